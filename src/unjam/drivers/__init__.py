@@ -1,0 +1,25 @@
+"""Who drives a CAV: experts, learned residuals, your own."""
+
+from unjam.drivers.check import check_driver
+from unjam.drivers.constant import Constant
+from unjam.drivers.driver import Driver, Memory
+from unjam.drivers.follower_stopper import FollowerStopper
+from unjam.drivers.idm import IDM, Human
+from unjam.drivers.local_state import LocalState
+from unjam.drivers.pi_saturation import PISaturation
+from unjam.drivers.registry import DRIVERS
+from unjam.drivers.residual import ResidualDriver
+
+__all__ = [
+    "DRIVERS",
+    "IDM",
+    "Constant",
+    "Driver",
+    "FollowerStopper",
+    "Human",
+    "LocalState",
+    "Memory",
+    "PISaturation",
+    "ResidualDriver",
+    "check_driver",
+]

@@ -1,0 +1,85 @@
+"""A conformance test for anybody's driver: run it in your own test suite."""
+
+from typing import Any
+
+import numpy as np
+
+from unjam.drivers.driver import Memory
+from unjam.drivers.local_state import LocalState
+from unjam.errors import InputError
+
+TOLERANCE = 1e-12
+
+
+def check_driver(driver: Any, rows: int = 8, steps: int = 50, seed: int = 0) -> None:
+    """Check that a driver keeps the contract of `unjam.drivers.Driver`; raise where it does not.
+
+    It drives `rows` vehicles for `steps` random steps and checks that accelerations are finite and of
+    shape (rows,), that n rows at once equal n single calls to 1e-12, that the same call gives the same
+    answer, and that neither the state nor the memory it was given is changed.
+
+    Args:
+        driver: anything with `initial_memory(n)` and `act(state, memory)`.
+        rows: vehicles driven at once.
+        steps: steps driven.
+        seed: of the random surroundings.
+
+    Raises:
+        InputError: one line that names what is wrong, and in which step.
+    """
+    for method in ("initial_memory", "act"):
+        if not callable(getattr(driver, method, None)):
+            raise InputError(f"driver: has no {method}(); see unjam.drivers.Driver")
+    generator = np.random.default_rng(seed)
+    memory = driver.initial_memory(rows)
+    single = [driver.initial_memory(1) for _ in range(rows)]
+    for step in range(steps):
+        state = random_state(generator, rows)
+        before = _copy(memory)
+        acceleration, after = driver.act(state, memory)
+        acceleration = check_acceleration(acceleration, rows, f"step {step}")
+        again, _ = driver.act(state, before)
+        if not np.array_equal(acceleration, again):
+            raise InputError(f"driver: step {step}: the same state and memory gave another acceleration")
+        if not _equal(memory, before):
+            raise InputError(f"driver: step {step}: act() changed the memory that it was given")
+        for row in range(rows):
+            one = LocalState(*(values[row : row + 1] for values in state))
+            alone, single[row] = driver.act(one, single[row])
+            if not abs(float(np.asarray(alone)[0]) - float(acceleration[row])) <= TOLERANCE:
+                raise InputError(
+                    f"driver: step {step}: row {row} gave {float(np.asarray(alone)[0])!r} alone "
+                    f"and {float(acceleration[row])!r} among {rows} rows"
+                )
+        memory = after
+
+
+def check_acceleration(acceleration: Any, rows: int, where: str) -> np.ndarray:
+    """Return what a driver answered as an array; raise `InputError` unless it is finite and has `rows` rows."""
+    try:
+        array = np.asarray(acceleration, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise InputError(f"driver: {where}: acceleration is not numbers: {acceleration!r}") from None
+    if array.shape != (rows,):
+        raise InputError(f"driver: {where}: acceleration has shape {array.shape}; allowed: ({rows},)")
+    if not np.isfinite(array).all():
+        raise InputError(f"driver: {where}: acceleration is {array[~np.isfinite(array)][0]}; allowed: finite")
+    return array
+
+
+def random_state(generator: np.random.Generator, rows: int) -> LocalState:
+    """Return random surroundings, standing and close vehicles among them."""
+    speeds = generator.uniform(0.0, 12.0, (3, rows)) * (generator.random((3, rows)) > 0.2)
+    gaps = generator.uniform(0.5, 60.0, (2, rows))
+    position = generator.uniform(0.0, 230.0, rows)
+    return LocalState(speeds[0], speeds[1], gaps[0], speeds[2], gaps[1], position, np.full(rows, 230.0))
+
+
+def _copy(memory: Memory) -> Memory:
+    return {key: np.array(value) for key, value in memory.items()}
+
+
+def _equal(memory: Memory, other: Memory) -> bool:
+    return memory.keys() == other.keys() and all(
+        np.array_equal(np.asarray(memory[key]), other[key], equal_nan=True) for key in memory
+    )

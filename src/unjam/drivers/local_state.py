@@ -1,0 +1,72 @@
+"""What a CAV perceives, and the vector of numbers that a network sees of it: one place for both worlds."""
+
+from typing import Literal, NamedTuple
+
+from unjam.physics.arrays import Array, stack_columns
+
+
+class LocalState(NamedTuple):
+    """The surroundings of n CAVs, one row each; NumPy arrays or torch tensors of shape (n,), SI units.
+
+    Drivers that take plain numbers (`Driver.plain_numbers`) may also be given floats, for a single CAV.
+
+    Where nobody is ahead (or behind), the gap is `LARGEST_GAP` and the leader (follower) as fast as the CAV.
+    """
+
+    speed: Array
+    """own speed [m/s]"""
+    leader_speed: Array
+    """speed of the vehicle ahead [m/s]"""
+    leader_gap: Array
+    """own front bumper to the leader's rear bumper [m]"""
+    follower_speed: Array
+    """speed of the vehicle behind [m/s]"""
+    follower_gap: Array
+    """the follower's front bumper to own rear bumper [m]"""
+    route_position: Array
+    """own front bumper along the route [m]; NaN where the road has no coordinate of its own"""
+    loop_length: Array
+    """length of the closed road [m]; NaN on an open one"""
+
+
+LARGEST_GAP = 100.0
+"""The gap that stands for `nobody there` [m]."""
+
+SPEED_SCALE = 10.0
+RELATIVE_SPEED_SCALE = 5.0
+GAP_SCALE = 20.0
+ACCELERATION_SCALE = 1.0
+
+ObservationPart = Literal["local", "expert_acceleration", "expert_memory"]
+"""Parts of an observation: the paper's five numbers; the expert's acceleration; what the expert remembers."""
+
+OBSERVATION_NAMES: dict[str, tuple[str, ...]] = {
+    "local": (
+        f"own speed / {SPEED_SCALE:g} m/s",
+        f"leader's speed - own / {RELATIVE_SPEED_SCALE:g} m/s",
+        f"gap to the leader / {GAP_SCALE:g} m",
+        f"follower's speed - own / {RELATIVE_SPEED_SCALE:g} m/s",
+        f"gap to the follower / {GAP_SCALE:g} m",
+    ),
+    "expert_acceleration": (f"expert's acceleration / {ACCELERATION_SCALE:g} m/s2",),
+}
+
+
+def local_vector(state: LocalState) -> Array:
+    """Return the paper's observation: five numbers a row, divided by fixed physical scales.
+
+    Own speed; relative speed and gap to the leader; relative speed and gap to the follower.
+    Relative speeds are the other's minus the own; gaps are bumper to bumper.
+
+    Returns:
+        Shape (n, 5), no unit; a tuple of five for plain numbers.
+    """
+    return stack_columns(
+        (
+            state.speed / SPEED_SCALE,
+            (state.leader_speed - state.speed) / RELATIVE_SPEED_SCALE,
+            state.leader_gap / GAP_SCALE,
+            (state.follower_speed - state.speed) / RELATIVE_SPEED_SCALE,
+            state.follower_gap / GAP_SCALE,
+        )
+    )

@@ -1,0 +1,77 @@
+"""PI with saturation (Stern et al. 2018): the paper's traffic expert, Eq. 9-11."""
+
+from typing import Annotated, ClassVar, Literal
+
+import numpy as np
+from pydantic import Field
+from pydantic.dataclasses import dataclass
+
+from unjam.drivers.driver import Driver, Memory
+from unjam.drivers.local_state import SPEED_SCALE, LocalState
+from unjam.drivers.speed_history import empty_window, fill, mean_speed, slide
+from unjam.parameters import STRICT, NotNegative, Positive
+from unjam.physics.arrays import Array, at_least, clip, namespace, stack_columns
+
+
+@dataclass(frozen=True, config=STRICT)
+class PISaturation(Driver):
+    """Drives at the mean of its own speed, a little faster behind a large gap, and yields when close.
+
+    The defaults are Table B2 of the paper. The paper divides the wanted change of speed by the time step,
+    which makes the command nearly bang-bang; `time_constant` spreads it over more time.
+    Source: Stern et al. 2018, Transp. Res. C 89:205-221; paper Eq. 9-11.
+    """
+
+    plain_numbers: ClassVar[bool] = True
+
+    window: Positive = 38.0
+    """time over which the own speed is averaged [s]"""
+    catch_up_speed: NotNegative = 1.0
+    """v_c: speed beyond the mean where the gap is large [m/s]"""
+    gap_lower: NotNegative = 7.0
+    """s_l: from this gap on it speeds up [m]"""
+    gap_upper: Positive = 30.0
+    """s_u: from this gap on it drives the whole `catch_up_speed` faster [m]"""
+    safe_gap: NotNegative = 4.0
+    """dx_s: below this gap it follows the leader's speed [m]"""
+    safe_gap_rule: Literal["constant", "closing"] = "constant"
+    """`constant` as the paper; `closing`: max(2 s (v_lead - v), safe_gap), as Stern et al. and Flow"""
+    time_constant: Annotated[float, Field(ge=0)] = 0.0
+    """time over which the wanted speed is reached [s]; 0: one time step, as the paper"""
+    first_command: Literal["own-speed", "zero"] = "own-speed"
+    """commanded speed before the first step; Flow starts from zero"""
+    time_step: Positive = 0.1
+    """time between two decisions [s]; set by the road"""
+
+    def initial_memory(self, n: int) -> Memory:
+        """Return an empty window and no command (NaN), or the command zero."""
+        first = np.nan if self.first_command == "own-speed" else 0.0
+        return {**empty_window(n, self.window, self.time_step), "command": np.full(n, first)}
+
+    def recall(self, memory: Memory, history: LocalState) -> Memory:
+        """Return `memory` with the own speeds of the warm-up in its window."""
+        return {**memory, **fill(memory, history.speed)}
+
+    def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
+        """Return the acceleration towards the commanded speed of Eq. 10, and the new memory."""
+        xp = namespace(state.speed)
+        window = slide(memory, state.speed)
+        mean = mean_speed(window)
+        command = xp.where(xp.isnan(memory["command"]), state.speed, memory["command"])
+
+        room = (state.leader_gap - self.gap_lower) / (self.gap_upper - self.gap_lower)
+        target = mean + self.catch_up_speed * clip(room, 0.0, 1.0)
+        safe_gap = self.safe_gap
+        if self.safe_gap_rule == "closing":
+            safe_gap = at_least(2.0 * (state.leader_speed - state.speed), self.safe_gap)
+        alpha = clip((state.leader_gap - safe_gap) / 2.0, 0.0, 1.0)
+        beta = 1.0 - 0.5 * alpha
+        command = beta * (alpha * target + (1.0 - alpha) * state.leader_speed) + (1.0 - beta) * command
+
+        acceleration = (command - state.speed) / max(self.time_constant, self.time_step)
+        return acceleration, {**window, "command": command}
+
+    def memory_features(self, memory: Memory) -> Array:
+        """Return the mean own speed and the commanded speed, scaled, shape (n, 2)."""
+        mean = mean_speed(memory)
+        return stack_columns((mean / SPEED_SCALE, memory["command"] / SPEED_SCALE))

@@ -1,0 +1,47 @@
+"""What can go wrong, and the exit code that the command line gives it.
+
+Every error that a user can cause or mend is one of these: one clear line, no traceback.
+"""
+
+import errno
+
+
+class UnjamError(Exception):
+    """An error with one line that a user understands; `exit_code` is what the command line returns."""
+
+    exit_code = 1
+
+
+class InputError(UnjamError):
+    """Wrong input: the message names the field, the value and what is allowed."""
+
+    exit_code = 2
+
+
+class MissingPartError(UnjamError):
+    """A program or package that is needed is not there: the message says how to get it."""
+
+    exit_code = 3
+
+
+class DiskError(UnjamError):
+    """The disk is full or cannot be written."""
+
+    exit_code = 74
+
+
+class EpisodeError(UnjamError):
+    """An episode failed again and again: the message holds what is needed to repeat it."""
+
+
+DISK_ERRNOS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EIO)
+
+
+def disk_error(error: OSError, path: object) -> DiskError:
+    """Return the one-line error for a failed write to `path`."""
+    return DiskError(f"cannot write {path}: {error.strerror or error}")
+
+
+def wrong(field: str, value: object, allowed: str) -> InputError:
+    """Return the error for a wrong value, in the form that all of unjam uses."""
+    return InputError(f"{field}: {value!r} is not allowed; allowed: {allowed}")

@@ -1,0 +1,63 @@
+"""How unjam's frozen dataclasses check what they are given: types, ranges, unknown names."""
+
+from typing import Annotated, Any, TypeVar
+
+from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
+
+from unjam.errors import InputError
+
+STRICT = ConfigDict(extra="forbid", allow_inf_nan=False)
+"""Configuration of every parameter dataclass: an unknown name or a NaN is an error, not a surprise."""
+
+Positive = Annotated[float, Field(gt=0)]
+NotNegative = Annotated[float, Field(ge=0)]
+Count = Annotated[int, Field(ge=1)]
+CountOrNone = Annotated[int, Field(ge=0)]
+
+Checked = TypeVar("Checked")
+
+
+def build(kind: type[Checked], values: dict[str, Any], field: str) -> Checked:
+    """Return `kind(**values)`, or raise `InputError` with one line that names the first wrong value.
+
+    `field` says where the values come from, for the message.
+    """
+    try:
+        return TypeAdapter(kind).validate_python(values)
+    except ValidationError as error:
+        raise InputError(one_line(error, field)) from None
+
+
+def one_line(error: ValidationError, field: str) -> str:
+    """Return the first problem of a pydantic error as `field.name: value is not allowed; allowed: ...`."""
+    problem = error.errors()[0]
+    name = ".".join([field, *(str(part) for part in problem["loc"])]).strip(".")
+    if problem["type"] in ("unexpected_keyword_argument", "extra_forbidden"):
+        return f"{name}: unknown name"
+    if problem["type"] == "missing":
+        return f"{name}: missing"
+    if problem["type"] == "value_error" and not problem["loc"]:  # a check across fields names them itself
+        return f"{name}.{problem['msg'].removeprefix('Value error, ')}"
+    allowed = problem["msg"].removeprefix("Input should be ").removeprefix("Value error, ")
+    return f"{name}: {problem['input']!r} is not allowed; allowed: {allowed}"
+
+
+def parse_value(text: str) -> Any:
+    """Return what `text` means as a TOML value (number, boolean, list); itself where it is none."""
+    import tomllib
+
+    try:
+        return tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        return text
+
+
+def parse_assignments(texts: list[str], field: str) -> dict[str, Any]:
+    """Return `{"key": value}` for texts `key=value`; raise `InputError` where one has no `=`."""
+    values: dict[str, Any] = {}
+    for text in texts:
+        key, equals, value = text.partition("=")
+        if not equals or not key.strip():
+            raise InputError(f"{field}: {text!r} is not allowed; allowed: key=value")
+        values[key.strip()] = parse_value(value.strip())
+    return values

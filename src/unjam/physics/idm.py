@@ -1,0 +1,90 @@
+"""The Intelligent Driver Model (Treiber, Hennecke, Helbing 2000): how people follow the car ahead."""
+
+from math import sqrt
+
+from pydantic.dataclasses import dataclass
+
+from unjam.parameters import STRICT, Positive
+from unjam.physics.arrays import Array, at_least
+
+
+@dataclass(frozen=True, config=STRICT)
+class IDMParameters:
+    """Parameters of the Intelligent Driver Model; the defaults are Table B1 of the paper."""
+
+    desired_speed: Positive = 30.0
+    """v0 [m/s]"""
+    time_headway: Positive = 1.0
+    """T [s]"""
+    max_acceleration: Positive = 1.0
+    """a [m/s2]"""
+    comfortable_deceleration: Positive = 1.5
+    """b [m/s2]"""
+    exponent: Positive = 4.0
+    """delta"""
+    minimum_gap: Positive = 2.0
+    """s0 [m], bumper to bumper at standstill"""
+
+
+PAPER_IDM = IDMParameters()
+
+
+def desired_gap(speed: Array, approach_rate: Array, parameters: IDMParameters = PAPER_IDM) -> Array:
+    """Return the gap s* that a driver wants at this speed and approach rate (Eq. 6).
+
+    Args:
+        speed: own speed [m/s], any shape.
+        approach_rate: own speed minus the leader's [m/s], same shape.
+        parameters: of the driver.
+
+    Returns:
+        Desired bumper-to-bumper gap [m], same shape.
+    """
+    p = parameters
+    braking = 2.0 * sqrt(p.max_acceleration * p.comfortable_deceleration)
+    return p.minimum_gap + at_least(speed * p.time_headway + speed * approach_rate / braking, 0.0)
+
+
+def idm_acceleration(
+    speed: Array, leader_speed: Array, gap: Array, parameters: IDMParameters = PAPER_IDM
+) -> Array:
+    """Return the acceleration of a driver behind a leader (Eq. 5).
+
+    Args:
+        speed: own speed [m/s], any shape.
+        leader_speed: speed of the vehicle ahead [m/s], same shape.
+        gap: bumper-to-bumper distance [m], same shape; positive (the model divides by it).
+        parameters: of the driver.
+
+    Returns:
+        Acceleration [m/s2], same shape; unbounded below as the gap closes.
+    """
+    p = parameters
+    free_road = (speed / p.desired_speed) ** p.exponent
+    interaction = (desired_gap(speed, speed - leader_speed, p) / gap) ** 2
+    return p.max_acceleration * (1.0 - free_road - interaction)
+
+
+def equilibrium_gap(speed: float, parameters: IDMParameters = PAPER_IDM) -> float:
+    """Return the gap at which a platoon at constant `speed` neither accelerates nor brakes [m].
+
+    Closed form of Eq. 5 with a* = 0 and no speed difference; `speed` in [0, v0) m/s.
+    """
+    p = parameters
+    if not 0 <= speed < p.desired_speed:
+        raise ValueError(f"speed {speed} m/s has no equilibrium gap: it must be in [0, {p.desired_speed})")
+    return (p.minimum_gap + speed * p.time_headway) / sqrt(1.0 - (speed / p.desired_speed) ** p.exponent)
+
+
+def equilibrium_speed(gap: float, parameters: IDMParameters = PAPER_IDM) -> float:
+    """Return the constant speed that drivers settle at when all gaps are `gap` metres [m/s].
+
+    The inverse of `equilibrium_gap`; 0 where the gap is not above the standstill gap.
+    """
+    from scipy.optimize import brentq  # costs a worker a quarter of its start-up, and no worker asks
+
+    if gap <= parameters.minimum_gap:
+        return 0.0
+    highest = parameters.desired_speed * (1.0 - 1e-12)
+    root = brentq(lambda speed: equilibrium_gap(speed, parameters) - gap, 0.0, highest, xtol=1e-12)
+    return float(root)  # pyright: ignore[reportArgumentType]

@@ -1,0 +1,44 @@
+"""All scenarios by name."""
+
+from dataclasses import asdict
+from typing import Any
+
+from unjam.errors import wrong
+from unjam.parameters import build
+from unjam.scenarios.ring import Ring
+from unjam.scenarios.scenario import Scenario
+
+SCENARIOS: dict[str, Scenario] = {
+    "ring": Ring(),
+    "ring-warm": Ring(warmup=750),
+    "ring-jammed": Ring(warmup=6000),
+}
+
+
+KINDS: dict[str, type[Scenario]] = {"ring": Ring}
+"""All kinds of road, by their title."""
+
+
+def make_scenario(name: str, changes: dict[str, Any] | None = None) -> Scenario:
+    """Return the scenario `name` with `changes` to its parameters.
+
+    Raises:
+        InputError: unknown scenario or parameter, or a value out of range.
+    """
+    if name not in SCENARIOS:
+        raise wrong("scenario", name, ", ".join(SCENARIOS))
+    scenario = SCENARIOS[name]
+    if not changes:
+        return scenario
+    return build(type(scenario), {**asdict(scenario), **changes}, f"scenario {name}")
+
+
+def scenario_recipe(scenario: Scenario) -> dict[str, Any]:
+    """Return a scenario as JSON; `scenario_from_recipe` makes it again."""
+    return {"kind": scenario.title, **asdict(scenario)}
+
+
+def scenario_from_recipe(recipe: dict[str, Any]) -> Scenario:
+    """Return the scenario that `scenario_recipe` wrote down."""
+    values = {key: value for key, value in recipe.items() if key != "kind"}
+    return build(KINDS[recipe["kind"]], values, "scenario")

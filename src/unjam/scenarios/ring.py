@@ -1,0 +1,130 @@
+"""The ring road: one lane, closed, and too full for people to drive without waves."""
+
+from typing import Annotated, ClassVar
+
+import numpy as np
+from pydantic import Field, model_validator
+from pydantic.dataclasses import dataclass
+
+from unjam.parameters import STRICT, Count
+from unjam.physics.idm import equilibrium_speed
+from unjam.scenarios.scenario import VEHICLE_LENGTH, Road, Scenario, cav_type, human_type
+
+EDGES = 4
+
+
+@dataclass(frozen=True, config=STRICT)
+class Ring(Scenario):
+    """Vehicles on a circle, evenly spaced and standing at the start; the length is new in each episode.
+
+    The paper's ring has 22 vehicles, one of them a CAV, on 220 to 270 m. At that density the IDM's own
+    steady flow is unstable, and the humans' noise grows into a wave.
+    """
+
+    title: ClassVar[str] = "ring"
+    reward: ClassVar[str] = "released"
+
+    length: tuple[Annotated[int, Field(ge=10)], Annotated[int, Field(ge=10)]] = (220, 270)
+    """shortest and longest ring, drawn uniformly among the integers between them [m]"""
+    vehicles: Annotated[int, Field(ge=2)] = 22
+    cavs: Count = 1
+    """vehicles of those that are CAVs, evenly spread"""
+
+    @model_validator(mode="after")
+    def _fits(self) -> "Ring":
+        shortest, longest = self.length
+        if longest < shortest:
+            raise ValueError(f"length: {longest} m is not allowed as the longest; allowed: >= {shortest} m")
+        needed = self.vehicles * (VEHICLE_LENGTH + self.humans.minimum_gap)
+        if shortest < needed:
+            raise ValueError(
+                f"length: {shortest} m is not allowed for {self.vehicles} vehicles; allowed: >= {needed:g} m"
+            )
+        if self.cavs > self.vehicles:
+            raise ValueError(f"cavs: {self.cavs} is not allowed; allowed: <= vehicles, {self.vehicles}")
+        return self
+
+    def draw(self, generator: np.random.Generator) -> Road:
+        """Return a ring of random length with its vehicles."""
+        length = float(generator.integers(self.length[0], self.length[1], endpoint=True))
+        cavs = {round(index * self.vehicles / self.cavs) for index in range(self.cavs)}
+        ids = tuple(f"{'cav' if index in cavs else 'human'}_{index}" for index in range(self.vehicles))
+        positions = np.arange(self.vehicles) * (length / self.vehicles)
+        return Road(
+            nodes=_nodes(length),
+            edges=_edges(length, self.humans.desired_speed),
+            netconvert_options=("--no-internal-links", "true", "--no-turnarounds", "true"),
+            traffic=self._traffic(length, ids, positions),
+            vehicle_ids=ids,
+            cav_ids=tuple(name for name in ids if name.startswith("cav")),
+            start_positions=positions,
+            loop_length=length,
+            limit_speed=equilibrium_speed(length / self.vehicles - VEHICLE_LENGTH, self.humans),
+            outline=_outline(length),
+            drawn={"length": length},
+        )
+
+    def _traffic(self, length: float, ids: tuple[str, ...], positions: np.ndarray) -> str:
+        seconds = self.simulation_step * (self.warmup + self.horizon * self.steps_per_decision)
+        laps = int(seconds * self.humans.desired_speed / length) + 2
+        lines = ["<routes>", human_type(self), cav_type(self)]
+        for first in range(EDGES):
+            edges = " ".join(f"edge_{(first + index) % EDGES}" for index in range(EDGES))
+            lines.append(f'<route id="from_{first}" edges="{edges}" repeat="{laps}"/>')
+        for name, position in zip(ids, positions, strict=True):
+            edge = min(int(position / (length / EDGES)), EDGES - 1)
+            place = float(position) - edge * length / EDGES
+            lines.append(
+                f'<vehicle id="{name}" type="human" route="from_{edge}" depart="0" departSpeed="0" '
+                f'departLane="0" departPos="{place!r}"/>'
+            )
+        return "\n".join([*lines, "</routes>"])
+
+    def facts(self) -> list[tuple[str, str]]:
+        """Return the ring's own facts for `unjam scenarios`."""
+        lengths = "-".join(str(length) for length in dict.fromkeys(self.length))
+        return [
+            ("road", f"circle of {lengths} m, one lane, new length in each episode"),
+            ("vehicles", f"{self.vehicles}, of which {self.cavs} CAV"),
+            ("limit", f"IDM equilibrium speed: {self._limits()} m/s"),
+        ]
+
+    def _limits(self) -> str:
+        speeds = [
+            f"{equilibrium_speed(length / self.vehicles - VEHICLE_LENGTH, self.humans):.2f}"
+            for length in dict.fromkeys(self.length)
+        ]
+        return " to ".join(speeds)
+
+
+def _point(angle: float, radius: float) -> tuple[float, float]:
+    return radius * float(np.cos(angle)), radius * float(np.sin(angle))
+
+
+def _nodes(length: float) -> str:
+    radius = length / (2 * np.pi)
+    lines = ["<nodes>"]
+    for index in range(EDGES):
+        x, y = _point(2 * np.pi * index / EDGES, radius)
+        lines.append(f'<node id="node_{index}" x="{x:.6f}" y="{y:.6f}" type="priority"/>')
+    return "\n".join([*lines, "</nodes>"])
+
+
+def _edges(length: float, speed: float) -> str:
+    radius = length / (2 * np.pi)
+    lines = ["<edges>"]
+    for index in range(EDGES):
+        angles = 2 * np.pi * (index + np.linspace(0, 1, 41)) / EDGES
+        shape = " ".join(f"{x:.6f},{y:.6f}" for x, y in (_point(angle, radius) for angle in angles))
+        lines.append(
+            f'<edge id="edge_{index}" from="node_{index}" to="node_{(index + 1) % EDGES}" numLanes="1" '
+            f'speed="{speed}" length="{length / EDGES!r}" shape="{shape}"/>'
+        )
+    return "\n".join([*lines, "</edges>"])
+
+
+def _outline(length: float) -> np.ndarray:
+    coordinates = np.linspace(0, length, 161)
+    angles = 2 * np.pi * coordinates / length
+    radius = length / (2 * np.pi)
+    return np.column_stack([coordinates, radius * np.cos(angles), radius * np.sin(angles)])

@@ -1,0 +1,151 @@
+"""What a scenario is: where the vehicles drive, how an episode starts and when it ends."""
+
+from dataclasses import dataclass as plain_dataclass
+from dataclasses import field
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic.dataclasses import dataclass
+
+from unjam.parameters import STRICT, Count, CountOrNone, NotNegative, Positive
+from unjam.physics.idm import IDMParameters
+
+VEHICLE_LENGTH = 5.0
+"""[m], of every vehicle"""
+
+Actuation = Literal["shielded", "raw", "flow"]
+"""How SUMO carries out a CAV's command.
+
+`shielded`: exactly, until it is unsafe; then SUMO brakes, and the override is counted.
+`raw`: exactly, always; a collision ends the episode.
+`flow`: as in Flow, the CAV is also bound by the human IDM and can never accelerate beyond it.
+"""
+
+
+@plain_dataclass(frozen=True)
+class Road:
+    """One episode's road and traffic, ready to be written as SUMO's input files."""
+
+    nodes: str
+    """XML of the nodes, for netconvert"""
+    edges: str
+    """XML of the edges, for netconvert"""
+    netconvert_options: tuple[str, ...]
+    traffic: str
+    """XML of vehicle types, routes and vehicles"""
+    vehicle_ids: tuple[str, ...]
+    """all vehicles, in the order in which they stand along the road"""
+    cav_ids: tuple[str, ...]
+    """those of them that a driver drives"""
+    start_positions: NDArray[np.float64]
+    """front bumper of each vehicle along the route at the start [m]"""
+    loop_length: float
+    """length of the closed road [m]"""
+    limit_speed: float
+    """speed that the traffic cannot exceed in the long run [m/s]: the scenario's own limit"""
+    outline: NDArray[np.float64]
+    """the road's centre line: rows (coordinate along the route, x, y) [m]"""
+    drawn: dict[str, float] = field(default_factory=dict)
+    """what the episode's seed has drawn, by name"""
+
+
+@dataclass(frozen=True, config=STRICT)
+class Scenario:
+    """What all scenarios share; each kind of road adds its own."""
+
+    title: ClassVar[str]
+    reward: ClassVar[str]
+    """reward used where none is named"""
+
+    simulation_step: Positive = 0.1
+    """time step of SUMO [s]"""
+    steps_per_decision: Count = 1
+    """simulation steps for which one command holds"""
+    horizon: Count = 3000
+    """decisions in an episode"""
+    warmup: CountOrNone = 0
+    """all-human simulation steps before the CAVs take over"""
+    recall_warmup: bool = True
+    """whether a driver may remember the warm-up, which it saw but did not drive"""
+    action_limit: Positive = 1.0
+    """largest acceleration that a CAV may ask for, in either direction [m/s2]"""
+    actuation: Actuation = "shielded"
+    humans: IDMParameters = field(default_factory=IDMParameters)
+    """how people drive"""
+    noise: NotNegative = 0.2
+    """standard deviation of the humans' acceleration noise [m/s2]"""
+    noise_scaling: Literal["sqrt-step", "none"] = "sqrt-step"
+    """`sqrt-step`: noise times sqrt(time step), as Flow; `none`: as the paper says"""
+    emission_class: str = "HBEFA4/PC_petrol_Euro-6ab"
+    """SUMO's emission class of every vehicle, for fuel"""
+
+    @property
+    def decision_step(self) -> float:
+        """Time between two decisions [s]."""
+        return self.simulation_step * self.steps_per_decision
+
+    @property
+    def noise_per_step(self) -> float:
+        """Standard deviation of the acceleration noise in one simulation step [m/s2]."""
+        scale = self.simulation_step**0.5 if self.noise_scaling == "sqrt-step" else 1.0
+        return self.noise * scale
+
+    def draw(self, generator: np.random.Generator) -> Road:
+        """Return the road of one episode; everything random about it comes from `generator`."""
+        raise NotImplementedError
+
+    def facts(self) -> list[tuple[str, str]]:
+        """Return what a reader wants to know of this road, as (name, value) pairs."""
+        raise NotImplementedError
+
+
+def vehicle_type(name: str, scenario: Scenario, **attributes: Any) -> str:
+    """Return the XML of a vehicle type: SUMO's defaults of chance switched off, the rest as given."""
+    common = {
+        "id": name,
+        "length": VEHICLE_LENGTH,
+        "speedFactor": 1.0,
+        "speedDev": 0.0,  # without it SUMO draws factors between 0.8 and 1.2
+        "sigma": 0.0,
+        "emissionClass": scenario.emission_class,
+    }
+    pairs = " ".join(f'{key}="{value}"' for key, value in {**common, **attributes}.items())
+    return f"<vType {pairs}/>"
+
+
+def human_type(scenario: Scenario) -> str:
+    """Return the XML of the human drivers: SUMO's own IDM with the scenario's parameters."""
+    humans = scenario.humans
+    return vehicle_type(
+        "human",
+        scenario,
+        carFollowModel="IDM",
+        accel=humans.max_acceleration,
+        decel=humans.comfortable_deceleration,
+        tau=humans.time_headway,
+        delta=humans.exponent,
+        minGap=humans.minimum_gap,
+        maxSpeed=humans.desired_speed,
+    )
+
+
+def cav_type(scenario: Scenario) -> str:
+    """Return the XML of the CAVs: a type that executes any safe command exactly.
+
+    With SUMO's safe-speed check on, a Krauss vehicle with a reaction time of one step and a small minimum
+    gap is the one that stays out of the way until the command would lead to a crash.
+    """
+    limits = 20.0  # [m/s2] far beyond what a CAV asks for, so that only safety clips a command
+    return vehicle_type(
+        "cav",
+        scenario,
+        carFollowModel="Krauss",
+        accel=limits,
+        decel=limits,
+        emergencyDecel=limits,
+        apparentDecel=limits,
+        tau=scenario.simulation_step,
+        minGap=0.5,
+        maxSpeed=scenario.humans.desired_speed,
+    )

@@ -1,0 +1,47 @@
+"""Who drives ahead and who behind, on a closed road with one lane."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from unjam.drivers.local_state import LocalState
+from unjam.physics.kinematics import gap_on_loop
+from unjam.scenarios.scenario import VEHICLE_LENGTH
+
+
+class Neighbours(NamedTuple):
+    """Places of some vehicles and of those around them, in road order: integers, or arrays of them."""
+
+    own: Any
+    ahead: Any
+    behind: Any
+
+
+def loop_neighbours(chosen: Any, vehicles: int) -> Neighbours:
+    """Return the neighbours of the `chosen` places among `vehicles` on a loop with one lane.
+
+    Nobody overtakes there: each vehicle keeps the neighbours that it starts with.
+    """
+    return Neighbours(chosen, (chosen + 1) % vehicles, (chosen - 1) % vehicles)
+
+
+def loop_state(speeds: Any, positions: Any, near: Neighbours, loop_length: float) -> LocalState:
+    """Return what the vehicles `near.own` perceive on a closed road.
+
+    Args:
+        speeds: [m/s], by place in road order: an array, (vehicles,) or (vehicles, moments), or a list.
+        positions: of the front bumpers along the road, not wrapped [m]; likewise.
+        near: whose surroundings; integers give a state of plain numbers.
+        loop_length: [m].
+    """
+    own, ahead, behind = near
+    speed, position = speeds[own], positions[own]
+    return LocalState(
+        speed=speed,
+        leader_speed=speeds[ahead],
+        leader_gap=gap_on_loop(position, positions[ahead], loop_length, VEHICLE_LENGTH),
+        follower_speed=speeds[behind],
+        follower_gap=gap_on_loop(positions[behind], position, loop_length, VEHICLE_LENGTH),
+        route_position=position % loop_length,
+        loop_length=loop_length if isinstance(position, float) else np.full(position.shape, loop_length),
+    )

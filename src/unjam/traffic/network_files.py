@@ -1,0 +1,94 @@
+"""SUMO's network files: made by netconvert, once for each content."""
+
+import hashlib
+import os
+import shutil
+import subprocess
+import tempfile
+from functools import lru_cache
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+import platformdirs
+
+from unjam.errors import DISK_ERRNOS, MissingPartError, UnjamError, disk_error
+from unjam.scenarios.scenario import Road
+
+
+def cache_folder() -> Path:
+    """Return where networks are kept: `$UNJAM_CACHE`, or the user's cache folder."""
+    chosen = os.environ.get("UNJAM_CACHE")
+    return Path(chosen) if chosen else Path(platformdirs.user_cache_dir("unjam"))
+
+
+@lru_cache(maxsize=None)
+def sumo_program(name: str) -> str:
+    """Return the path of one of SUMO's programs: the installed package's, else the one on the PATH.
+
+    Raises:
+        MissingPartError: neither has it.
+    """
+    try:
+        import sumo
+
+        bundled = Path(sumo.SUMO_HOME) / "bin" / name
+        if bundled.exists():
+            return str(bundled)
+    except (ImportError, AttributeError):
+        pass
+    found = shutil.which(name)
+    if found is None:
+        raise MissingPartError(f"SUMO's {name} is not there; install it: pip install eclipse-sumo==1.28.0")
+    return found
+
+
+@lru_cache(maxsize=None)
+def sumo_version() -> str:
+    """Return the installed version of libsumo; `MissingPartError` where there is none."""
+    try:
+        return version("libsumo")
+    except PackageNotFoundError:
+        raise MissingPartError("libsumo is not installed; install it: pip install libsumo==1.28.0") from None
+
+
+def network_file(road: Road) -> Path:
+    """Return SUMO's network file of a road, made with netconvert if this content was never made before.
+
+    Raises:
+        MissingPartError: netconvert is missing.
+        DiskError: the cache cannot be written.
+    """
+    content = "\n".join([sumo_version(), *road.netconvert_options, road.nodes, road.edges])
+    name = hashlib.sha256(content.encode()).hexdigest()[:24]
+    target = cache_folder() / "networks" / f"{name}.net.xml"
+    if target.exists():
+        return target
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=target.parent) as folder:
+            made = _netconvert(road, Path(folder))
+            os.replace(made, target)  # whole or not at all, also with several workers at it
+    except OSError as error:
+        if error.errno in DISK_ERRNOS:
+            raise disk_error(error, target.parent) from None
+        raise
+    return target
+
+
+def _netconvert(road: Road, folder: Path) -> Path:
+    nodes, edges, made = folder / "road.nod.xml", folder / "road.edg.xml", folder / "road.net.xml"
+    nodes.write_text(road.nodes)
+    edges.write_text(road.edges)
+    command = [
+        sumo_program("netconvert"),
+        f"--node-files={nodes}",
+        f"--edge-files={edges}",
+        f"--output-file={made}",
+        "--offset.disable-normalization=true",
+        "--precision=6",
+        *road.netconvert_options,
+    ]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode != 0 or not made.exists():
+        raise UnjamError(f"netconvert failed: {(done.stderr or done.stdout).strip().splitlines()[-1:]}")
+    return made

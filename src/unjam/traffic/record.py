@@ -1,0 +1,142 @@
+"""What happened in an episode, and how it travels between processes."""
+
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from unjam.drivers.local_state import LocalState
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """One stay of one CAV on the road; T decisions. Arrays of shape (T,) where nothing else is said."""
+
+    vehicle: str
+    start: int
+    """decision of the episode at which it began"""
+    states: LocalState
+    """what it perceived, shape (T + 1,): the last entry is where it ended"""
+    observations: Floats
+    """what the residual network saw, shape (T + 1, inputs); (T + 1, 0) without one"""
+    expert: Floats
+    """the expert's acceleration within the action limit [m/s2]"""
+    residual: Floats
+    """the network's residual with its exploration noise, not clipped [m/s2]; zero without one"""
+    applied: Floats
+    """the acceleration that was commanded, within the action limit [m/s2]"""
+    shield: Floats
+    """braking that SUMO's safety check added to the command [m/s2]; zero where it let it pass"""
+    terms: dict[str, Floats]
+    """terms of the reward by name"""
+    terminated: bool
+    """whether a collision ended it; otherwise it was cut by the horizon or by leaving the road"""
+
+    @property
+    def reward(self) -> Floats:
+        """What each decision earned: the sum of the terms."""
+        return np.sum(list(self.terms.values()), axis=0)
+
+
+@dataclass(frozen=True)
+class Episode:
+    """What happened in one episode; T decisions, N vehicles. The warm-up is not part of it."""
+
+    seed: tuple[int, ...]
+    status: str
+    """`completed`, `collision`, or `failed`"""
+    reason: str = ""
+    """why it failed"""
+    error: str = ""
+    """name of the error that made it fail"""
+    step: float = 0.1
+    """time between two decisions [s]"""
+    warmup: int = 0
+    """simulation steps before the first decision"""
+    drawn: dict[str, float] = field(default_factory=dict)
+    """what the seed has drawn, by name"""
+    loop_length: float = float("nan")
+    """[m]"""
+    limit_speed: float = float("nan")
+    """the scenario's own limit of speed [m/s]"""
+    vehicle_ids: tuple[str, ...] = ()
+    cav_ids: tuple[str, ...] = ()
+    collisions: int = 0
+    """vehicles in contact with another when the episode ended"""
+    speeds: Floats = field(default_factory=lambda: np.zeros((1, 0)))
+    """[m/s], shape (T + 1, N); NaN where a vehicle is not on the road"""
+    positions: Floats = field(default_factory=lambda: np.zeros((1, 0)))
+    """front bumpers along the route, not wrapped [m], shape (T + 1, N)"""
+    gaps: Floats = field(default_factory=lambda: np.zeros((1, 0)))
+    """bumper to bumper to the vehicle ahead [m], shape (T + 1, N)"""
+    fuel: Floats = field(default_factory=lambda: np.zeros((0, 0)))
+    """fuel rate in each step [mg/s], shape (T, N); (0, 0) where it was not recorded"""
+    outline: Floats = field(default_factory=lambda: np.zeros((0, 3)))
+    """the road's centre line: rows (coordinate along the route, x, y) [m]"""
+    trajectories: tuple[Trajectory, ...] = ()
+
+    @property
+    def steps(self) -> int:
+        """How many decisions were made: the episode's actual steps."""
+        return len(self.speeds) - 1
+
+    @property
+    def ok(self) -> bool:
+        """Whether the episode ran to its end, be it a collision."""
+        return self.status != "failed"
+
+
+def failed_episode(seed: tuple[int, ...], reason: str, error: str) -> Episode:
+    """Return the row of an episode that did not run: every requested episode has one."""
+    return Episode(seed=seed, status="failed", reason=reason, error=error)
+
+
+_ARRAYS = ("speeds", "positions", "gaps", "fuel", "outline")
+_TRAJECTORY_ARRAYS = ("observations", "expert", "residual", "applied", "shield")
+
+
+def pack_episode(episode: Episode) -> tuple[dict[str, Any], dict[str, Floats]]:
+    """Return an episode as JSON and arrays; `unpack_episode` undoes it exactly."""
+    arrays = {name: getattr(episode, name) for name in _ARRAYS}
+    facts: dict[str, Any] = {
+        field.name: getattr(episode, field.name)
+        for field in fields(Episode)
+        if field.name not in (*_ARRAYS, "trajectories")
+    }
+    facts["trajectories"] = []
+    for index, trajectory in enumerate(episode.trajectories):
+        arrays |= {f"{index}.{name}": getattr(trajectory, name) for name in _TRAJECTORY_ARRAYS}
+        arrays |= {f"{index}.states.{name}": array for name, array in trajectory.states._asdict().items()}
+        arrays |= {f"{index}.terms.{name}": array for name, array in trajectory.terms.items()}
+        facts["trajectories"].append(
+            {
+                "vehicle": trajectory.vehicle,
+                "start": trajectory.start,
+                "terminated": trajectory.terminated,
+                "terms": list(trajectory.terms),
+            }
+        )
+    return facts, arrays
+
+
+def unpack_episode(facts: dict[str, Any], arrays: dict[str, Floats]) -> Episode:
+    """Return the episode that `pack_episode` packed."""
+    trajectories = []
+    for index, about in enumerate(facts["trajectories"]):
+        trajectories.append(
+            Trajectory(
+                vehicle=about["vehicle"],
+                start=about["start"],
+                terminated=about["terminated"],
+                states=LocalState(*(arrays[f"{index}.states.{name}"] for name in LocalState._fields)),
+                terms={name: arrays[f"{index}.terms.{name}"] for name in about["terms"]},
+                **{name: arrays[f"{index}.{name}"] for name in _TRAJECTORY_ARRAYS},
+            )
+        )
+    scalars = {key: value for key, value in facts.items() if key != "trajectories"}
+    for name in ("seed", "vehicle_ids", "cav_ids"):
+        scalars[name] = tuple(scalars[name])
+    return Episode(**scalars, **{name: arrays[name] for name in _ARRAYS}, trajectories=tuple(trajectories))

@@ -1,0 +1,115 @@
+"""Rewards: named terms, and their sum. One place for the actual and the virtual environment."""
+
+import inspect
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+from unjam.drivers.from_file import is_file_reference, load_object
+from unjam.errors import InputError, wrong
+from unjam.physics.arrays import Array, at_least, namespace
+
+DESIRED_SPEED = 30.0
+"""v_des of Eq. 16 [m/s]"""
+LONGEST_PENALISED_HEADWAY = 1.0
+"""h_max of Eq. 16 [s]"""
+MOBILITY_WEIGHT, HEADWAY_WEIGHT, ACCELERATION_WEIGHT = 1.0, 0.1, 0.1
+"""alpha, beta, gamma of Eq. 16"""
+STANDING = 1e-3
+"""speed below which a time headway means nothing [m/s]"""
+
+
+class Outcome(NamedTuple):
+    """What one decision led to; a row per decision. NumPy arrays or torch tensors, SI units."""
+
+    speeds: Array
+    """speeds after the step of all vehicles (in the virtual environment: of those seen) [m/s], shape
+    (rows, vehicles); NaN where a vehicle is not on the road"""
+    accelerations: Array
+    """what the CAVs were told, within the action limit [m/s2], shape (rows, CAVs)"""
+    headways: Array
+    """time headways of the CAVs after the step, gap over speed [s], shape (rows, CAVs)"""
+    crashed: Array
+    """whether there was a collision, shape (rows,)"""
+
+
+Reward = Callable[[Outcome], dict[str, Array]]
+"""A reward: its terms by name, each of shape (rows,). What is earned is their sum."""
+
+
+def _mean(values: Array) -> Array:
+    """Mean over the last axis of those that are there (not NaN)."""
+    xp = namespace(values)
+    there = ~xp.isnan(values)
+    return xp.nan_to_num(values, nan=0.0).sum(-1) / there.sum(-1)
+
+
+def released(outcome: Outcome) -> dict[str, Array]:
+    """Reward what Table 1 was computed with on ring and figure eight: 4 mean v / 20 - 4 mean |a|; 0 at a crash.
+
+    Source: the authors' released code, after Flow's wave attenuation environment.
+    """
+    running = ~outcome.crashed
+    return {
+        "speed": 4.0 * _mean(outcome.speeds) / 20.0 * running,
+        "acceleration": -4.0 * abs(outcome.accelerations).mean(-1) * running,
+    }
+
+
+def eq16(outcome: Outcome) -> dict[str, Array]:
+    """Reward Eq. 16 of the paper with the sign of its first term mended: it pays for being near v_des."""
+    mean = _mean(outcome.speeds)
+    return {
+        "speed": MOBILITY_WEIGHT * at_least(DESIRED_SPEED - abs(DESIRED_SPEED - mean), 0.0),
+        **_eq16_costs(outcome),
+    }
+
+
+def eq16_as_printed(outcome: Outcome) -> dict[str, Array]:
+    """Reward Eq. 16 as it is printed: its first term pays for being slow. Here to show just that."""
+    mean = _mean(outcome.speeds)
+    return {"speed": MOBILITY_WEIGHT * at_least(DESIRED_SPEED - mean, 0.0), **_eq16_costs(outcome)}
+
+
+def _eq16_costs(outcome: Outcome) -> dict[str, Array]:
+    too_close = at_least(LONGEST_PENALISED_HEADWAY - outcome.headways, 0.0)
+    return {
+        "headway": -HEADWAY_WEIGHT * too_close.sum(-1),
+        "acceleration": -ACCELERATION_WEIGHT * abs(outcome.accelerations).sum(-1),
+    }
+
+
+REWARDS: dict[str, Reward] = {
+    "released": released,
+    "eq16": eq16,
+    "eq16-as-printed": eq16_as_printed,
+}
+
+
+def time_headway(gap: Array, speed: Array) -> Array:
+    """Return gap over speed [s]; of a standing vehicle a very large number."""
+    return gap / at_least(speed, STANDING)
+
+
+def make_reward(text: str) -> Reward:
+    """Return the reward for a name or for `path.py:name`, a function of the user's own.
+
+    The user's function takes an `Outcome` and returns its terms by name, or one array.
+
+    Raises:
+        InputError: unknown name, or the file has no such function.
+    """
+    if not is_file_reference(text):
+        if text not in REWARDS:
+            raise wrong("reward", text, ", ".join([*REWARDS, "path.py:name"]))
+        return REWARDS[text]
+    path, _, name = text.rpartition(":")
+    function = load_object(Path(path), name)
+    if not callable(function) or inspect.isclass(function):
+        raise InputError(f"{Path(path).name}:{name}: is not a function of an Outcome")
+
+    def checked(outcome: Outcome) -> dict[str, Array]:
+        terms = function(outcome)
+        return terms if isinstance(terms, dict) else {"reward": terms}
+
+    return checked

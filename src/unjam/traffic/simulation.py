@@ -1,0 +1,164 @@
+"""SUMO: start, read, command, step. The only module that imports libsumo or traci."""
+
+import importlib
+import tempfile
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial
+from pathlib import Path
+from types import ModuleType, TracebackType
+from typing import Any, Literal, Self
+
+from unjam.errors import EpisodeError, MissingPartError, UnjamError
+from unjam.scenarios.scenario import Road
+from unjam.traffic.network_files import network_file, sumo_program
+
+Backend = Literal["libsumo", "traci", "gui"]
+"""`libsumo`: in this process; `traci`: SUMO as a child process; `gui`: the same, with its window."""
+
+SPEED_MODES = {"shielded": 31, "raw": 30, "flow": 25}
+"""SUMO's speed mode bits for each way of actuation: bit 0 is the check for a safe speed."""
+
+_open: "Simulation | None" = None
+
+
+class Simulation:
+    """One SUMO simulation, loaded anew for each episode.
+
+    libsumo holds one simulation per process and silently replaces the first by a second, so this class
+    refuses to open another while one is open.
+    """
+
+    def __init__(self, backend: Backend = "libsumo") -> None:
+        global _open
+        if _open is not None:
+            raise UnjamError("a simulation is already open in this process; close it, or use another process")
+        self.backend = backend
+        self._sumo = _import(backend)
+        self._folder = tempfile.TemporaryDirectory(prefix="unjam-")
+        self._running = False
+        call = partial(_function, self._sumo)
+        self._get_speed = call("vehicle", "getSpeed")
+        self._get_distance = call("vehicle", "getDistance")
+        self._get_fuel = call("vehicle", "getFuelConsumption")
+        self._set_speed = call("vehicle", "setSpeed")
+        self._set_previous_speed = call("vehicle", "setPreviousSpeed")
+        self.vehicle_count: Callable[[], int] = call("vehicle", "getIDCount")
+        """how many vehicles are on the road"""
+        self.colliding_count: Callable[[], int] = call("simulation", "getCollidingVehiclesNumber")
+        """how many vehicles touched another in the last step"""
+        self.step: Callable[[], object] = call("simulation", "step")
+        """simulates one time step"""
+        _open = self
+
+    def load(self, road: Road, step: float, seed: int, gui_options: Sequence[str] = ()) -> None:
+        """Start an episode: load network and traffic, and put the vehicles on the road.
+
+        Raises:
+            EpisodeError: SUMO refuses the files; the message holds its reason.
+        """
+        traffic = Path(self._folder.name) / "traffic.rou.xml"
+        traffic.write_text(road.traffic)
+        options = self._options(network_file(road), traffic, step, seed)
+        try:
+            if self._running:
+                self._sumo.load(options)
+            else:
+                program = "sumo-gui" if self.backend == "gui" else "sumo"
+                self._sumo.start([sumo_program(program), *options, *gui_options])
+                self._running = True
+            self.step()  # the first step inserts the vehicles and moves none
+        except Exception as error:
+            raise EpisodeError(f"SUMO cannot start: {self._reason() or error}") from error
+
+    def _options(self, network: Path, traffic: Path, step: float, seed: int) -> list[str]:
+        return [
+            *("--net-file", str(network), "--route-files", str(traffic)),
+            *("--step-length", str(step), "--seed", str(seed)),
+            *("--no-step-log", "true", "--no-warnings", "true", "--duration-log.disable", "true"),
+            *("--error-log", str(self._error_log)),
+            # The only setting in which a collision is real contact and every one is reported.
+            *("--collision.action", "warn", "--collision.mingap-factor", "0"),
+            *("--collision.check-junctions", "true"),
+            # Vehicles neither vanish from a jam nor give up waiting to enter.
+            *("--time-to-teleport", "-1", "--max-depart-delay", "-1"),
+        ]
+
+    @property
+    def _error_log(self) -> Path:
+        return Path(self._folder.name) / "error.log"
+
+    def _reason(self) -> str:
+        """Return SUMO's own words about its last error: they are in its log, not in its exception."""
+        try:
+            lines = [line.strip() for line in self._error_log.read_text().splitlines() if line.strip()]
+        except OSError:
+            return ""
+        return "; ".join(lines[:3])
+
+    def speeds(self, ids: Sequence[str]) -> list[float]:
+        """Return the speeds of `ids` [m/s]."""
+        return list(map(self._get_speed, ids))
+
+    def distances(self, ids: Sequence[str]) -> list[float]:
+        """Return how far each of `ids` has driven since it entered [m]."""
+        return list(map(self._get_distance, ids))
+
+    def fuel(self, ids: Sequence[str]) -> list[float]:
+        """Return the fuel rates of `ids` in the last step [mg/s], by their emission class."""
+        return list(map(self._get_fuel, ids))
+
+    def command_speeds(self, ids: Iterable[str], speeds: Iterable[float]) -> None:
+        """Ask for the speeds that `ids` shall have after the next step [m/s]: plain floats."""
+        for name, speed in zip(ids, speeds):
+            self._set_speed(name, speed)
+
+    def replace_speeds(self, ids: Iterable[str], speeds: Iterable[float]) -> None:
+        """Give `ids` other current speeds [m/s], plain floats: how noise enters."""
+        replace = self._set_previous_speed
+        for name, speed in zip(ids, speeds):
+            replace(name, speed)
+
+    def take_control(self, ids: Sequence[str], actuation: Literal["shielded", "raw", "flow"]) -> None:
+        """Make `ids` CAVs: from now on they obey `command_speeds`."""
+        for name in ids:
+            if actuation != "flow":  # Flow leaves its CAVs the human type
+                self._sumo.vehicle.setType(name, "cav")
+            self._sumo.vehicle.setSpeedMode(name, SPEED_MODES[actuation])
+
+    def close(self) -> None:
+        """End the simulation and remove its files; may be called twice."""
+        global _open
+        if self._running:
+            self._running = False
+            self._sumo.close()
+        self._folder.cleanup()
+        if _open is self:
+            _open = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+def _function(sumo: ModuleType, domain: str, name: str) -> Callable[..., Any]:
+    """Return a function of libsumo or traci; of libsumo the compiled one, without its Python wrapper.
+
+    The wrapper only passes its arguments on, and is a third of the cost of a call.
+    """
+    compiled = getattr(getattr(sumo, "libsumo", None), "_libsumo", None)
+    wrapped = sumo.simulationStep if name == "step" else getattr(getattr(sumo, domain), name)
+    return getattr(compiled, f"{domain}_{name}", wrapped)
+
+
+def _import(backend: Backend) -> ModuleType:
+    name = "libsumo" if backend == "libsumo" else "traci"
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        raise MissingPartError(
+            f"{name} cannot be imported ({error}); install it: pip install {name}==1.28.0"
+        ) from None

@@ -1,0 +1,73 @@
+"""A worker process: runs the episodes that it is asked for, one after the other. Free of torch.
+
+Started by `unjam.traffic.workers` as `python -m unjam.traffic.worker`.
+"""
+
+import gc
+import os
+import sys
+import time
+from typing import Any, BinaryIO
+
+from unjam.drivers.registry import driver_from_recipe
+from unjam.errors import UnjamError
+from unjam.scenarios.registry import scenario_from_recipe
+from unjam.traffic.episode import run_episode
+from unjam.traffic.messages import Arrays, read_message, write_message
+from unjam.traffic.record import failed_episode, pack_episode
+from unjam.traffic.simulation import Simulation
+
+SIGN_OF_LIFE = 0.2
+"""seconds between two reports of progress"""
+
+
+def main() -> None:
+    """Answer requests from standard input until it is closed."""
+    answers = os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)  # SUMO and user code may print: not into the answers
+    gc.freeze()  # what the imports made stays; searching it for garbage would cost every episode
+    simulation = None
+    try:
+        while True:
+            facts, arrays = read_message(sys.stdin.buffer)
+            try:
+                simulation = simulation or Simulation()
+                episode = _run(facts, arrays, simulation, answers)
+            except (BrokenPipeError, EOFError):
+                raise
+            except Exception as error:  # every requested episode has a row, also one that failed
+                known = isinstance(error, UnjamError)
+                reason = str(error) if known else f"{type(error).__name__}: {error}"
+                episode = failed_episode(tuple(facts["seed"]), reason, type(error).__name__)
+            answer, answer_arrays = pack_episode(episode)
+            write_message(answers, {"episode": answer}, answer_arrays)
+    except (BrokenPipeError, EOFError):
+        pass  # the parent is gone, or wants no more
+    finally:
+        if simulation is not None:
+            simulation.close()
+
+
+def _run(facts: dict[str, Any], arrays: Arrays, simulation: Simulation, answers: BinaryIO) -> Any:
+    last = time.monotonic()
+
+    def progress(steps: int) -> None:
+        nonlocal last
+        if time.monotonic() - last > SIGN_OF_LIFE:
+            last = time.monotonic()
+            write_message(answers, {"progress": steps})
+
+    return run_episode(
+        scenario_from_recipe(facts["scenario"]),
+        driver_from_recipe(facts["driver"], arrays),
+        facts["seed"],
+        facts["reward"],
+        facts["explore"],
+        facts["record_fuel"],
+        simulation,
+        progress,
+    )
+
+
+if __name__ == "__main__":
+    main()
