@@ -4,6 +4,7 @@ Every error that a user can cause or mend is one of these: one clear line, no tr
 """
 
 import errno
+from collections.abc import Iterable
 
 
 class UnjamError(Exception):
@@ -45,3 +46,8 @@ def disk_error(error: OSError, path: object) -> DiskError:
 def wrong(field: str, value: object, allowed: str) -> InputError:
     """Return the error for a wrong value, in the form that all of unjam uses."""
     return InputError(f"{field}: {value!r} is not allowed; allowed: {allowed}")
+
+
+def wrong_name(field: str, value: object, names: Iterable[str]) -> InputError:
+    """Return the error for a name that is not among `names`."""
+    return wrong(field, value, ", ".join(names))

@@ -36,9 +36,11 @@ SPEED_SCALE = 10.0
 RELATIVE_SPEED_SCALE = 5.0
 GAP_SCALE = 20.0
 ACCELERATION_SCALE = 1.0
+LOOP_LENGTH_SCALE = 250.0
 
-ObservationPart = Literal["local", "expert_acceleration", "expert_memory"]
-"""Parts of an observation: the paper's five numbers; the expert's acceleration; what the expert remembers."""
+ObservationPart = Literal["local", "expert_acceleration", "expert_memory", "loop_length"]
+"""Parts of an observation: the paper's five numbers; the expert's acceleration; what the expert remembers;
+the length of the closed road."""
 
 OBSERVATION_NAMES: dict[str, tuple[str, ...]] = {
     "local": (
@@ -49,6 +51,7 @@ OBSERVATION_NAMES: dict[str, tuple[str, ...]] = {
         f"gap to the follower / {GAP_SCALE:g} m",
     ),
     "expert_acceleration": (f"expert's acceleration / {ACCELERATION_SCALE:g} m/s2",),
+    "loop_length": (f"length of the closed road / {LOOP_LENGTH_SCALE:g} m",),
 }
 
 

@@ -17,8 +17,10 @@ from unjam.physics.arrays import Array, at_least, clip, namespace, stack_columns
 class PISaturation(Driver):
     """Drives at the mean of its own speed, a little faster behind a large gap, and yields when close.
 
-    The defaults are Table B2 of the paper. The paper divides the wanted change of speed by the time step,
-    which makes the command nearly bang-bang; `time_constant` spreads it over more time.
+    The defaults are Table B2 of the paper, but for `time_constant`. The paper divides the wanted change of
+    speed by the time step. Close behind a leader that makes the CAV its copy: it stops and starts with
+    it, never opens a gap, and in a fully grown jam stays part of the wave. Spread over 3 s, the same
+    controller dissolves the wave. `pi:time_constant=0` is the paper's.
     Source: Stern et al. 2018, Transp. Res. C 89:205-221; paper Eq. 9-11.
     """
 
@@ -36,7 +38,7 @@ class PISaturation(Driver):
     """dx_s: below this gap it follows the leader's speed [m]"""
     safe_gap_rule: Literal["constant", "closing"] = "constant"
     """`constant` as the paper; `closing`: max(2 s (v_lead - v), safe_gap), as Stern et al. and Flow"""
-    time_constant: Annotated[float, Field(ge=0)] = 0.0
+    time_constant: Annotated[float, Field(ge=0)] = 3.0
     """time over which the wanted speed is reached [s]; 0: one time step, as the paper"""
     first_command: Literal["own-speed", "zero"] = "own-speed"
     """commanded speed before the first step; Flow starts from zero"""

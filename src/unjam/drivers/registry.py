@@ -87,6 +87,7 @@ def recipe_of(driver: Driver, prefix: str = "") -> tuple[Recipe, dict[str, np.nd
             "expert": expert,
             "action_limit": driver.action_limit,
             "parts": list(driver.parts),
+            "hold": driver.hold,
             "authority": driver.network.authority,
             "exploration_std": driver.network.exploration_std,
         }
@@ -125,6 +126,7 @@ def driver_from_recipe(recipe: Recipe, arrays: dict[str, np.ndarray], prefix: st
             network_from_arrays(own, recipe["authority"], recipe["exploration_std"]),
             recipe["action_limit"],
             tuple(recipe["parts"]),
+            recipe["hold"],
         )
     raise wrong("driver recipe", kind, "named, file, residual")
 

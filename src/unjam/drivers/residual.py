@@ -1,14 +1,15 @@
 """An expert plus a learned residual: the paper's full policy, Eq. 8."""
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 
 from unjam.drivers.driver import Driver, Memory
-from unjam.drivers.local_state import ACCELERATION_SCALE, LocalState, ObservationPart, local_vector
+from unjam.drivers.local_state import ACCELERATION_SCALE, LOOP_LENGTH_SCALE, LocalState, ObservationPart, local_vector
 from unjam.drivers.network import Network
-from unjam.physics.arrays import Array, as_column, clip, join_columns
+from unjam.physics.arrays import Array, as_column, clip, join_columns, namespace
 
 
 class Decision(NamedTuple):
@@ -21,7 +22,7 @@ class Decision(NamedTuple):
     residual: Array
     """the network's share with its exploration noise, not clipped [m/s2], shape (n,)"""
     observation: Array
-    """what the network saw, shape (n, inputs)"""
+    """what the network saw, shape (n, inputs); empty for a single CAV whose residual is being held"""
     memory: Memory
 
 
@@ -40,6 +41,8 @@ def observe(
     for part in parts:
         if part == "local":
             blocks.append(local_vector(state))
+        elif part == "loop_length":
+            blocks.append(as_column(state.loop_length / LOOP_LENGTH_SCALE))
         elif part == "expert_acceleration":
             blocks.append(as_column(expert_acceleration / ACCELERATION_SCALE))
         else:
@@ -62,29 +65,70 @@ class ResidualDriver(Driver):
     """largest acceleration in either direction [m/s2]"""
     parts: tuple[ObservationPart, ...] = ("local",)
     """what the network sees"""
+    hold: int = 1
+    """decisions for which one residual is held; the expert goes on deciding in each of them"""
 
     @property
     def plain_numbers(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Whether the expert takes plain numbers."""
         return self.expert.plain_numbers
 
+    @cached_property
+    def _keys(self) -> tuple[str, str]:
+        """Names of the held residual and its age in the memory: others than those of an expert like this."""
+        depth, expert = 0, self.expert
+        while isinstance(expert, ResidualDriver):
+            depth, expert = depth + 1, expert.expert
+        return f"residual_{depth}", f"residual_age_{depth}"
+
     def initial_memory(self, n: int) -> Memory:
-        """Return the expert's memory; the network has none."""
-        return self.expert.initial_memory(n)
+        """Return the expert's memory and, where a residual is held, the residual and its age."""
+        memory = self.expert.initial_memory(n)
+        if self.hold == 1:
+            return memory
+        return {**memory, **{key: np.zeros(n) for key in self._keys}}
 
     def recall(self, memory: Memory, history: LocalState) -> Memory:
         """Return what the expert makes of the warm-up."""
-        return self.expert.recall(memory, history)
+        return {**memory, **self.expert.recall(memory, history)}
 
     def decide(self, state: LocalState, memory: Memory, noise: Array | None = None) -> Decision:
         """Return the decision taken apart; with standard normal `noise`, shape (n,), it explores."""
-        wanted, memory = self.expert.act(state, memory)
+        wanted, after = self.expert.act(state, memory)
         expert = clip(wanted, -self.action_limit, self.action_limit)
-        observation = observe(self.parts, state, expert, self.expert, memory)
-        network = self.network
-        residual = network(observation) if noise is None else network.explore(observation, noise)
+        if self.hold == 1:
+            observation, residual = self._look(state, expert, after, noise)
+        else:
+            held, age = self._keys
+            observation, residual = self._look_or_hold(state, expert, after, noise, memory)
+            after = {**after, held: residual, age: memory[age] + 1.0}
         acceleration = clip(expert + residual, -self.action_limit, self.action_limit)
-        return Decision(acceleration, expert, residual, observation, memory)
+        return Decision(acceleration, expert, residual, observation, after)
+
+    def observation(self, state: LocalState, memory: Memory) -> Array:
+        """Return what the network would see now, whether or not its residual is being held."""
+        wanted, after = self.expert.act(state, memory)
+        expert = clip(wanted, -self.action_limit, self.action_limit)
+        return observe(self.parts, state, expert, self.expert, after)
+
+    def _look(
+        self, state: LocalState, expert: Array, after: Memory, noise: Array | None
+    ) -> tuple[Array, Array]:
+        """Return what the network sees, and its residual."""
+        observation = observe(self.parts, state, expert, self.expert, after)
+        network = self.network
+        return observation, network(observation) if noise is None else network.explore(observation, noise)
+
+    def _look_or_hold(
+        self, state: LocalState, expert: Array, after: Memory, noise: Array | None, memory: Memory
+    ) -> tuple[Array, Array]:
+        """Return what the network sees and the residual: a new one where the held one is old enough."""
+        held, age = self._keys
+        due = memory[age] % self.hold == 0
+        if due is False:  # a single CAV in plain numbers: the network need not be asked
+            return (), memory[held]
+        observation, fresh = self._look(state, expert, after, noise)
+        return observation, namespace(fresh).where(due, fresh, memory[held])
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
         """Return the deterministic acceleration, clip(expert + residual), and the expert's new memory."""

@@ -1,5 +1,6 @@
 """The ring road: one lane, closed, and too full for people to drive without waves."""
 
+from dataclasses import replace
 from typing import Annotated, ClassVar
 
 import numpy as np
@@ -79,6 +80,18 @@ class Ring(Scenario):
                 f'departLane="0" departPos="{place!r}"/>'
             )
         return "\n".join([*lines, "</routes>"])
+
+    @property
+    def drawn_ranges(self) -> dict[str, tuple[float, float]]:
+        """The ring's length."""
+        return {"length": self.length}
+
+    def part(self, index: int, count: int) -> "Ring":
+        """Return this ring with one of `count` equal parts of its lengths."""
+        shortest, longest = self.length
+        borders = np.linspace(shortest, longest + 1, count + 1).astype(int)
+        low, high = int(borders[index]), int(borders[index + 1]) - 1
+        return replace(self, length=(low, max(low, high)))
 
     def facts(self) -> list[tuple[str, str]]:
         """Return the ring's own facts for `unjam scenarios`."""

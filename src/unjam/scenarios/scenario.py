@@ -95,6 +95,26 @@ class Scenario:
         """Return the road of one episode; everything random about it comes from `generator`."""
         raise NotImplementedError
 
+    def drawn_scaled(self, drawn: dict[str, float]) -> tuple[float, ...]:
+        """Return what an episode has drawn, each number scaled to [-1, 1] over its range: for a critic."""
+        return tuple(
+            (drawn[name] - (low + high) / 2) / max((high - low) / 2, 1e-9)
+            for name, (low, high) in self.drawn_ranges.items()
+        )
+
+    @property
+    def drawn_ranges(self) -> dict[str, tuple[float, float]]:
+        """What each episode draws anew, and from which range."""
+        raise NotImplementedError
+
+    def part(self, index: int, count: int) -> "Scenario":
+        """Return this scenario with what it draws narrowed to one of `count` equal parts of the range.
+
+        Episodes of all parts cover the range evenly: with few episodes, whether a ring is long or short
+        otherwise hides what the driver does.
+        """
+        raise NotImplementedError
+
     def facts(self) -> list[tuple[str, str]]:
         """Return what a reader wants to know of this road, as (name, value) pairs."""
         raise NotImplementedError

@@ -1,6 +1,7 @@
 """An episode is a pure function: `run_episode(scenario, driver, seed) -> Episode`."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -8,6 +9,7 @@ from unjam.drivers.driver import Driver, single_row
 from unjam.drivers.local_state import LocalState
 from unjam.drivers.residual import ResidualDriver
 from unjam.errors import InputError
+from unjam.physics.arrays import Array
 from unjam.scenarios.scenario import Scenario
 from unjam.traffic.record import Episode, Floats, Trajectory
 from unjam.traffic.reward import Outcome, Reward, make_reward, time_headway
@@ -57,14 +59,23 @@ def run_episode(
                 scenario, driver, seed, reward, explore, record_fuel, simulation, progress
             )
     traffic = Traffic(scenario, seed, simulation, driver.plain_numbers, record_fuel)
-    decisions = _drive(traffic, driver, explore, progress)
-    return _episode(traffic, seed, earned, decisions)
+    return _episode(traffic, seed, earned, _drive(traffic, driver, explore, progress))
+
+
+@dataclass(frozen=True)
+class ResidualLog:
+    """What a residual driver decided in an episode."""
+
+    decisions: list[tuple[Array, Array, Array, Array]]
+    """each `Decision` but its memory, which is large"""
+    last_observation: Array
+    hold: int
 
 
 def _drive(
     traffic: Traffic, driver: Driver, explore: bool, progress: Progress | None
-) -> list[tuple]:
-    """Drive to the end; return the `Decision`s of a residual driver without memory, one more than driven."""
+) -> ResidualLog | None:
+    """Drive to the end; return what a residual driver decided, None of any other."""
     history = traffic.start(controlled=not driver.native, progress=progress)
     memory = driver.initial_memory(len(traffic.road.cav_ids))
     if history is not None and traffic.scenario.recall_warmup:
@@ -78,7 +89,7 @@ def _drive(
         if residual is not None:
             decision = residual.decide(traffic.local_state(), memory, noise[step - 1])
             memory = decision.memory
-            decisions.append(decision[:-1])  # without the memory, which is large
+            decisions.append(decision[:-1])
             traffic.advance(decision.acceleration)
         elif driver.native:
             traffic.advance(None)
@@ -89,12 +100,12 @@ def _drive(
             progress(step)
         if traffic.crashed:
             break
-    if residual is not None:
-        decisions.append(residual.decide(traffic.local_state(), memory)[:-1])
-    return decisions
+    if residual is None:
+        return None
+    return ResidualLog(decisions, residual.observation(traffic.local_state(), memory), residual.hold)
 
 
-def _episode(traffic: Traffic, seed: Sequence[int], reward: Reward, decisions: list[tuple]) -> Episode:
+def _episode(traffic: Traffic, seed: Sequence[int], reward: Reward, log: ResidualLog | None) -> Episode:
     """Put the record of finished traffic in order."""
     road = traffic.road
     each = traffic.scenario.steps_per_decision
@@ -116,12 +127,12 @@ def _episode(traffic: Traffic, seed: Sequence[int], reward: Reward, decisions: l
         gaps=np.ascontiguousarray(states.leader_gap.T),
         fuel=np.array(traffic.log_fuel) if traffic.log_fuel else np.zeros((0, 0)),
         outline=road.outline,
-        trajectories=_trajectories(traffic, states, reward, decisions),
+        trajectories=_trajectories(traffic, states, reward, log),
     )
 
 
 def _trajectories(
-    traffic: Traffic, states: LocalState, reward: Reward, decisions: list[tuple]
+    traffic: Traffic, states: LocalState, reward: Reward, log: ResidualLog | None
 ) -> tuple[Trajectory, ...]:
     """Return the trajectory of each CAV; `states` are those of all vehicles, shape (vehicles, T + 1)."""
     road = traffic.road
@@ -134,12 +145,14 @@ def _trajectories(
     headways = time_headway(states.leader_gap[places, 1:], states.speed[places, 1:]).T
     terms = _checked(reward(Outcome(states.speed[:, 1:].T, applied, headways, crashed)), steps)
     expert, residual = applied, np.zeros_like(applied)
-    observations = np.zeros((steps + 1, cavs, 0))
-    if decisions:
-        _, experts, residuals, seen = zip(*decisions, strict=True)
-        expert = np.array(experts[:-1]).reshape(steps, cavs)
-        residual = np.array(residuals[:-1]).reshape(steps, cavs)
-        observations = np.array(seen).reshape(steps + 1, cavs, -1)
+    observations, hold = np.zeros((1, cavs, 0)), 1
+    if log is not None:
+        hold = log.hold
+        _, experts, residuals, seen = zip(*log.decisions, strict=True)
+        expert = np.array(experts).reshape(steps, cavs)
+        residual = np.array(residuals).reshape(steps, cavs)
+        looks = [*seen[::hold], log.last_observation]
+        observations = np.array(looks).reshape(len(looks), cavs, -1)
     return tuple(
         Trajectory(
             vehicle=name,
@@ -151,6 +164,7 @@ def _trajectories(
             applied=np.ascontiguousarray(applied[:, row]),
             shield=np.ascontiguousarray(shield[:, row]),
             terms=terms,
+            hold=hold,
             terminated=traffic.crashed,
         )
         for row, (name, place) in enumerate(zip(road.cav_ids, places, strict=True))

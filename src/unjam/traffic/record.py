@@ -21,7 +21,8 @@ class Trajectory:
     states: LocalState
     """what it perceived, shape (T + 1,): the last entry is where it ended"""
     observations: Floats
-    """what the residual network saw, shape (T + 1, inputs); (T + 1, 0) without one"""
+    """what the residual network saw at each of its looks, and at the end, shape (looks + 1, inputs); it
+    looks every `hold` decisions; (1, 0) without a network"""
     expert: Floats
     """the expert's acceleration within the action limit [m/s2]"""
     residual: Floats
@@ -32,6 +33,8 @@ class Trajectory:
     """braking that SUMO's safety check added to the command [m/s2]; zero where it let it pass"""
     terms: dict[str, Floats]
     """terms of the reward by name"""
+    hold: int
+    """decisions for which one residual was held"""
     terminated: bool
     """whether a collision ended it; otherwise it was cut by the horizon or by leaving the road"""
 
@@ -39,6 +42,12 @@ class Trajectory:
     def reward(self) -> Floats:
         """What each decision earned: the sum of the terms."""
         return np.sum(list(self.terms.values()), axis=0)
+
+    @property
+    def looks(self) -> tuple[Floats, Floats]:
+        """The residuals that the network chose, and what was earned while each was held; shape (looks,)."""
+        starts = np.arange(0, len(self.residual), self.hold)
+        return self.residual[starts], np.add.reduceat(self.reward, starts)
 
 
 @dataclass(frozen=True)
@@ -116,6 +125,7 @@ def pack_episode(episode: Episode) -> tuple[dict[str, Any], dict[str, Floats]]:
                 "vehicle": trajectory.vehicle,
                 "start": trajectory.start,
                 "terminated": trajectory.terminated,
+                "hold": trajectory.hold,
                 "terms": list(trajectory.terms),
             }
         )
@@ -131,6 +141,7 @@ def unpack_episode(facts: dict[str, Any], arrays: dict[str, Floats]) -> Episode:
                 vehicle=about["vehicle"],
                 start=about["start"],
                 terminated=about["terminated"],
+                hold=about["hold"],
                 states=LocalState(*(arrays[f"{index}.states.{name}"] for name in LocalState._fields)),
                 terms={name: arrays[f"{index}.terms.{name}"] for name in about["terms"]},
                 **{name: arrays[f"{index}.{name}"] for name in _TRAJECTORY_ARRAYS},

@@ -1,0 +1,61 @@
+"""What decides how an agent learns. Free of torch, so that a wrong value is refused at once."""
+
+from typing import Annotated
+
+from pydantic import Field
+from pydantic.dataclasses import dataclass
+
+from unjam.drivers.local_state import ObservationPart
+from unjam.parameters import STRICT, Count, NotNegative, Positive
+
+Discount = Annotated[float, Field(gt=0, lt=1)]
+Share = Annotated[float, Field(ge=0, le=1)]
+
+
+@dataclass(frozen=True, config=STRICT)
+class PolicySettings:
+    """The residual network and how it explores."""
+
+    hidden: tuple[Count, ...] = (64, 64)
+    """units of the hidden layers, of the policy and of the value network"""
+    observe: Annotated[tuple[ObservationPart, ...], Field(min_length=1)] = (
+        "local",
+        "expert_acceleration",
+        "expert_memory",
+    )
+    """what the network sees; the paper's network sees `local` alone, and cannot know what PI will do"""
+    authority: Positive = 1.0
+    """largest residual, as a share of the action limit"""
+    exploration_std: Positive = 0.1
+    """standard deviation of the exploration noise at the start, as a share of the action limit"""
+    learn_exploration: bool = True
+    """whether the standard deviation is learned, or stays what it is at the start"""
+    hold: Count = 10
+    """decisions for which one residual is held: on the ring a second, over which noise adds up to a change
+    of speed instead of cancelling itself"""
+    critic_sees_road: bool = True
+    """whether the value network also sees what the episode has drawn (the ring's length); without it, it
+    takes a large gap for a longer and faster ring, and the policy learns to fall back"""
+    normalise_value: bool = True
+    """scale the value network by the returns of the first iteration: one that starts at zero needs tens of
+    iterations to reach values of 150"""
+
+
+@dataclass(frozen=True, config=STRICT)
+class TRPOSettings:
+    """Trust region policy optimisation. Where they differ from Table B5, the preset `paper` has the paper's."""
+
+    batch_steps: Count = 12_000
+    """actual steps in an iteration, rounded up to whole episodes"""
+    spread: bool = True
+    """whether the episodes of an iteration cover the range of what they draw (the ring's lengths) evenly"""
+    gamma: Discount = 0.99
+    """discount from one look of the network to the next"""
+    gae_lambda: Share = 0.97
+    target_kl: Positive = 0.03
+    cg_damping: Positive = 0.1
+    cg_steps: Count = 15
+    critic_epochs: Count = 10
+    critic_batch: Count = 250
+    critic_rate: Positive = 1e-3
+    value_l2: NotNegative = 1e-3

@@ -1,0 +1,1 @@
+"""How we train and compare: configurations, runs, evaluations."""

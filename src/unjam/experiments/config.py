@@ -1,0 +1,125 @@
+"""Everything that decides what a training run does: one validated configuration, as TOML and flags."""
+
+import tomllib
+from dataclasses import asdict, field
+from pathlib import Path
+from typing import Any, Literal
+
+import tomli_w
+from pydantic import model_validator
+from pydantic.dataclasses import dataclass
+
+from unjam.agents.settings import PolicySettings, TRPOSettings
+from unjam.drivers.constant import Constant
+from unjam.drivers.driver import Driver
+from unjam.errors import InputError, wrong_name
+from unjam.experiments.presets import PRESETS
+from unjam.parameters import STRICT, Count, CountOrNone, build
+from unjam.scenarios.registry import make_scenario
+from unjam.scenarios.scenario import Scenario
+
+@dataclass(frozen=True, config=STRICT)
+class EvaluationSettings:
+    """How a run is judged, always with the deterministic policy; its steps are counted apart."""
+
+    every: CountOrNone = 5
+    """iterations between two validations; 0: none, and the last policy becomes the controller"""
+    validation_episodes: Count = 4
+    """episodes of a validation, the same seeds each time: they choose the controller"""
+    episodes: Count = 20
+    """episodes of the final evaluation, on held-out seeds that chose nothing"""
+    baselines: tuple[str, ...] = ("human", "pi", "follower-stopper")
+    """drivers that are evaluated beside the expert and the trained controller"""
+
+
+@dataclass(frozen=True, config=STRICT)
+class RunConfig:
+    """One training run. Every key can be set in a TOML file, by `--set key=value`, and in Python."""
+
+    scenario: str = "ring"
+    road: dict[str, Any] = field(default_factory=dict)
+    """changes to the scenario's parameters"""
+    agent: Literal["trpo"] = "trpo"
+    expert: str = "pi"
+    """driver that the residual is added to: a name, `path.py:name`, a run folder, a .unjam file; `none`:
+    the network drives alone"""
+    reward: str = ""
+    """a name or `path.py:name`; empty: the scenario's own"""
+    steps: Count = 960_000
+    """actual steps of training"""
+    seed: CountOrNone = 0
+    workers: Count = 2
+    policy: PolicySettings = field(default_factory=PolicySettings)
+    trpo: TRPOSettings = field(default_factory=TRPOSettings)
+    evaluation: EvaluationSettings = field(default_factory=EvaluationSettings)
+    preset: str = ""
+    """which preset this started from, for the record"""
+
+    @model_validator(mode="after")
+    def _possible(self) -> "RunConfig":
+        self.make_scenario()
+        return self
+
+    def make_scenario(self) -> Scenario:
+        """Return the scenario with its changes."""
+        try:
+            return make_scenario(self.scenario, self.road)
+        except InputError as error:
+            raise ValueError(str(error)) from None
+
+    def make_expert(self) -> Driver:
+        """Return the driver that the residual is added to."""
+        from unjam.controller import make_driver
+
+        if self.expert == "none":
+            return Constant()
+        return make_driver(self.expert, self.make_scenario().decision_step)
+
+
+def load_config(
+    file: Path | None = None, preset: str = "", changes: dict[str, Any] | None = None
+) -> RunConfig:
+    """Return a configuration: the defaults, changed by a preset, by a TOML file, by `changes`, in this order.
+
+    Keys of `changes` may have dots: `trpo.gamma`.
+
+    Raises:
+        InputError: an unknown key or preset, a value out of range, an unreadable file.
+    """
+    values: dict[str, Any] = {}
+    if preset:
+        if preset not in PRESETS:
+            raise wrong_name("preset", preset, PRESETS)
+        values = merge(values, {**PRESETS[preset], "preset": preset})
+    if file is not None:
+        values = merge(values, read_toml(file))
+    for key, value in (changes or {}).items():
+        nested: Any = value
+        for part in reversed(key.split(".")):
+            nested = {part: nested}
+        values = merge(values, nested)
+    return build(RunConfig, values, "")
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """Return the content of a TOML file; raise `InputError` where it is missing or not TOML."""
+    try:
+        return tomllib.loads(path.read_text())
+    except OSError as error:
+        raise InputError(f"config file {path}: {error.strerror}") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"config file {path}: not TOML: {error}") from None
+
+
+def merge(values: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
+    """Return `values` with `changes`; tables are merged key by key."""
+    merged = dict(values)
+    for key, value in changes.items():
+        both = isinstance(value, dict) and isinstance(merged.get(key), dict)
+        merged[key] = merge(merged[key], value) if both else value
+    return merged
+
+
+def to_toml(config: RunConfig) -> str:
+    """Return a configuration as TOML, every key written out."""
+    return tomli_w.dumps(asdict(config))

@@ -1,0 +1,21 @@
+"""Named starting points of a training run: what differs from the defaults, and why."""
+
+from typing import Any
+
+PRESETS: dict[str, dict[str, Any]] = {
+    # What the paper says, where it says something: Tables B2 and B5, section 4.1.
+    "paper": {
+        "expert": "pi:time_constant=0",
+        "steps": 4_000_000,
+        "policy": {
+            "observe": ["local"],
+            "exploration_std": 1.0,
+            "hold": 1,
+            "critic_sees_road": False,
+            "normalise_value": False,
+        },
+        "trpo": {"batch_steps": 6000, "spread": False, "gamma": 0.995, "target_kl": 0.01},
+    },
+    # Ends within about five minutes on two cores, evaluation included.
+    "demo": {"steps": 600_000},
+}
