@@ -1,3 +1,53 @@
-"""Train, compare and ship controllers for automated vehicles that dissolve stop-and-go waves."""
+"""Train, compare and ship controllers for automated vehicles that dissolve stop-and-go waves.
+
+    import unjam
+    result = unjam.drive("ring-jammed", driver="pi", episodes=5, out="runs/first")
+    print(result.mean["time_to_dissolve"], result.report)
+
+The same on the command line: `unjam --help`.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
 __version__ = "0.1.0.dev0"
+
+if TYPE_CHECKING:
+    from unjam.controller import load_controller
+    from unjam.drivers import Driver, LocalState, check_driver
+    from unjam.experiments.config import load_config
+    from unjam.experiments.drive import drive
+    from unjam.experiments.train import train
+    from unjam.reports.html import write_report
+    from unjam.traffic.episode import run_episode
+
+# Imported when first used: workers must stay free of torch, and the command line quick.
+_PLACES = {
+    "drive": "unjam.experiments.drive",
+    "train": "unjam.experiments.train",
+    "load_config": "unjam.experiments.config",
+    "load_controller": "unjam.controller",
+    "run_episode": "unjam.traffic.episode",
+    "write_report": "unjam.reports.html",
+    "Driver": "unjam.drivers",
+    "LocalState": "unjam.drivers",
+    "check_driver": "unjam.drivers",
+}
+
+__all__ = [
+    "Driver",
+    "LocalState",
+    "check_driver",
+    "drive",
+    "load_config",
+    "load_controller",
+    "run_episode",
+    "train",
+    "write_report",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _PLACES:
+        raise AttributeError(f"module 'unjam' has no attribute {name!r}")
+    return getattr(import_module(_PLACES[name]), name)

@@ -6,8 +6,11 @@ from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 
 from unjam.errors import InputError
 
-STRICT = ConfigDict(extra="forbid", allow_inf_nan=False)
-"""Configuration of every parameter dataclass: an unknown name or a NaN is an error, not a surprise."""
+STRICT = ConfigDict(extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
+"""Configuration of every parameter dataclass: an unknown name or a NaN is an error, not a surprise.
+
+The texts under its fields are what `unjam drivers` and the documentation show.
+"""
 
 Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]

@@ -30,10 +30,14 @@ class IDM(IDMParameters, Driver):
 
 
 @dataclass(frozen=True, config=STRICT)
-class Human(IDM):
+class Human(Driver):
     """Nobody automated: the vehicle stays one of the road's human drivers, with their noise.
 
     With this driver the traffic is all-human. It is the simulator that drives.
     """
 
     native: ClassVar[bool] = True
+
+    def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
+        """Return what the paper's IDM would do; the simulator does not ask."""
+        return IDM().act(state, memory)

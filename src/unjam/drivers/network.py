@@ -33,17 +33,15 @@ class Network:
 
     def __call__(self, observation: Any) -> Any:
         """Return the residual acceleration [m/s2]: shape (n,) for (n, inputs), a float for a tuple."""
-        if isinstance(observation, tuple):
-            return self.authority * math.tanh(self._last_layer(np.array((*observation, 1.0))))
-        ones = np.ones((len(observation), 1))
-        return self.authority * np.tanh(self._last_layer(np.hstack([observation, ones])))
-
-    def _last_layer(self, hidden: Floats) -> Any:
-        first, *others = self._folded
-        hidden = hidden.dot(first)
-        for weight in others:
+        single = isinstance(observation, tuple)
+        if single:
+            hidden = np.array((*observation, 1.0))
+        else:
+            hidden = np.hstack([observation, np.ones((len(observation), 1))])
+        hidden = hidden.dot(self._folded[0])
+        for weight in self._folded[1:]:
             hidden = np.maximum(hidden, 0.0, out=hidden).dot(weight)
-        return hidden
+        return self.authority * (math.tanh(hidden) if single else np.tanh(hidden))
 
     def explore(self, observation: Any, noise: Any) -> Any:
         """Return the residual with exploration; `noise` is standard normal, shaped like the residual."""

@@ -11,7 +11,7 @@ from safetensors.torch import load, save
 
 from unjam.agents.state import Tensors
 from unjam.errors import InputError
-from unjam.experiments.files import make_folder, write_whole
+from unjam.files import make_folder, write_whole
 
 GENERATIONS = 2
 STATE, TENSORS = "state.json", "tensors.safetensors"

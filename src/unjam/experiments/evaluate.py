@@ -11,7 +11,7 @@ from safetensors.numpy import save
 
 from unjam.drivers.driver import Driver
 from unjam.errors import EpisodeError, InputError, MissingPartError, UnjamError
-from unjam.experiments.files import make_folder, to_json, write_whole
+from unjam.files import make_folder, to_json, write_whole
 from unjam.reports.metrics import METRICS, measure
 from unjam.reports.statistics import estimate
 from unjam.scenarios.scenario import Scenario
@@ -95,7 +95,7 @@ def save_evaluation(folder: Path, evaluation: Evaluation, about: dict[str, Any])
     """
     make_folder(folder)
     rows = [{"driver": label, **row} for label, found in evaluation.rows.items() for row in found]
-    frame = pd.DataFrame([{**row, "seed": "-".join(map(str, row["seed"]))} for row in rows])
+    frame = pd.DataFrame([{**row, "seed": str(row["seed"])} for row in rows])
     arrays = {}
     for number, episode in enumerate(evaluation.shown.values()):
         for name in ("speeds", "positions", "gaps", "outline"):

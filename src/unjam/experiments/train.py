@@ -1,36 +1,86 @@
-"""A training run: from a configuration to a folder that holds everything about it."""
+"""Train: from a configuration to a folder that holds everything about the run. `unjam train`, `unjam.train`."""
 
-import json
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
+import torch
 
-from unjam.agents.algorithms import EpisodicTRPO, Iteration
-from unjam.agents.state import learner_state, restore_learner
-from unjam.controller import controller_bytes, make_driver
-from unjam.drivers.driver import Driver
-from unjam.drivers.network import Network
 from unjam.drivers.registry import describe
-from unjam.drivers.residual import ResidualDriver, observation_size
 from unjam.errors import InputError
-from unjam.experiments.checkpoint import load_checkpoint, save_checkpoint
 from unjam.experiments.config import RunConfig, load_config, to_toml
-from unjam.experiments.evaluate import VALIDATION, evaluate, held_out_seeds, raise_failure, save_evaluation
-from unjam.experiments.files import append_line, make_folder, to_json, write_whole
+from unjam.experiments.judge import TRAINED, judge
 from unjam.experiments.manifest import manifest
-from unjam.reports.metrics import measure
-from unjam.scenarios.registry import scenario_recipe
-from unjam.traffic.record import Episode
-from unjam.traffic.workers import EpisodeTask, Workers
+from unjam.experiments.run import Run, Told
+from unjam.files import make_folder, to_json, write_whole
+from unjam.reports.html import write_report
+from unjam.reports.statistics import Estimate, paired_difference
+from unjam.traffic.workers import Workers
 
-TRAINED = "trained"
-"""label of the trained controller in tables and pictures"""
 
-Told = Callable[[dict[str, Any]], None]
-"""told each row of progress as it is written"""
+@dataclass(frozen=True)
+class TrainResult:
+    """A finished training run."""
+
+    folder: Path
+    rows: dict[str, list[dict[str, Any]]]
+    """by driver: a row of metrics per held-out episode"""
+    gain: Estimate | None
+    """return of the trained controller beyond its expert's, same seeds paired; None without an expert"""
+
+    @property
+    def controller(self) -> Path:
+        """The trained controller: the best on the validation seeds."""
+        return self.folder / "controller.unjam"
+
+    @property
+    def report(self) -> Path:
+        """The page that shows what happened."""
+        return self.folder / "report.html"
+
+
+def train(
+    config: RunConfig,
+    folder: Path | str,
+    resume: bool = False,
+    told: Told | None = None,
+    progress: Callable[[tuple[str, int], int], None] | None = None,
+) -> TrainResult:
+    """Train as `config` says into `folder`, judge the controller on held-out seeds, and write the report.
+
+    A run that was stopped goes on where it was with `resume`; one that ended goes on if `config.steps` is
+    larger than before. It then ends with the same parameters as if it had never stopped.
+
+    Args:
+        config: what to do; see `unjam.load_config`.
+        folder: new, or the run's.
+        resume: whether to go on with the run in `folder`.
+        told: told a row of progress after each iteration.
+        progress: told how far the final evaluation is: ((driver, episode), decisions).
+
+    Raises:
+        InputError: the folder holds something else, or the driver or reward are at fault.
+        DiskError: the disk is full; the last checkpoint is whole.
+    """
+    folder = Path(folder)
+    if resume:
+        continue_folder(folder, config)
+    else:
+        start_folder(folder, config)
+    torch.set_num_threads(1)  # more threads would fight with the workers for the cores
+    with Workers(config.workers) as workers:
+        Run(folder, config, workers, told).train()
+        found = judge(folder, config, workers, progress=progress)
+    write_report([folder], folder / "report.html")
+    return TrainResult(folder, found.rows, gain_of(config, found.rows))
+
+
+def gain_of(config: RunConfig, rows: dict[str, list[dict[str, Any]]]) -> Estimate | None:
+    """Return what the trained controller earns beyond its expert, same seeds paired."""
+    if config.expert == "none":
+        return None
+    return paired_difference(rows[TRAINED], rows[describe(config.make_expert())], "return")
 
 
 def start_folder(folder: Path, config: RunConfig) -> None:
@@ -53,182 +103,14 @@ def read_config(folder: Path) -> RunConfig:
     return load_config(folder / "config.toml")
 
 
-class Run:
-    """One training run in its folder: collects, learns, validates, keeps checkpoints, and judges at the end."""
+def continue_folder(folder: Path, config: RunConfig) -> None:
+    """Check that `config` may go on with the run in `folder`, and write down its new budget.
 
-    def __init__(self, folder: Path, config: RunConfig, workers: Workers, told: Told | None = None) -> None:
-        """Prepare a run, from its newest checkpoint if it has one."""
-        self.folder = folder
-        self.config = config
-        self.workers = workers
-        self.scenario = config.make_scenario()
-        self.expert = config.make_expert()
-        self._told = told
-        self._validation_best = -np.inf
-        self._expert_return = float("nan")
-        settings = config.policy
-        self.learner = EpisodicTRPO(
-            observation_size(settings.observe, self.expert),
-            self.scenario,
-            settings,
-            config.trpo,
-            config.seed,
-            self._collect,
-            self._after_iteration,
-        )
-        checkpoint = load_checkpoint(folder / "checkpoint")
-        if checkpoint is not None:
-            state, tensors = checkpoint
-            restore_learner(self.learner, state, tensors)
-            self._validation_best = state["validation_best"]
-            self._expert_return = state["expert_return"]
-            self._forget_progress_after(state["iteration"])
-
-    def train(self) -> None:
-        """Learn until the configured number of actual steps; a stop loses at most the running iteration."""
-        if self.learner.iteration == 0:
-            self._expert_return = self._validate(self.expert)
-            self._keep_controller(self.learner.policy.network())
-            self._validation_best = self._expert_return
-        if self.learner.num_timesteps < self.config.steps:
-            self.learner.run(self.config.steps)
-
-    def driver(self, network: Network) -> ResidualDriver:
-        """Return the full policy: the expert plus this residual."""
-        policy = self.config.policy
-        return ResidualDriver(self.expert, network, self.scenario.action_limit, policy.observe, policy.hold)
-
-    def _collect(self, network: Network, iteration: int) -> Sequence[Episode]:
-        driver, steps = self.driver(network), self.config.trpo.batch_steps
-        count = -(-steps // self.scenario.horizon)
-        return self._run_spread(driver, count, (self.config.seed, iteration), explore=True)
-
-    def _validate(self, driver: Driver) -> float:
-        episodes = self._run_spread(driver, self.config.evaluation.validation_episodes, (VALIDATION,))
-        return float(np.mean([measure(episode)["return"] for episode in episodes]))
-
-    def _run_spread(
-        self, driver: Driver, count: int, seed: tuple[int, ...], explore: bool = False
-    ) -> list[Episode]:
-        """Run `count` episodes that cover the range of what the scenario draws; raise where one failed."""
-        scenario, spread = self.scenario, self.config.trpo.spread
-        episodes = self.workers.run(
-            [
-                EpisodeTask(
-                    scenario.part(index, count) if spread else scenario,
-                    driver,
-                    (*seed, index),
-                    self.config.reward,
-                    explore,
-                )
-                for index in range(count)
-            ]
-        )
-        raise_failure([measure(episode) for episode in episodes if not episode.ok])
-        return episodes
-
-    def _after_iteration(self, iteration: Iteration) -> None:
-        """Validate now and then, and write progress and checkpoint."""
-        started = time.perf_counter()
-        validation, every = None, self.config.evaluation.every
-        last = iteration.actual_steps >= self.config.steps
-        if every and (iteration.number % every == 0 or last):
-            network = self.learner.policy.network()
-            validation = self._validate(self.driver(network))
-            if validation > self._validation_best:
-                self._validation_best = validation
-                self._keep_controller(network)
-        elif not every and last:
-            self._keep_controller(self.learner.policy.network())
-        seconds = {**iteration.seconds, "validation": time.perf_counter() - started}
-        row = self._row(iteration, validation, seconds)
-        append_line(self.folder / "progress.jsonl", to_json(row))
-        counters, tensors = learner_state(self.learner)
-        state = {
-            **counters,
-            "validation_best": self._validation_best,
-            "expert_return": self._expert_return,
-        }
-        save_checkpoint(self.folder / "checkpoint", state, tensors)
-        if self._told is not None:
-            self._told(row)
-
-    def _row(self, iteration: Iteration, validation: float | None, seconds: dict[str, float]) -> dict[str, Any]:
-        measured = [measure(episode) for episode in iteration.episodes]
-
-        def mean(name: str) -> float:
-            return float(np.mean([row[name] for row in measured]))
-
-        return {
-            "iteration": iteration.number,
-            "actual_steps": iteration.actual_steps,
-            "virtual_steps": iteration.virtual_steps,
-            "k_star": None,  # no virtual environment yet
-            "eps_m": None,
-            "return_mean": mean("return"),
-            "return_expert": self._expert_return,
-            "return_validation": validation,
-            "mean_speed": mean("mean_speed"),
-            "speed_std_fleet": mean("speed_std_fleet"),
-            "mean_abs_accel": mean("mean_abs_accel"),
-            "shield_override_share": mean("shield_override_share"),
-            "collisions": sum(row["collisions"] for row in measured),
-            "learner": iteration.log,
-            "seconds": seconds,
-        }
-
-    def _keep_controller(self, network: Network) -> None:
-        about = {
-            "scenario": scenario_recipe(self.scenario),
-            "expert": describe(self.expert),
-            "iteration": self.learner.iteration,
-            "actual_steps": self.learner.num_timesteps,
-        }
-        write_whole(self.folder / "controller.unjam", controller_bytes(self.driver(network), about))
-
-    def _forget_progress_after(self, iteration: int) -> None:
-        """Remove rows of iterations that the checkpoint does not know: they will be made again."""
-        path = self.folder / "progress.jsonl"
-        rows = read_progress(self.folder)
-        kept = [to_json(row) + "\n" for row in rows if row["iteration"] <= iteration]
-        write_whole(path, "".join(kept))
-
-    def judge(self, progress: Callable[[str, int, int], None] | None = None) -> None:
-        """Evaluate the controller beside its expert and the baselines on held-out seeds, and save it all."""
-        trained = make_driver(str(self.folder), self.scenario.decision_step)
-        drivers = comparison(self.config, trained)
-        seeds = held_out_seeds(self.config.evaluation.episodes)
-        evaluation = evaluate(self.scenario, drivers, seeds, self.workers, self.config.reward, progress)
-        about = {
-            "scenario": self.config.scenario,
-            "reward": self.config.reward or self.scenario.reward,
-            "trained": TRAINED,
-            "expert": describe(self.expert),
-            "manifest": manifest(),
-        }
-        save_evaluation(self.folder, evaluation, about)
-        raise_failure([row for rows in evaluation.rows.values() for row in rows])
-
-
-def comparison(config: RunConfig, trained: Driver) -> dict[str, Driver]:
-    """Return the drivers of an evaluation by label: the baselines, the expert, the trained controller."""
-    time_step = config.make_scenario().decision_step
-    drivers = {"human": make_driver("human", time_step)}
-    for name in config.evaluation.baselines:
-        drivers[describe(make_driver(name, time_step))] = make_driver(name, time_step)
-    expert = config.make_expert()
-    if config.expert != "none":
-        drivers[describe(expert)] = expert
-    return {**drivers, TRAINED: trained}
-
-
-def read_progress(folder: Path) -> list[dict[str, Any]]:
-    """Return the rows of a run's progress; a last line cut short by a crash is left out."""
-    path = folder / "progress.jsonl"
-    rows = []
-    for line in path.read_text().splitlines() if path.exists() else []:
-        try:
-            rows.append(json.loads(line))
-        except ValueError:
-            break
-    return rows
+    Raises:
+        InputError: something else than the budget or the number of workers differs.
+    """
+    before = read_config(folder)
+    if replace(before, steps=config.steps, workers=config.workers) != config:
+        raise InputError("resume: only steps and workers may change; all else is the run's")
+    if config != before:
+        write_whole(folder / "config.toml", to_toml(config))

@@ -111,14 +111,14 @@ def share_standing(episode: Episode) -> float:
 
 
 def time_to_dissolve(episode: Episode) -> float:
-    """Time until the wave is dissolved [s]; NaN where it never is.
+    """Time until the wave that an episode starts with is dissolved [s]; NaN where there is none, or it never is.
 
     From the first decision to the first moment from which on the std of speed across vehicles stays below
     0.3 m/s for 60 s on end.
     """
     calm = np.nanstd(episode.speeds, axis=1) < CALM_STD
     needed = round(CALM_SECONDS / episode.step)
-    if len(calm) < needed:
+    if calm[0] or len(calm) < needed:
         return float("nan")
     runs = np.convolve(calm, np.ones(needed), "valid")
     found = np.flatnonzero(runs > needed - 0.5)
@@ -230,7 +230,7 @@ def measure(episode: Episode) -> dict[str, Any]:
     The metrics of a failed episode are NaN, and its row has the reason.
     """
     row: dict[str, Any] = {
-        "seed": list(episode.seed),
+        "seed": episode.seed[0] if len(episode.seed) == 1 else list(episode.seed),
         "status": episode.status,
         "reason": episode.reason,
         "error": episode.error,

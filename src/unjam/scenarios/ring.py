@@ -28,8 +28,9 @@ class Ring(Scenario):
     length: tuple[Annotated[int, Field(ge=10)], Annotated[int, Field(ge=10)]] = (220, 270)
     """shortest and longest ring, drawn uniformly among the integers between them [m]"""
     vehicles: Annotated[int, Field(ge=2)] = 22
+    """on the ring, CAVs among them"""
     cavs: Count = 1
-    """vehicles of those that are CAVs, evenly spread"""
+    """vehicles that are CAVs, evenly spread"""
 
     @model_validator(mode="after")
     def _fits(self) -> "Ring":
@@ -97,9 +98,9 @@ class Ring(Scenario):
         """Return the ring's own facts for `unjam scenarios`."""
         lengths = "-".join(str(length) for length in dict.fromkeys(self.length))
         return [
-            ("road", f"circle of {lengths} m, one lane, new length in each episode"),
-            ("vehicles", f"{self.vehicles}, of which {self.cavs} CAV"),
-            ("limit", f"IDM equilibrium speed: {self._limits()} m/s"),
+            ("road", f"ring of {lengths} m"),
+            ("vehicles", f"{self.vehicles} ({self.cavs} CAV)"),
+            ("limit", f"{self._limits()} m/s"),
         ]
 
     def _limits(self) -> str:
@@ -107,7 +108,7 @@ class Ring(Scenario):
             f"{equilibrium_speed(length / self.vehicles - VEHICLE_LENGTH, self.humans):.2f}"
             for length in dict.fromkeys(self.length)
         ]
-        return " to ".join(speeds)
+        return "-".join(speeds)
 
 
 def _point(angle: float, radius: float) -> tuple[float, float]:

@@ -71,6 +71,8 @@ class Scenario:
     action_limit: Positive = 1.0
     """largest acceleration that a CAV may ask for, in either direction [m/s2]"""
     actuation: Actuation = "shielded"
+    """how SUMO carries out a CAV's command: `shielded` exactly until it is unsafe, then SUMO brakes; `raw`
+    exactly; `flow` bound by the human IDM"""
     humans: IDMParameters = field(default_factory=IDMParameters)
     """how people drive"""
     noise: NotNegative = 0.2

@@ -59,7 +59,7 @@ def run_episode(
                 scenario, driver, seed, reward, explore, record_fuel, simulation, progress
             )
     traffic = Traffic(scenario, seed, simulation, driver.plain_numbers, record_fuel)
-    return _episode(traffic, seed, earned, _drive(traffic, driver, explore, progress))
+    return _episode(traffic, seed, earned, drive_traffic(traffic, driver, explore, progress))
 
 
 @dataclass(frozen=True)
@@ -72,8 +72,8 @@ class ResidualLog:
     hold: int
 
 
-def _drive(
-    traffic: Traffic, driver: Driver, explore: bool, progress: Progress | None
+def drive_traffic(
+    traffic: Traffic, driver: Driver, explore: bool, progress: Progress | None = None
 ) -> ResidualLog | None:
     """Drive to the end; return what a residual driver decided, None of any other."""
     history = traffic.start(controlled=not driver.native, progress=progress)
@@ -137,9 +137,8 @@ def _trajectories(
     """Return the trajectory of each CAV; `states` are those of all vehicles, shape (vehicles, T + 1)."""
     road = traffic.road
     places = [road.vehicle_ids.index(name) for name in road.cav_ids]
-    steps, cavs = len(traffic.log_applied), len(places)
-    applied = np.array(traffic.log_applied)
-    shield = np.array(traffic.log_shield)
+    applied, shield = traffic.applied(), traffic.shield()
+    steps, cavs = applied.shape
     crashed = np.zeros(steps, bool)
     crashed[-1] = traffic.crashed
     headways = time_headway(states.leader_gap[places, 1:], states.speed[places, 1:]).T

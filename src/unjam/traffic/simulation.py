@@ -1,8 +1,11 @@
 """SUMO: start, read, command, step. The only module that imports libsumo or traci."""
 
 import importlib
+import io
 import tempfile
+from collections import deque
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import redirect_stdout
 from functools import partial
 from pathlib import Path
 from types import ModuleType, TracebackType
@@ -18,6 +21,9 @@ Backend = Literal["libsumo", "traci", "gui"]
 SPEED_MODES = {"shielded": 31, "raw": 30, "flow": 25}
 """SUMO's speed mode bits for each way of actuation: bit 0 is the check for a safe speed."""
 
+_exhaust = deque(maxlen=0).extend
+"""runs through an iterator, in C: a loop would cost as much as the calls"""
+
 _open: "Simulation | None" = None
 
 
@@ -28,11 +34,13 @@ class Simulation:
     refuses to open another while one is open.
     """
 
-    def __init__(self, backend: Backend = "libsumo") -> None:
+    def __init__(self, backend: Backend = "libsumo", gui_options: Sequence[str] = ()) -> None:
+        """Open a simulation; nothing runs before `load`. `gui_options` go to SUMO's window."""
         global _open
         if _open is not None:
             raise UnjamError("a simulation is already open in this process; close it, or use another process")
         self.backend = backend
+        self._gui_options = gui_options
         self._sumo = _import(backend)
         self._folder = tempfile.TemporaryDirectory(prefix="unjam-")
         self._running = False
@@ -50,7 +58,7 @@ class Simulation:
         """simulates one time step"""
         _open = self
 
-    def load(self, road: Road, step: float, seed: int, gui_options: Sequence[str] = ()) -> None:
+    def load(self, road: Road, step: float, seed: int) -> None:
         """Start an episode: load network and traffic, and put the vehicles on the road.
 
         Raises:
@@ -64,7 +72,8 @@ class Simulation:
                 self._sumo.load(options)
             else:
                 program = "sumo-gui" if self.backend == "gui" else "sumo"
-                self._sumo.start([sumo_program(program), *options, *gui_options])
+                with redirect_stdout(io.StringIO()):  # traci announces each of its attempts to connect
+                    self._sumo.start([sumo_program(program), *options, *self._gui_options])
                 self._running = True
             self.step()  # the first step inserts the vehicles and moves none
         except Exception as error:
@@ -114,9 +123,7 @@ class Simulation:
 
     def replace_speeds(self, ids: Iterable[str], speeds: Iterable[float]) -> None:
         """Give `ids` other current speeds [m/s], plain floats: how noise enters."""
-        replace = self._set_previous_speed
-        for name, speed in zip(ids, speeds):
-            replace(name, speed)
+        _exhaust(map(self._set_previous_speed, ids, speeds))
 
     def take_control(self, ids: Sequence[str], actuation: Literal["shielded", "raw", "flow"]) -> None:
         """Make `ids` CAVs: from now on they obey `command_speeds`."""

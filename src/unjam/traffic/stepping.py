@@ -62,13 +62,15 @@ class Traffic:
         self.single = plain_numbers and len(cavs) == 1
         self._cavs = cavs
         self._near = loop_neighbours(cavs[0] if self.single else np.array(cavs), len(road.vehicle_ids))
-        near_places = sorted({int(place) for places in self._near for place in np.atleast_1d(places)})
-        self._near_places = near_places
-        self._near_ids = [road.vehicle_ids[place] for place in near_places]
-        self._near_starts = [float(road.start_positions[place]) for place in near_places]
+        self._near_positions: dict[int, float] = {
+            int(place): float(road.start_positions[place])
+            for places in self._near
+            for place in np.atleast_1d(places)
+        }
         self._be_human(road.vehicle_ids)
         self._speeds = simulation.speeds(road.vehicle_ids)
-        self._check_count()
+        if simulation.vehicle_count() != len(road.vehicle_ids):
+            self._miss()
         self._forget()
 
     def _be_human(self, ids: Sequence[str]) -> None:
@@ -83,8 +85,8 @@ class Traffic:
         self._log_speeds = array("d", self._speeds)
         self._started = self._simulation.distances(self.road.vehicle_ids)
         self.log_fuel: list[list[float]] = []
-        self.log_applied: list[list[float]] = []
-        self.log_shield: list[list[float]] = []
+        self._log_applied = array("d")
+        self._log_commanded = array("d")
 
     def start(self, controlled: bool, progress: Callable[[int], None] | None = None) -> LocalState | None:
         """Run the warm-up, then hand the CAVs over, unless they stay human (`controlled` false).
@@ -115,14 +117,12 @@ class Traffic:
 
     def local_state(self) -> LocalState:
         """Return what the CAVs perceive now: arrays of shape (CAVs,), or plain numbers of a single one."""
-        driven = self._simulation.distances(self._near_ids)
-        positions = list(map(add, self._near_starts, driven))
+        near = self._near_positions
         if self.single:
-            by_place = dict(zip(self._near_places, positions))
-            return loop_state(self._speeds, by_place, self._near, self.road.loop_length)
-        everywhere = np.full(len(self._speeds), np.nan)
-        everywhere[self._near_places] = positions
-        return loop_state(np.array(self._speeds), everywhere, self._near, self.road.loop_length)
+            return loop_state(self._speeds, near, self._near, self.road.loop_length)
+        positions = np.full(len(self._speeds), np.nan)
+        positions[list(near)] = list(near.values())
+        return loop_state(np.array(self._speeds), positions, self._near, self.road.loop_length)
 
     def advance(self, acceleration: Array | None) -> None:
         """Simulate one decision: `acceleration` [m/s2] of every CAV, held over its simulation steps.
@@ -132,47 +132,43 @@ class Traffic:
         Raises:
             InputError: an acceleration is not finite, or there are not as many as CAVs.
         """
-        scenario = self.scenario
+        scenario, cavs = self.scenario, self._cavs
         if acceleration is None:
-            before = np.array([self._speeds[place] for place in self._cavs])
             for _ in range(scenario.steps_per_decision):
                 self._simulate()
-            after = np.array([self._speeds[place] for place in self._cavs])
-            self.log_applied.append(((after - before) / scenario.decision_step).tolist())
-            self.log_shield.append([0.0] * len(self._cavs))
         else:
             values = [acceleration] if self.single else acceleration.tolist()
-            self._check(values)
-            limit = scenario.action_limit
+            if len(values) != len(cavs) or not all(map(isfinite, values)):
+                self._refuse(values)
+            limit, step = scenario.action_limit, scenario.simulation_step
             applied = [clip(value, -limit, limit) for value in values]
-            self.log_applied.append(applied)
-            self.log_shield.append(self._command(applied))
+            self._log_applied.fromlist(applied)
+            for _ in range(scenario.steps_per_decision):
+                speeds = self._speeds
+                commanded = [next_speed(speeds[place], wanted, step) for place, wanted in zip(cavs, applied)]
+                self._log_commanded.fromlist(commanded)
+                self._simulation.command_speeds(self.road.cav_ids, commanded)
+                self._simulate()
         if self._record_fuel:
             self.log_fuel.append(self._simulation.fuel(self.road.vehicle_ids))
 
-    def _command(self, applied: list[float]) -> list[float]:
-        """Simulate one decision; return the hardest braking that SUMO added to each command [m/s2]."""
-        step, cavs, shield = self.scenario.simulation_step, self._cavs, [0.0] * len(self._cavs)
-        for _ in range(self.scenario.steps_per_decision):
-            speeds = self._speeds
-            commanded = [next_speed(speeds[place], wanted, step) for place, wanted in zip(cavs, applied)]
-            self._simulation.command_speeds(self.road.cav_ids, commanded)
-            self._simulate()
-            for row, place in enumerate(cavs):
-                shield[row] = max(shield[row], (commanded[row] - self._speeds[place]) / step)
-        return shield
-
     def _simulate(self) -> None:
-        """Simulate one step, and add the humans' noise to their speeds."""
-        simulation = self._simulation
+        """Simulate one step, and add the humans' noise to their speeds.
+
+        Two formulas of `physics.kinematics` are written out here: calls would cost a tenth of the episode.
+        """
+        simulation, near, step = self._simulation, self._near_positions, self.scenario.simulation_step
         simulation.step()
         moved = simulation.speeds(self.road.vehicle_ids)
-        self._check_count()
+        if simulation.vehicle_count() != len(moved):
+            self._miss()
         self._log_moved.fromlist(moved)
+        for place in near:
+            near[place] += moved[place] * step
         self._speeds = moved
         if self.scenario.noise > 0:
-            # next_speed() of everybody, written out: a call for each would cost a tenth of the episode
-            self._speeds = [speed if speed > 0.0 else 0.0 for speed in map(add, moved, self._noise())]
+            noise = self._noise_rows.pop() if self._noise_rows else self._draw_noise()
+            self._speeds = [speed if speed > 0.0 else 0.0 for speed in map(add, moved, noise)]
             simulation.replace_speeds(self._human_ids, compress(self._speeds, self._human_mask))
         self._log_speeds.fromlist(self._speeds)
         self.collisions = simulation.colliding_count()
@@ -183,12 +179,11 @@ class Traffic:
         noise = self._exploration_generator.standard_normal((self.scenario.horizon, len(self._cavs)))
         return noise[:, 0].tolist() if self.single else list(noise)
 
-    def _noise(self) -> list[float]:
-        """Return the change of speed that noise makes in this step, for each vehicle; none for CAVs [m/s]."""
-        if not self._noise_rows:
-            draws = self._noise_generator.standard_normal((NOISE_BLOCK, len(self._human_mask)))
-            scale = self.scenario.noise_per_step * self.scenario.simulation_step
-            self._noise_rows = (draws * np.where(self._human_mask, scale, 0.0)).tolist()[::-1]
+    def _draw_noise(self) -> list[float]:
+        """Return the change of speed that noise makes in this step, none for CAVs [m/s]; keep many for later."""
+        draws = self._noise_generator.standard_normal((NOISE_BLOCK, len(self._human_mask)))
+        scale = self.scenario.noise_per_step * self.scenario.simulation_step
+        self._noise_rows = (draws * np.where(self._human_mask, scale, 0.0)).tolist()[::-1]
         return self._noise_rows.pop()
 
     def speeds_and_positions(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -216,10 +211,25 @@ class Traffic:
         near = loop_neighbours(places, len(self.road.vehicle_ids))
         return loop_state(speeds, positions, near, self.road.loop_length)
 
-    def _check(self, values: list[float]) -> None:
-        if len(values) == len(self._cavs) and all(map(isfinite, values)):
-            return
-        where = f"driver: step {len(self.log_applied)}"
+    def applied(self) -> NDArray[np.float64]:
+        """Return what the CAVs were told within the action limit, of humans what they did [m/s2], (T, CAVs)."""
+        if self._log_applied:
+            return np.array(self._log_applied).reshape(-1, len(self._cavs))
+        speeds = np.array(self._log_speeds).reshape(-1, len(self._human_mask))[:, self._cavs]
+        return np.diff(speeds[:: self.scenario.steps_per_decision], axis=0) / self.scenario.decision_step
+
+    def shield(self) -> NDArray[np.float64]:
+        """Return the hardest braking that SUMO added to each command, zero where it let it pass, (T, CAVs)."""
+        if not self._log_commanded:
+            return np.zeros_like(self.applied())
+        commanded = np.array(self._log_commanded).reshape(-1, len(self._cavs))
+        moved = np.array(self._log_moved).reshape(-1, len(self._human_mask))[:, self._cavs]
+        added = (commanded - moved) / self.scenario.simulation_step
+        return added.reshape(-1, self.scenario.steps_per_decision, len(self._cavs)).max(1).clip(0.0, None)
+
+    def _refuse(self, values: list[float]) -> None:
+        """Raise the error for accelerations that cannot be commanded."""
+        where = f"driver: step {len(self._log_applied) // len(self._cavs)}"
         if len(values) != len(self._cavs):
             wanted = f"one for each of the {len(self._cavs)} CAVs"
             raise InputError(f"{where}: {len(values)} accelerations are not allowed; allowed: {wanted}")
@@ -228,7 +238,6 @@ class Traffic:
         )
         raise InputError(f"{where}: acceleration of {name} is {value}; allowed: finite")
 
-    def _check_count(self) -> None:
+    def _miss(self) -> None:
         present, wanted = self._simulation.vehicle_count(), len(self.road.vehicle_ids)
-        if present != wanted:
-            raise EpisodeError(f"{present} vehicles on the road where {wanted} should be")
+        raise EpisodeError(f"{present} vehicles on the road where {wanted} should be")

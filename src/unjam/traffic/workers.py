@@ -104,7 +104,10 @@ class Workers:
         try:
             for _ in range(self._attempts):
                 try:
-                    return worker.run(task.message(), lambda steps: progress and progress(index, steps))
+                    episode = worker.run(task.message(), lambda steps: progress and progress(index, steps))
+                    if progress is not None:
+                        progress(index, episode.steps)
+                    return episode
                 except _WorkerLost as lost:
                     problems.append(str(lost))
             reason = f"{self._attempts} workers were lost on it: {'; '.join(dict.fromkeys(problems))}"

@@ -1,0 +1,5 @@
+"""`python -m unjam` is `unjam`."""
+
+from unjam.cli import main
+
+main()

@@ -1,0 +1,92 @@
+"""The command line: `unjam VERB`. Each verb is a file of this package."""
+
+import os
+import signal
+import sys
+from types import FrameType
+from typing import Annotated
+
+import typer
+
+from unjam import __version__
+from unjam.cli.bench import bench
+from unjam.cli.doctor import doctor
+from unjam.cli.drive import drive
+from unjam.cli.evaluate import evaluate
+from unjam.cli.lists import drivers, scenarios
+from unjam.cli.report import report
+from unjam.cli.train import train
+from unjam.cli.watch import watch
+from unjam.errors import DISK_ERRNOS, UnjamError, disk_error
+
+INTERRUPTED, TERMINATED = 130, 143
+
+app = typer.Typer(
+    name="unjam",
+    help="Train, compare and ship controllers for automated vehicles that dissolve stop-and-go waves.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="markdown",
+    epilog="Exit codes: 0 done, 2 wrong input, 3 missing part, 74 disk, 130/143 stopped.",
+)
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        print(f"unjam {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _root(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version.")
+    ] = False,
+) -> None:
+    pass
+
+
+for verb in (scenarios, drivers, drive, train, evaluate, report, watch, bench, doctor):
+    app.command()(verb)
+
+
+class _Terminated(BaseException):
+    """The process was asked to end (SIGTERM)."""
+
+
+def _terminate(signum: int, frame: FrameType | None) -> None:
+    raise _Terminated
+
+
+def main() -> None:
+    """Run the command line; every error that a user can mend is one line and an exit code."""
+    signal.signal(signal.SIGTERM, _terminate)
+    sys.exit(_run())
+
+
+def _run() -> int:
+    try:
+        return app(standalone_mode=False) or 0
+    except UnjamError as error:
+        return _say(str(error), error.exit_code)
+    except OSError as error:
+        if error.errno in DISK_ERRNOS:
+            return _say(str(disk_error(error, error.filename or "output")), 74)
+        raise
+    except (KeyboardInterrupt, typer.Abort):
+        return _say("interrupted", INTERRUPTED)
+    except _Terminated:
+        return _say("terminated", TERMINATED)
+    except Exception as error:
+        if hasattr(error, "format_message"):  # what typer says of a wrong command line
+            return _say(error.format_message(), 2)  # pyright: ignore[reportAttributeAccessIssue]
+        raise
+
+
+def _say(message: str, code: int) -> int:
+    """Print one line of error; return the exit code."""
+    try:
+        print(f"unjam: {' '.join(message.split())}", file=sys.stderr)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stderr.fileno())
+    return code

@@ -1,0 +1,80 @@
+"""`unjam drive`: run episodes with a driver, print metrics, write a report."""
+
+from typing import Annotated
+
+import typer
+
+from unjam.cli.options import (
+    DEFAULT_WORKERS,
+    CavsOption,
+    EpisodesOption,
+    JsonOption,
+    LengthOption,
+    OutOption,
+    RewardOption,
+    ScenarioArgument,
+    SeedOption,
+    VehiclesOption,
+    WarmupOption,
+    WorkersOption,
+    assignments,
+    new_folder,
+    road_changes,
+)
+
+
+def drive(
+    scenario: ScenarioArgument,
+    driver: Annotated[
+        list[str],
+        typer.Option(
+            "--driver",
+            "-d",
+            help="Who drives the CAVs: a name, name:parameter=value, your own path.py:name, a run folder, or a "
+            ".unjam file. Given several times, they are compared on the same traffic.",
+        ),
+    ],
+    episodes: EpisodesOption = 5,
+    seed: SeedOption = 0,
+    length: LengthOption = None,
+    vehicles: VehiclesOption = None,
+    cavs: CavsOption = None,
+    warmup: WarmupOption = None,
+    reward: RewardOption = "",
+    settings: Annotated[
+        list[str] | None, typer.Option("--set", help="Any parameter of the scenario: key=value.")
+    ] = None,
+    workers: WorkersOption = DEFAULT_WORKERS,
+    out: OutOption = None,
+    report: Annotated[bool, typer.Option(help="Write the results and a report.html into a folder.")] = True,
+    json: JsonOption = False,
+) -> None:
+    """Run episodes with a driver: live progress, a table of metrics, a report.
+
+    Examples:
+
+      unjam drive ring --driver human
+
+      unjam drive ring-warm --driver pi --length 230
+
+      unjam drive ring-jammed -d human -d pi -d pi:time_constant=0 --episodes 10
+
+      unjam drive ring --driver my_driver.py:gentle --json
+    """
+    from unjam.cli.output import aside, console, counting_steps, metrics_table, print_json
+    from unjam.experiments.drive import drive as run
+    from unjam.experiments.drive import raise_failures
+    from unjam.scenarios.registry import make_scenario
+
+    road = {**road_changes(length, vehicles, cavs, warmup), **assignments(settings)}
+    total = make_scenario(scenario, road).horizon * episodes * len(driver)
+    folder = new_folder(out, f"drive-{scenario}") if report else None
+    with counting_steps(f"driving {scenario}", total) as steps:
+        result = run(scenario, driver, episodes, seed, road, reward, workers, folder, steps)
+    if json:
+        print_json(result.document())
+    else:
+        console.print(metrics_table(result.rows))
+        if result.report is not None:
+            aside.print(f"report: {result.report}")
+    raise_failures(result)

@@ -1,0 +1,132 @@
+"""`unjam scenarios` and `unjam drivers`: what there is."""
+
+from dataclasses import fields, is_dataclass
+from typing import Annotated, Any
+
+import typer
+
+from unjam.cli.options import JsonOption
+
+
+def scenarios(
+    name: Annotated[str | None, typer.Argument(help="One scenario, in full.")] = None, json: JsonOption = False
+) -> None:
+    """List the scenarios; of one, its road, observation, reward, limit and every parameter.
+
+    Examples:
+
+      unjam scenarios
+
+      unjam scenarios ring
+    """
+    from rich.markup import escape
+    from rich.table import Table
+
+    from unjam.cli.output import console, print_json
+    from unjam.scenarios.registry import SCENARIOS, make_scenario, scenario_recipe
+
+    if name is None:
+        if json:
+            print_json({key: scenario_recipe(scenario) for key, scenario in SCENARIOS.items()})
+            return
+        table = Table(box=None, pad_edge=False, header_style="bold")
+        for column in ("scenario", "road", "vehicles", "limit", "decisions", "warm-up"):
+            table.add_column(column)
+        for key, scenario in SCENARIOS.items():
+            facts = dict(scenario.facts())
+            warmup = f"{scenario.warmup * scenario.simulation_step:g} s"
+            table.add_row(key, facts["road"], facts["vehicles"], facts["limit"], f"{scenario.horizon:,}", warmup)
+        console.print(table)
+        return
+    scenario = make_scenario(name)
+    facts = [*scenario.facts(), *_common_facts(scenario)]
+    parameters = parameter_rows(type(scenario), scenario)
+    if json:
+        print_json({"name": name, "facts": dict(facts), "parameters": scenario_recipe(scenario)})
+        return
+    console.print(f"[bold]{name}[/bold]")
+    table = Table(box=None, pad_edge=False, show_header=False)
+    for fact in facts:
+        table.add_row(*map(escape, fact))
+    console.print(table)
+    console.print(_parameter_table(parameters, "parameter (--set key=value)"))
+
+
+def _common_facts(scenario: Any) -> list[tuple[str, str]]:
+    from unjam.drivers.local_state import OBSERVATION_NAMES
+
+    step = scenario.simulation_step
+    return [
+        ("episode", f"{scenario.horizon:,} decisions of {scenario.decision_step:g} s; a collision ends it"),
+        ("warm-up", f"{scenario.warmup} all-human steps ({scenario.warmup * step:g} s), before control, not counted"),
+        ("people", f"IDM with acceleration noise of std {scenario.noise_per_step:.3f} m/s2 a step"),
+        ("action", f"acceleration within ±{scenario.action_limit:g} m/s2, {scenario.actuation}"),
+        ("observation", "; ".join(OBSERVATION_NAMES["local"])),
+        ("reward", scenario.reward),
+        ("limit is", "the IDM's equilibrium speed, at which all vehicles could drive alike for ever"),
+    ]
+
+
+def drivers(json: JsonOption = False) -> None:
+    """List the drivers and their parameters, as `--driver name:parameter=value` takes them.
+
+    Example:
+
+      unjam drivers
+    """
+    from unjam.cli.output import console, print_json
+    from unjam.drivers.registry import DRIVERS
+
+    if json:
+        print_json(
+            {
+                name: {"about": _first_line(kind), "parameters": parameter_rows(kind, kind())}
+                for name, kind in DRIVERS.items()
+            }
+        )
+        return
+    for name, kind in DRIVERS.items():
+        console.print(f"[bold]{name}[/bold]  {_first_line(kind)}")
+        rows = [row for row in parameter_rows(kind, kind()) if row["name"] != "time_step"]
+        if rows:
+            console.print(_parameter_table(rows, "parameter"))
+        console.print()
+    console.print("Your own: --driver path.py:name, a function or a class; check it with unjam.check_driver.")
+
+
+def _first_line(kind: type) -> str:
+    return (kind.__doc__ or "").strip().splitlines()[0]
+
+
+def parameter_rows(kind: type, instance: Any) -> list[dict[str, Any]]:
+    """Return name, value and meaning of each parameter of a parameter dataclass."""
+    from dataclasses import asdict
+
+    about: dict[str, str] = {}
+    for base in reversed(kind.__mro__):  # pydantic forgets the texts of inherited fields
+        own = getattr(base, "__pydantic_fields__", {})
+        about |= {name: field.description for name, field in own.items() if field.description}
+    if not is_dataclass(instance):
+        return []
+    values = asdict(instance)  # pyright: ignore[reportArgumentType]
+    return [
+        {"name": field.name, "default": values[field.name], "about": about.get(field.name, "")}
+        for field in fields(instance)
+    ]
+
+
+def _parameter_table(rows: list[dict[str, Any]], title: str) -> Any:
+    from rich.markup import escape
+    from rich.table import Table
+
+    table = Table(box=None, pad_edge=False, header_style="dim")
+    for column in (title, "default", "meaning"):
+        table.add_column(column)
+    for row in rows:
+        table.add_row(f"  {row['name']}", escape(_brief(row["default"])), escape(" ".join(row["about"].split())))
+    return table
+
+
+def _brief(value: Any) -> str:
+    """Return a default as a table shows it."""
+    return ", ".join(f"{key}={entry:g}" for key, entry in value.items()) if isinstance(value, dict) else str(value)

@@ -1,0 +1,67 @@
+"""Options that several verbs share, each defined once."""
+
+import os
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from unjam.errors import InputError
+from unjam.parameters import parse_assignments
+
+ScenarioArgument = Annotated[str, typer.Argument(help="Name of the scenario; `unjam scenarios` lists them.")]
+RewardOption = Annotated[
+    str, typer.Option("--reward", help="Reward by name, or your own: path.py:name.", show_default="the scenario's")
+]
+EpisodesOption = Annotated[int, typer.Option("--episodes", "-n", min=1, help="Number of episodes.")]
+SeedOption = Annotated[int, typer.Option("--seed", min=0, help="First seed.")]
+WorkersOption = Annotated[
+    int, typer.Option("--workers", min=1, help="Worker processes; the result does not depend on it.")
+]
+OutOption = Annotated[
+    Path | None, typer.Option("--out", help="Folder for the results.", show_default="a new one under runs/")
+]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON document and nothing else.")]
+LengthOption = Annotated[
+    str | None, typer.Option("--length", help="Length of the ring [m]: one, or a range like 220-270.")
+]
+VehiclesOption = Annotated[int | None, typer.Option("--vehicles", help="Number of vehicles.")]
+CavsOption = Annotated[int | None, typer.Option("--cavs", help="Number of CAVs among them.")]
+WarmupOption = Annotated[
+    int | None, typer.Option("--warmup", help="All-human simulation steps before the CAVs take over.")
+]
+
+DEFAULT_WORKERS = os.cpu_count() or 1
+
+
+def road_changes(
+    length: str | None, vehicles: int | None, cavs: int | None, warmup: int | None
+) -> dict[str, Any]:
+    """Return the changes to a scenario that the road options ask for."""
+    asked = {"length": parse_range(length), "vehicles": vehicles, "cavs": cavs, "warmup": warmup}
+    return {name: value for name, value in asked.items() if value is not None}
+
+
+def parse_range(text: str | None) -> tuple[int, int] | None:
+    """Return (230, 230) for `230` and (220, 270) for `220-270`."""
+    if text is None:
+        return None
+    parts = text.split("-")
+    if len(parts) > 2 or not all(part.strip().isdigit() for part in parts):
+        raise InputError(f"length: {text!r} is not allowed; allowed: metres, like 230 or 220-270")
+    return int(parts[0]), int(parts[-1])
+
+
+def assignments(texts: list[str] | None) -> dict[str, Any]:
+    """Return what `--set key=value` options say."""
+    return parse_assignments(texts or [], "--set")
+
+
+def new_folder(out: Path | None, name: str) -> Path:
+    """Return the folder for new results: `out`, or the next free one under `runs/`."""
+    if out is not None:
+        return out
+    number = 1
+    while (Path("runs") / f"{name}-{number:03d}").exists():
+        number += 1
+    return Path("runs") / f"{name}-{number:03d}"

@@ -1,0 +1,104 @@
+"""What the command line prints: tables for people, one JSON document for programs, progress on the side."""
+
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+from rich.table import Table
+
+from unjam.files import to_json
+
+LINE_SECONDS = 5.0
+"""time between two plain lines of progress where there is no terminal"""
+
+console = Console(highlight=False)
+aside = Console(stderr=True, highlight=False)
+"""progress and messages: standard output is for results"""
+
+
+def print_json(document: Any) -> None:
+    """Print one JSON document: NaN, which JSON does not know, becomes null."""
+    sys.stdout.write(to_json(document, indent=1) + "\n")
+
+
+def metrics_table(rows_by_driver: dict[str, list[dict[str, Any]]]) -> Table:
+    """Return the table of all metrics: mean and 95 % bootstrap interval over the episodes."""
+    from unjam.reports.metrics import METRICS
+    from unjam.reports.statistics import estimate
+
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    table.add_column("metric")
+    table.add_column("unit", style="dim")
+    for driver in rows_by_driver:
+        table.add_column(driver, justify="right")
+    for name, metric in METRICS.items():
+        cells = []
+        for rows in rows_by_driver.values():
+            found = estimate([row[name] for row in rows])
+            if found.count == 0:
+                cells.append("–")
+                continue
+            digits = metric.digits
+            interval = f" [dim]\\[{found.low:.{digits}f}, {found.high:.{digits}f}][/dim]" if found.count > 1 else ""
+            share = f" [dim]{found.count} of {len(rows)}[/dim]" if found.count < len(rows) else ""
+            cells.append(f"{found.mean:.{digits}f}{interval}{share}")
+        table.add_row(metric.label, metric.unit, *cells)
+    return table
+
+
+class Steps:
+    """Progress of many episodes at once, counted in steps."""
+
+    def __init__(self, label: str, total: int) -> None:
+        """Prepare to count to `total`."""
+        self._label = label
+        self._total = total
+        self._done: dict[Any, int] = {}
+        self._bar: Progress | None = None
+        self._task: TaskID | None = None
+        self._last_line = time.monotonic()
+
+    def __call__(self, key: Any, steps: int) -> None:
+        """Note that the episode `key` has come to `steps`."""
+        self._done[key] = steps
+        done = sum(self._done.values())
+        if self._bar is not None and self._task is not None:
+            self._bar.update(self._task, completed=done)
+        elif time.monotonic() - self._last_line > LINE_SECONDS:
+            self._last_line = time.monotonic()
+            aside.print(f"{self._label}: {done:,} of {self._total:,} steps")
+
+    def attach(self, bar: Progress) -> None:
+        """Show it as a bar."""
+        self._bar = bar
+        self._task = bar.add_task(self._label, total=self._total)
+
+
+@contextmanager
+def counting_steps(label: str, total: int) -> Iterator[Steps]:
+    """Show the progress of episodes: a bar on a terminal, plain lines now and then elsewhere."""
+    steps = Steps(label, total)
+    if not aside.is_terminal:
+        yield steps
+        return
+    with bar() as shown:
+        steps.attach(shown)
+        yield steps
+
+
+def bar() -> Progress:
+    """Return a progress bar on standard error, gone when it is done."""
+    return Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+        console=aside,
+        transient=True,
+    )
+
+

@@ -1,0 +1,169 @@
+"""`unjam train`: learn a residual on an expert."""
+
+from contextlib import nullcontext
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from unjam.cli.options import (
+    DEFAULT_WORKERS,
+    CavsOption,
+    JsonOption,
+    LengthOption,
+    OutOption,
+    RewardOption,
+    VehiclesOption,
+    WarmupOption,
+    WorkersOption,
+    assignments,
+    new_folder,
+    road_changes,
+)
+from unjam.errors import InputError
+
+LINE_EVERY = 5
+"""iterations between two plain lines of progress where there is no terminal"""
+
+
+def train(
+    scenario: Annotated[
+        str | None, typer.Argument(help="Name of the scenario; the configuration's if left out.")
+    ] = None,
+    preset: Annotated[str, typer.Option(help="Named starting point: demo, paper.")] = "",
+    config: Annotated[Path | None, typer.Option(help="TOML file with any keys of the configuration.")] = None,
+    settings: Annotated[
+        list[str] | None, typer.Option("--set", help="Any key of the configuration: key=value, trpo.gamma=0.995.")
+    ] = None,
+    steps: Annotated[int | None, typer.Option(min=1, help="Actual simulator steps to train for.")] = None,
+    seed: Annotated[int | None, typer.Option(min=0, help="Seed of the whole run.")] = None,
+    agent: Annotated[str | None, typer.Option(help="Learner: trpo.")] = None,
+    expert: Annotated[
+        str | None,
+        typer.Option(help="Driver that the residual is added to, as in drive --driver; none: no expert."),
+    ] = None,
+    reward: RewardOption = "",
+    length: LengthOption = None,
+    vehicles: VehiclesOption = None,
+    cavs: CavsOption = None,
+    warmup: WarmupOption = None,
+    workers: WorkersOption = DEFAULT_WORKERS,
+    out: OutOption = None,
+    resume: Annotated[
+        Path | None, typer.Option(help="Go on with this run: after a stop, or with more --steps after its end.")
+    ] = None,
+    json: JsonOption = False,
+) -> None:
+    """Train a residual on an expert, judge it on held-out seeds, write a report.
+
+    Examples:
+
+      unjam train ring --preset demo
+
+      unjam train ring-jammed --expert follower-stopper --steps 500000 --seed 3
+
+      unjam train ring --expert my_driver.py:gentle --reward my_reward.py:calm
+
+      unjam train ring --expert runs/ring-001        (a trained controller as the expert)
+
+      unjam train --resume runs/ring-001 --steps 2000000
+    """
+    from unjam.experiments.config import load_config
+    from unjam.experiments.train import read_config
+    from unjam.experiments.train import train as run
+
+    flags = {"scenario": scenario, "steps": steps, "seed": seed, "agent": agent, "expert": expert}
+    changes: dict[str, Any] = {key: value for key, value in flags.items() if value is not None}
+    changes |= {"reward": reward} if reward else {}
+    changes |= {f"road.{key}": value for key, value in road_changes(length, vehicles, cavs, warmup).items()}
+    changes |= {"workers": workers}
+    for key, value in assignments(settings).items():
+        if key == "out":
+            out = Path(str(value))
+        else:
+            changes[key] = value
+
+    if resume is not None:
+        if out is not None or preset or config is not None:
+            raise InputError("resume: --out, --preset and --config are not allowed beside it")
+        before = read_config(resume)
+        made = load_config(resume / "config.toml", changes={"steps": before.steps, **changes})
+        folder = resume
+    else:
+        made = load_config(config, preset, changes)
+        folder = new_folder(out, made.scenario)
+    with nullcontext() if json else _Progress(made.steps, folder) as shown:
+        result = run(made, folder, resume is not None, shown and shown.iteration, shown and shown.judging)
+    _print_result(result, json)
+
+
+class _Progress:
+    """Progress of training: a bar with the newest returns on a terminal, plain lines elsewhere."""
+
+    def __init__(self, steps: int, folder: Path) -> None:
+        from unjam.cli.output import aside, bar
+
+        self._console = aside
+        self._steps = steps
+        self._folder = folder
+        self._bar = bar() if aside.is_terminal else None
+        self._validated = "-"
+
+    def __enter__(self) -> "_Progress":
+        self._console.print(f"training into {self._folder}")
+        if self._bar is not None:
+            self._bar.start()
+            self._task = self._bar.add_task("first validation", total=self._steps)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._bar is not None:
+            self._bar.stop()
+
+    def iteration(self, row: dict[str, Any]) -> None:
+        """Show a row of progress."""
+        if row["return_validation"] is not None:
+            self._validated = f"{row['return_validation']:.0f}"
+        words = (
+            f"return {row['return_mean']:.0f}, validation {self._validated} (expert {row['return_expert']:.0f})"
+        )
+        if self._bar is not None:
+            self._bar.update(self._task, completed=row["actual_steps"], description=words)
+        elif row["iteration"] % LINE_EVERY == 0 or row["actual_steps"] >= self._steps:
+            self._console.print(
+                f"iteration {row['iteration']}: {row['actual_steps']:,} of {self._steps:,} steps, {words}"
+            )
+
+    def judging(self, key: tuple[str, int], steps: int) -> None:
+        """Say once that the training is over."""
+        if self._validated != "":
+            self._validated = ""
+            if self._bar is not None:
+                self._bar.update(self._task, description="evaluating on held-out seeds")
+            else:
+                self._console.print("evaluating on held-out seeds")
+
+
+def _print_result(result: Any, json: bool) -> None:
+    from unjam.cli.output import aside, console, metrics_table, print_json
+    from unjam.reports.statistics import summarise
+    from unjam.reports.story import signed
+
+    if json:
+        print_json(
+            {
+                "folder": str(result.folder),
+                "controller": str(result.controller),
+                "report": str(result.report),
+                "gain": result.gain._asdict() if result.gain else None,
+                "drivers": {
+                    driver: {name: found.mean for name, found in summarise(rows).items()}
+                    for driver, rows in result.rows.items()
+                },
+            }
+        )
+        return
+    console.print(metrics_table(result.rows))
+    if result.gain is not None:
+        console.print(f"return beyond the expert, held-out seeds, 95 % interval: {signed(result.gain)}")
+    aside.print(f"controller: {result.controller}\nreport: {result.report}")

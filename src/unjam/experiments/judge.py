@@ -1,0 +1,56 @@
+"""The final judgement of a run: its controller beside its expert and others, on held-out seeds."""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from unjam.controller import make_driver
+from unjam.drivers.driver import Driver
+from unjam.drivers.registry import describe
+from unjam.experiments.config import RunConfig
+from unjam.experiments.evaluate import Evaluation, evaluate, held_out_seeds, raise_failure, save_evaluation
+from unjam.experiments.manifest import manifest
+from unjam.traffic.workers import Workers
+
+TRAINED = "trained"
+"""label of the trained controller in tables and pictures"""
+
+
+def comparison(config: RunConfig, folder: Path, baselines: Sequence[str]) -> dict[str, Driver]:
+    """Return the drivers to compare, by label: the baselines, the run's expert, its trained controller."""
+    time_step = config.make_scenario().decision_step
+    drivers = {}
+    for name in baselines:
+        driver = make_driver(name, time_step)
+        drivers[describe(driver)] = driver
+    if config.expert != "none":
+        expert = config.make_expert()
+        drivers[describe(expert)] = expert
+    return {**drivers, TRAINED: make_driver(str(folder), time_step)}
+
+
+def judge(
+    folder: Path,
+    config: RunConfig,
+    workers: Workers,
+    baselines: Sequence[str] | None = None,
+    episodes: int | None = None,
+    progress: Callable[[tuple[str, int], int], None] | None = None,
+) -> Evaluation:
+    """Evaluate the controller of a run beside others on the same held-out seeds, and save it all in its folder.
+
+    `baselines` and `episodes` are the configuration's where they are not given.
+    """
+    scenario = config.make_scenario()
+    drivers = comparison(config, folder, config.evaluation.baselines if baselines is None else baselines)
+    seeds = held_out_seeds(episodes or config.evaluation.episodes)
+    found = evaluate(scenario, drivers, seeds, workers, config.reward, progress)
+    about = {
+        "scenario": config.scenario,
+        "reward": config.reward or scenario.reward,
+        "trained": TRAINED,
+        "expert": describe(config.make_expert()) if config.expert != "none" else "none",
+        "manifest": manifest(),
+    }
+    save_evaluation(folder, found, about)
+    raise_failure([row for rows in found.rows.values() for row in rows])
+    return found

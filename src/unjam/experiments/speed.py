@@ -1,0 +1,123 @@
+"""How fast episodes run on this machine, beside what bounds them: bare SUMO, and the same over TraCI.
+
+Machines differ, and one machine differs from minute to minute: what counts are ratios within one run, with
+their parts measured in turn.
+"""
+
+import os
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from statistics import median
+from typing import Any
+
+import numpy as np
+
+from unjam.agents.settings import PolicySettings
+from unjam.drivers.network import Network
+from unjam.drivers.pi_saturation import PISaturation
+from unjam.drivers.residual import ResidualDriver
+from unjam.scenarios.registry import SCENARIOS
+from unjam.scenarios.ring import Ring
+from unjam.traffic.episode import drive_traffic, run_episode
+from unjam.traffic.simulation import Simulation
+from unjam.traffic.stepping import Traffic
+
+ROUNDS = 7
+TRACI_STEPS = 200
+SIZES = {22: 3000, 220: 800, 2200: 200}
+"""vehicles on the ring, one CAV in 22, and decisions driven"""
+METRES_PER_VEHICLE = 245 / 22
+
+
+def neural_driver(hold: int) -> ResidualDriver:
+    """Return PI with a residual network of the paper's size that looks every `hold` decisions."""
+    generator = np.random.default_rng(0)
+    sizes = [5, 64, 64, 1]
+    layers = tuple(
+        (generator.normal(size=(inputs, outputs)) / 100, np.zeros(outputs))
+        for inputs, outputs in zip(sizes[:-1], sizes[1:], strict=True)
+    )
+    return ResidualDriver(PISaturation(), Network(layers, 1.0, 0.1), 1.0, hold=hold)
+
+
+def measure_speed(rounds: int = ROUNDS, told: Callable[[str], None] | None = None) -> dict[str, Any]:
+    """Return steps per second, ratios, and the cost of a vehicle-step by size; on one core.
+
+    `over_bare`: steps/s of `run_episode` (loading and recording included) over those of SUMO alone, with the
+    residual driver that training makes by default, whose network looks once a second.
+    `over_bare_every_step`: the same with a network that looks in every step.
+    `over_traci`: steps/s of the same driving loop with libsumo over those through TraCI.
+    `growth`: the largest cost of a vehicle-step over that of the smallest road.
+    """
+    say = told or (lambda _: None)
+    if hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+    ring, driver = SCENARIOS["ring"], neural_driver(PolicySettings().hold)
+    every_step = neural_driver(1)
+    found: dict[str, list[float]] = {"bare": [], "episode": [], "every_step": [], "loop": [], "traci": []}
+    with Simulation() as simulation:
+        run_episode(ring, driver, (0,), explore=True, simulation=simulation)  # networks made, caches warm
+    for number in range(1, rounds + 1):
+        say(f"round {number} of {rounds}")
+        with Simulation() as simulation:
+            Traffic(ring, (number,), simulation)
+            found["bare"].append(_rate(partial(_step, simulation, ring.horizon), ring.horizon))
+            for name, driven in (("episode", driver), ("every_step", every_step)):
+                run = partial(run_episode, ring, driven, (number,), explore=True, simulation=simulation)
+                found[name].append(_rate(run, ring.horizon))
+            found["loop"].append(_loop_rate(ring, driver, simulation))
+        with Simulation("traci") as simulation:
+            found["traci"].append(_loop_rate(replace(ring, horizon=TRACI_STEPS), driver, simulation))
+    say("larger roads")
+    scaling = _scaling(driver, max(1, rounds // 2))
+    costs = [entry["us_per_vehicle_step"] for entry in scaling]
+    return {
+        "bare_steps_per_s": median(found["bare"]),
+        "episode_steps_per_s": median(found["episode"]),
+        "traci_steps_per_s": median(found["traci"]),
+        "every_step_steps_per_s": median(found["every_step"]),
+        "over_bare": _median_ratio(found["episode"], found["bare"]),
+        "over_bare_every_step": _median_ratio(found["every_step"], found["bare"]),
+        "over_traci": _median_ratio(found["loop"], found["traci"]),
+        "scaling": scaling,
+        "growth": max(costs) / costs[0],
+        "rounds": rounds,
+    }
+
+
+def _scaling(driver: ResidualDriver, rounds: int) -> list[dict[str, float]]:
+    """Return the cost of a vehicle-step on rings of the same density, measured in turn."""
+    costs: dict[int, list[float]] = {vehicles: [] for vehicles in SIZES}
+    for _ in range(rounds):
+        for vehicles, horizon in SIZES.items():
+            length = round(vehicles * METRES_PER_VEHICLE)
+            ring = Ring(length=(length, length), vehicles=vehicles, cavs=vehicles // 22, horizon=horizon)
+            with Simulation() as simulation:
+                costs[vehicles].append(1e6 / _loop_rate(ring, driver, simulation) / vehicles)
+    return [
+        {"vehicles": vehicles, "us_per_vehicle_step": median(found)} for vehicles, found in costs.items()
+    ]
+
+
+def _rate(run: Callable[[], object], steps: int) -> float:
+    started = time.perf_counter()
+    run()
+    return steps / (time.perf_counter() - started)
+
+
+def _loop_rate(scenario: Ring | Any, driver: ResidualDriver, simulation: Simulation) -> float:
+    """Return decisions per second of the driving loop alone."""
+    traffic = Traffic(scenario, (1,), simulation, driver.plain_numbers)
+    return _rate(lambda: drive_traffic(traffic, driver, explore=True), scenario.horizon)
+
+
+def _step(simulation: Simulation, steps: int) -> None:
+    step = simulation.step
+    for _ in range(steps):
+        step()
+
+
+def _median_ratio(above: list[float], below: list[float]) -> float:
+    return median(a / b for a, b in zip(above, below, strict=True))

@@ -1,0 +1,203 @@
+"""Pictures. Each function draws on a new figure; `wide` for a screen, otherwise for a phone."""
+
+import base64
+import io
+from collections.abc import Sequence
+from typing import Any, Literal
+
+import numpy as np
+from matplotlib import colormaps, rc_context
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.collections import LineCollection
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+from PIL import Image
+
+from unjam.reports.results import Shown
+
+SPEED_COLOURS = "viridis"
+"""slow is dark, fast is bright: also without colour vision, and in print"""
+INK, MUTED, GRID = "#1f2933", "#697586", "#e4e7eb"
+LINES = ["#7b8794", "#e07a1f", "#2b6cb0", "#2f855a", "#b83280", "#805ad5", "#c05621", "#1a202c"]
+"""of drivers, in the order in which they are shown"""
+POINTS_IN_TIME = 600
+"""moments that a picture shows of an episode"""
+
+STYLE = {
+    "font.family": "DejaVu Sans",
+    "font.size": 9,
+    "axes.edgecolor": MUTED,
+    "axes.labelcolor": INK,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "grid.color": GRID,
+    "xtick.color": MUTED,
+    "ytick.color": MUTED,
+    "legend.frameon": False,
+    "figure.facecolor": "white",
+}
+
+
+def _figure(width: float, height: float) -> Figure:
+    return Figure(figsize=(width, height), layout="constrained")
+
+
+def data_uri(figure: Figure, kind: Literal["png", "svg"]) -> str:
+    """Return a figure as a `data:` address, for a page that needs no network."""
+    content = io.BytesIO()
+    if kind == "svg":
+        with rc_context({"svg.hashsalt": "unjam"}):  # the same figure gets the same bytes
+            figure.savefig(content, format="svg", metadata={"Date": None})
+        return _data_uri("image/svg+xml", content)
+    figure.savefig(content, format="png", dpi=130)
+    small = io.BytesIO()
+    Image.open(content).convert("RGB").quantize(128).save(small, "PNG", optimize=True)
+    return _data_uri("image/png", small)
+
+
+def _data_uri(mime: str, content: io.BytesIO) -> str:
+    return f"data:{mime};base64,{base64.b64encode(content.getvalue()).decode()}"
+
+
+def speed_scale(shown: Sequence[Shown]) -> Normalize:
+    """Return one scale of speed for all pictures of these episodes."""
+    fastest = max(float(np.nanmax(episode.speeds)) for episode in shown)
+    return Normalize(0.0, max(1.0, np.ceil(fastest)))
+
+
+def space_time(shown: Sequence[Shown], wide: bool = True) -> Figure:
+    """Draw where every vehicle is at every time, coloured by speed; a panel per driver, all on one scale.
+
+    A stop-and-go wave is a dark band that runs against the direction of travel.
+    """
+    count = len(shown)
+    with rc_context(STYLE):
+        columns = min(count, 2 if count == 4 else 3) if wide else 1
+        rows = -(-count // columns)
+        figure = _figure(10.5 if wide else 4.4, 3.1 * rows + 0.3)
+        panels = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
+        scale = speed_scale(shown)
+        for number, axes in enumerate(panels.flat):
+            if number >= count:
+                axes.set_visible(False)
+                continue
+            _trajectories(axes, shown[number], scale)
+            axes.set_title(shown[number].driver, loc="left", fontsize=10, color=INK)
+            if number % columns == 0:
+                axes.set_ylabel("position on the ring [m]")
+            if number + columns >= count:
+                axes.set_xlabel("time [s]")
+                axes.tick_params(labelbottom=True)
+        mappable = ScalarMappable(scale, SPEED_COLOURS)
+        bar = figure.colorbar(
+            mappable, ax=panels, location="right" if wide else "bottom", shrink=0.8, pad=0.02, aspect=30
+        )
+        bar.set_label("speed [m/s]")
+        bar.outline.set_visible(False)  # pyright: ignore[reportCallIssue]
+        return figure
+
+
+def _trajectories(axes: Axes, episode: Shown, scale: Normalize) -> None:
+    every = max(1, len(episode.times) // POINTS_IN_TIME)
+    times = episode.times[::every]
+    axes.grid(False)
+    for column in range(episode.speeds.shape[1]):
+        position = episode.positions[::every, column] % episode.loop_length
+        points = np.column_stack([times, position])
+        segments = np.stack([points[:-1], points[1:]], axis=1)
+        keep = np.abs(np.diff(position)) < episode.loop_length / 2  # not across the seam of the ring
+        is_cav = column in episode.cavs
+        lines = LineCollection(
+            list(segments[keep]), cmap=SPEED_COLOURS, norm=scale, linewidths=2.2 if is_cav else 1.1, rasterized=True
+        )
+        lines.set_array(episode.speeds[::every, column][:-1][keep])
+        axes.add_collection(lines)
+        if is_cav:
+            axes.add_collection(LineCollection(list(segments[keep]), colors="#d7263d", linewidths=0.7, rasterized=True))
+    axes.set_xlim(times[0], times[-1])
+    axes.set_ylim(0, episode.loop_length)
+
+
+def speed_and_gap(shown: Sequence[Shown], wide: bool = True) -> Figure:
+    """Draw over time: the CAV's speed, its gap, and the std of speed across all vehicles."""
+    with rc_context(STYLE):
+        figure = _figure(10.5 if wide else 4.4, 6.2 if wide else 7.0)
+        speed, gap, wave = figure.subplots(3, 1, sharex=True)
+        for episode, colour in zip(shown, LINES, strict=False):
+            every = max(1, len(episode.times) // POINTS_IN_TIME)
+            times = episode.times[::every]
+            column = episode.cavs[0]
+            speed.plot(times, episode.speeds[::every, column], color=colour, lw=1.2, label=episode.driver)
+            gap.plot(times, episode.gaps[::every, column], color=colour, lw=1.2)
+            wave.plot(times, np.nanstd(episode.speeds[::every], axis=1), color=colour, lw=1.2)
+        speed.axhline(shown[0].limit_speed, color=INK, lw=0.8, ls=":", label="limit")
+        speed.set_ylabel("CAV's speed [m/s]")
+        gap.set_ylabel("CAV's gap [m]")
+        wave.set_ylabel("speed std across\nvehicles [m/s]")
+        wave.set_xlabel("time [s]")
+        for axes in (speed, gap, wave):
+            axes.set_ylim(bottom=0)
+        speed.margins(x=0)
+        figure.legend(loc="outside upper left", ncols=6 if wide else 2, fontsize=9)
+        return figure
+
+
+def learning_curve(
+    runs: dict[str, list[dict[str, Any]]], references: dict[str, float], wide: bool = True
+) -> Figure:
+    """Draw return against actual simulator steps.
+
+    Args:
+        runs: rows of progress, by the label of the run.
+        references: returns of drivers that do not learn, drawn as lines.
+        wide: for a screen.
+    """
+    with rc_context(STYLE):
+        figure = _figure(10.5 if wide else 4.4, 3.8)
+        axes = figure.subplots()
+        for (label, rows), colour in zip(runs.items(), LINES[2:], strict=False):
+            steps = np.array([row["actual_steps"] for row in rows]) / 1000
+            prefix = f"{label}: " if len(runs) > 1 else ""
+            training = [row["return_mean"] for row in rows]
+            axes.plot(steps, training, color=colour, lw=1, alpha=0.45, label=f"{prefix}training, with exploration")
+            validated = [(0.0, rows[0]["return_expert"])]  # the policy starts as exactly its expert
+            validated += [(step, row["return_validation"]) for step, row in zip(steps, rows, strict=True)]
+            points = np.array([point for point in validated if point[1] is not None], float).reshape(-1, 2)
+            axes.plot(*points.T, color=colour, lw=1.8, marker="o", ms=3.5, label=f"{prefix}validation, deterministic")
+        for (label, value), style in zip(references.items(), ("--", ":", "-.", (0, (1, 3))), strict=False):
+            axes.axhline(value, color=INK, lw=1.1, ls=style, label=label)
+        axes.set_xlabel("actual simulator steps [thousands]")
+        axes.set_ylabel("return of an episode")
+        axes.margins(x=0.01)
+        figure.legend(loc="outside upper left", ncols=3 if wide else 1, fontsize=9)
+        return figure
+
+
+def time_split(progress: list[dict[str, Any]], wide: bool = True) -> Figure:
+    """Draw how the wall time of training divides among its parts."""
+    totals: dict[str, float] = {}
+    for row in progress:
+        for part, seconds in row["seconds"].items():
+            totals[part] = totals.get(part, 0.0) + seconds
+    with rc_context(STYLE):
+        figure = _figure(10.5 if wide else 4.4, 1.5)
+        axes = figure.subplots()
+        start = 0.0
+        for (part, seconds), colour in zip(totals.items(), LINES, strict=False):
+            axes.barh([0], [seconds], left=start, color=colour, label=f"{part} {seconds:.0f} s")
+            start += seconds
+        axes.set_yticks([])
+        axes.set_xlabel("wall time [s]")
+        axes.margins(x=0)
+        axes.spines["left"].set_visible(False)
+        figure.legend(loc="outside upper left", ncols=5 if wide else 2, fontsize=9)
+        return figure
+
+
+def colour_table(steps: int = 32) -> list[str]:
+    """Return the colours of speed as hex codes, slowest first: for pictures that the page draws itself."""
+    table = colormaps[SPEED_COLOURS](np.linspace(0, 1, steps))[:, :3]
+    return [f"#{round(r * 255):02x}{round(g * 255):02x}{round(b * 255):02x}" for r, g, b in table]

@@ -1,0 +1,174 @@
+"""The report: one HTML page with everything in it, no network needed."""
+
+import base64
+import json
+from collections.abc import Callable, Sequence
+from importlib.resources import files
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from jinja2 import Environment, StrictUndefined
+from markupsafe import Markup, escape
+from matplotlib.figure import Figure
+
+from unjam import __version__
+from unjam.files import write_whole
+from unjam.reports.figures import (
+    colour_table,
+    data_uri,
+    learning_curve,
+    space_time,
+    speed_and_gap,
+    speed_scale,
+    time_split,
+)
+from unjam.reports.results import Results, Shown, command_to_repeat, read_results
+from unjam.reports.statistics import estimate
+from unjam.reports.story import Column, cards_of, columns_of, lead_of, notes_of, table_of, title_of
+from unjam.scenarios.scenario import VEHICLE_LENGTH
+
+REPLAY_SECONDS = 0.5
+"""time between two frames of the replay [s]"""
+MOST_PANELS = 6
+
+
+def write_report(folders: Sequence[Path], target: Path) -> Path:
+    """Write the report of one folder of results, or a comparison of several; return its path.
+
+    Raises:
+        InputError: a folder holds no results.
+        DiskError: the page cannot be written.
+    """
+    results = [read_results(folder) for folder in folders]
+    write_whole(target, render(results))
+    return target
+
+
+def render(results: Sequence[Results]) -> str:
+    """Return the page as text."""
+    page = files("unjam.reports") / "page"
+    columns = columns_of(results)
+    panels = [_renamed(column) for column in columns if column.shown is not None][:MOST_PANELS]
+    pictures = _pictures(results, panels)
+    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    template = environment.from_string((page / "report.html").read_text(encoding="utf-8"))
+    single = results[0] if len(results) == 1 else None
+    return template.render(
+        version=__version__,
+        title=title_of(results),
+        lead=lead_of(single) if single else " ".join(f"{result.folder.name}: {lead_of(result)}" for result in results),
+        notes=[note for result in results for note in notes_of(result)],
+        cards=cards_of(single) if single else [],
+        pictures=pictures,
+        picture=lambda name, text: _picture(pictures[name], text),
+        shown_drawn=", ".join(f"{key} {value:g}" for key, value in panels[0].drawn.items()) if panels else "",
+        learning_note="Validation uses fixed seeds and chooses the controller; the table below uses other seeds.",
+        columns=[column.name for column in columns],
+        table=table_of(columns),
+        table_note=_table_note(columns),
+        failures="; ".join(
+            f"{column.name} seed {row['seed']}: {row['reason']}"
+            for column in columns
+            for row in column.rows
+            if row["status"] == "failed"
+        ),
+        sources=[_source(result) for result in results],
+        style=Markup((page / "report.css").read_text(encoding="utf-8")),
+        script=Markup((page / "replay.js").read_text(encoding="utf-8")),
+        replay_data=Markup(json.dumps(replay_data(panels)).replace("</", "<\\/")),
+    )
+
+
+def _renamed(column: Column) -> Shown:
+    assert column.shown is not None
+    return Shown(**{**vars(column.shown), "driver": column.name})
+
+
+def _table_note(columns: Sequence[Column]) -> str:
+    counts = sorted({len(column.rows) for column in columns})
+    episodes = " to ".join(str(count) for count in dict.fromkeys((counts[0], counts[-1])))
+    return (
+        f"Mean over {episodes} episodes, deterministic drivers, fixed seeds; in brackets the 95 % bootstrap "
+        "interval. Hold the pointer over a metric for its definition."
+    )
+
+
+def _pictures(results: Sequence[Results], panels: Sequence[Shown]) -> dict[str, tuple[str, str]]:
+    """Return each picture as two `data:` addresses: for a screen, and for a phone."""
+    pictures: dict[str, tuple[str, str]] = {}
+
+    def add(name: str, kind: Literal["png", "svg"], draw: Callable[[bool], Figure]) -> None:
+        pictures[name] = (data_uri(draw(True), kind), data_uri(draw(False), kind))
+
+    if panels:
+        add("space_time", "png", lambda wide: space_time(panels, wide))
+        add("speed_and_gap", "svg", lambda wide: speed_and_gap(panels, wide))
+    runs = {result.folder.name: result.progress for result in results if result.progress}
+    if runs:
+        references = _references(results)
+        add("learning_curve", "svg", lambda wide: learning_curve(runs, references, wide))
+    if len(results) == 1 and results[0].progress:
+        add("time_split", "svg", lambda wide: time_split(results[0].progress, wide))
+    return pictures
+
+
+def _references(results: Sequence[Results]) -> dict[str, float]:
+    """Return the returns of the drivers that do not learn."""
+    found: dict[str, float] = {}
+    for result in results:
+        for label, rows in result.rows.items():
+            if label != result.trained:
+                found.setdefault(label, estimate([row["return"] for row in rows]).mean)
+    return found
+
+
+def _picture(both: tuple[str, str], text: str) -> Markup:
+    wide, narrow = both
+    return Markup(
+        f'<picture><source media="(max-width: 640px)" srcset="{narrow}"><img src="{wide}" alt="{escape(text)}"></picture>'
+    )
+
+
+def _source(result: Results) -> dict[str, Any]:
+    about = result.about.get("manifest", {})
+    packages = ", ".join(f"{name} {version}" for name, version in about.get("packages", {}).items() if version)
+    commit = f", commit {about['commit']}" if about.get("commit") else ""
+    facts = f"unjam {about.get('unjam')}{commit}, Python {about.get('python')}, {packages}; {about.get('started', '')}."
+    return {
+        "name": result.folder.name,
+        "command": command_to_repeat(result),
+        "facts": facts,
+        "config": result.config,
+    }
+
+
+def replay_data(panels: Sequence[Shown]) -> dict[str, Any]:
+    """Return what the page's replay needs: positions and speeds at a few frames a second."""
+    if not panels:
+        return {"drivers": []}
+    every = max(1, round(REPLAY_SECONDS / panels[0].step))
+    return {
+        "step": panels[0].step * every,
+        "frames": min(len(episode.times[::every]) for episode in panels),
+        "start": 0,
+        "fastest": speed_scale(panels).vmax,
+        "colours": colour_table(),
+        "vehicle_length": VEHICLE_LENGTH,
+        "drivers": [
+            {
+                "name": episode.driver,
+                "vehicles": episode.speeds.shape[1],
+                "cavs": episode.cavs,
+                "loop_length": episode.loop_length,
+                "outline": np.round(episode.outline, 2).tolist(),
+                "positions": _base64(episode.positions[::every]),
+                "speeds": _base64(episode.speeds[::every]),
+            }
+            for episode in panels
+        ],
+    }
+
+
+def _base64(array: np.ndarray) -> str:
+    return base64.b64encode(np.ascontiguousarray(array, "<f4").tobytes()).decode()

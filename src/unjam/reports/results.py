@@ -1,0 +1,130 @@
+"""What a folder of results says: reports read folders, and nothing else."""
+
+import json
+import tomllib
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from safetensors.numpy import load_file
+
+from unjam.errors import InputError
+
+Floats = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Shown:
+    """The episode of one driver that pictures show; T decisions, N vehicles. All drivers have the same seed."""
+
+    driver: str
+    step: float
+    """time between two decisions [s]"""
+    loop_length: float
+    limit_speed: float
+    drawn: dict[str, float]
+    vehicle_ids: list[str]
+    cav_ids: list[str]
+    speeds: Floats
+    """[m/s], shape (T + 1, N)"""
+    positions: Floats
+    """along the route, not wrapped [m], shape (T + 1, N)"""
+    gaps: Floats
+    """to the vehicle ahead [m], shape (T + 1, N)"""
+    outline: Floats
+    """the road's centre line: rows (coordinate along the route, x, y) [m]"""
+
+    @property
+    def times(self) -> NDArray[np.float64]:
+        """[s], shape (T + 1,)."""
+        return np.arange(len(self.speeds)) * self.step
+
+    @property
+    def cavs(self) -> list[int]:
+        """Columns of the CAVs."""
+        return [self.vehicle_ids.index(name) for name in self.cav_ids]
+
+
+@dataclass(frozen=True)
+class Results:
+    """The content of a run folder, or of one that `unjam drive` wrote."""
+
+    folder: Path
+    about: dict[str, Any]
+    """scenario, reward, expert, label of the trained controller, manifest"""
+    rows: dict[str, list[dict[str, Any]]]
+    """by driver: a row of metrics per episode"""
+    shown: dict[str, Shown]
+    """by driver"""
+    progress: list[dict[str, Any]] = field(default_factory=list)
+    """a row per iteration of training; empty without one"""
+    config: str = ""
+    """the run's configuration, as TOML"""
+
+    @property
+    def trained(self) -> str | None:
+        """Label of the trained controller, if there is one."""
+        return self.about.get("trained")
+
+
+def read_results(folder: Path) -> Results:
+    """Return what a folder of results says.
+
+    Raises:
+        InputError: it is not such a folder, or not finished.
+    """
+    path = folder / "evaluation.json"
+    if not path.is_file():
+        hint = "; go on with: unjam train --resume" if (folder / "config.toml").exists() else ""
+        raise InputError(f"report: {str(folder)!r} has no evaluation.json{hint}")
+    try:
+        about = json.loads(path.read_text())
+        arrays = load_file(folder / "shown.safetensors")
+    except (OSError, ValueError) as error:
+        raise InputError(f"report: {str(folder)!r} cannot be read: {error}") from None
+    rows: dict[str, list[dict[str, Any]]] = {}
+    for row in about.pop("rows"):
+        rows.setdefault(row["driver"], []).append({key: _nan(value) for key, value in row.items()})
+    shown = {}
+    for number, entry in enumerate(about.pop("shown")):
+        values = {key: _nan(value) for key, value in entry.items() if key != "seed"}
+        names = ("speeds", "positions", "gaps", "outline")
+        shown[entry["driver"]] = Shown(**values, **{name: arrays[f"{number}.{name}"] for name in names})
+    return Results(folder, about, rows, shown, read_progress(folder), _text(folder / "config.toml"))
+
+
+def read_progress(folder: Path) -> list[dict[str, Any]]:
+    """Return the rows of a run's progress; a last line cut short by a crash is left out."""
+    rows = []
+    for line in _text(folder / "progress.jsonl").splitlines():
+        try:
+            rows.append(json.loads(line))
+        except ValueError:
+            break
+    return rows
+
+
+def _text(path: Path) -> str:
+    return path.read_text() if path.exists() else ""
+
+
+def _nan(value: Any) -> Any:
+    """JSON has no NaN; null stands for it."""
+    return float("nan") if value is None else value
+
+
+def command_to_repeat(results: Results) -> str:
+    """Return the command line that made a folder."""
+    command = results.about.get("manifest", {}).get("command", [])
+    return " ".join(_quoted(str(word)) for word in command)
+
+
+def _quoted(word: str) -> str:
+    return f"'{word}'" if any(letter in word for letter in " []*?$&|;<>(){}\"") else word
+
+
+def steps_of(config: str) -> int:
+    """Return the budget of actual steps in a configuration."""
+    return int(tomllib.loads(config)["steps"])

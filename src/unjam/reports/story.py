@@ -1,0 +1,163 @@
+"""What the report says in words and figures, from the results of one folder or of several."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from unjam.reports.metrics import METRICS
+from unjam.reports.results import Results, Shown
+from unjam.reports.statistics import Estimate, estimate, paired_difference
+
+CLOSE_HEADWAY = 1.0
+"""time headway below which the report says so [s]; the paper's h_max"""
+
+
+@dataclass(frozen=True)
+class Column:
+    """One driver of one folder, as tables and pictures name it."""
+
+    name: str
+    rows: list[dict[str, Any]]
+    shown: Shown | None
+
+
+def columns_of(results: Sequence[Results]) -> list[Column]:
+    """Return the drivers to show: all of a single folder; of several, what each folder is about."""
+    if len(results) == 1:
+        only = results[0]
+        return [Column(label, rows, only.shown.get(label)) for label, rows in only.rows.items()]
+    columns: dict[str, Column] = {}
+    for result in results:
+        for label, rows in result.rows.items():
+            mine = label == result.trained or result.trained is None
+            name = f"{result.folder.name}: {label}" if mine else label
+            columns.setdefault(name, Column(name, rows, result.shown.get(label)))
+    return list(columns.values())
+
+
+def title_of(results: Sequence[Results]) -> str:
+    """Return the page's title."""
+    names = ", ".join(dict.fromkeys(result.about["scenario"] for result in results))
+    if len(results) > 1:
+        return f"{names}: {len(results)} results compared"
+    only = results[0]
+    return f"{names}: a trained residual on {only.about['expert']}" if only.trained else f"{names}: {', '.join(only.rows)}"
+
+
+def lead_of(result: Results) -> str:
+    """Return the main finding of a folder in a sentence or two, whichever way it went."""
+    if result.trained is None:
+        label, rows = next(iter(result.rows.items()))
+        speed, ratio = (estimate([row[name] for row in rows]) for name in ("mean_speed", "speed_limit_ratio_steady"))
+        return (
+            f"{label} on {result.about['scenario']}, {len(rows)} episodes: all vehicles drive "
+            f"{speed.mean:.2f} m/s on average, and in steady state {100 * ratio.mean:.0f} % of the limit."
+        )
+    trained, expert = result.rows[result.trained], result.rows.get(result.about["expert"])
+    if expert is None:
+        earned = estimate([row["return"] for row in trained])
+        return f"On {len(trained)} held-out seeds the trained controller earns {earned.mean:.0f} an episode."
+    gain = paired_difference(trained, expert, "return")
+    means = [estimate([row["return"] for row in rows]).mean for rows in (trained, expert)]
+    if gain.low > 0:
+        verdict = "The residual pays."
+    elif gain.high < 0:
+        verdict = "The residual makes it worse."
+    else:
+        verdict = "No gain is shown: the interval holds zero."
+    return (
+        f"On {gain.count} held-out seeds the trained controller earns {means[0]:.0f} an episode, its expert "
+        f"{result.about['expert']} alone {means[1]:.0f}: {signed(gain)}. {verdict}"
+    )
+
+
+def signed(gain: Estimate) -> str:
+    """Return a difference with its sign and interval."""
+    return f"{gain.mean:+.0f} [{gain.low:+.0f}, {gain.high:+.0f}]"
+
+
+def notes_of(result: Results) -> list[str]:
+    """Return what a reader should know before trusting the main finding."""
+    label = result.trained or next(iter(result.rows))
+    rows = [row for row in result.rows[label] if row["status"] != "failed"]
+    notes = []
+    crashes = sum(row["status"] == "collision" for row in rows)
+    if crashes:
+        notes.append(f"{label} ended in a collision in {crashes} of {len(rows)} episodes.")
+    closest = min((row["min_headway"] for row in rows if np.isfinite(row["min_headway"])), default=np.inf)
+    if closest < CLOSE_HEADWAY:
+        notes.append(
+            f"{label} drives close: its smallest time headway is {closest:.2f} s. The reward "
+            f"({result.about['reward']}) does not ask for distance."
+            if result.about["reward"] == "released"
+            else f"{label} drives close: its smallest time headway is {closest:.2f} s."
+        )
+    leaning = estimate([row["shield_override_share"] for row in rows]).mean
+    if leaning > 0.01:
+        hardest = max(row["shield_max_braking"] for row in rows)
+        notes.append(
+            f"{label} leans on the simulator's safety check: it overrides {100 * leaning:.1f} % of the commands, "
+            f"braking up to {hardest:.1f} m/s² harder than asked."
+        )
+    return notes
+
+
+def cards_of(result: Results) -> list[dict[str, str]]:
+    """Return the key figures of a folder, for its trained controller or its only driver."""
+    label = result.trained or next(iter(result.rows))
+    rows = result.rows[label]
+
+    def mean(name: str, of: list[dict[str, Any]] = rows) -> float:
+        return estimate([row[name] for row in of]).mean
+
+    human = result.rows.get("human")
+    compared = human is not None and label != "human"
+
+    def beside(name: str, form: str) -> str:
+        return f"all-human: {format(mean(name, human), form)}" if compared else label
+
+    ratio = "speed_limit_ratio_steady"
+    cards = [
+        _card("Mean speed of the limit, steady", f"{100 * mean(ratio):.0f} %", beside(ratio, ".0%")),
+        _card(
+            "Speed std across vehicles, steady",
+            f"{mean('speed_std_fleet_steady'):.2f} m/s",
+            beside("speed_std_fleet_steady", ".2f"),
+        ),
+        _card("Fuel", f"{mean('fuel_ml_per_km'):.0f} ml/km", beside("fuel_ml_per_km", ".0f")),
+    ]
+    expert = result.rows.get(result.about.get("expert", ""))
+    if result.trained and expert is not None:
+        gain = paired_difference(rows, expert, "return")
+        detail = f"95 % interval {gain.low:+.0f} to {gain.high:+.0f}"
+        cards.insert(0, _card("Return beyond the expert", f"{gain.mean:+.0f}", detail))
+    return cards
+
+
+def _card(label: str, value: str, detail: str) -> dict[str, str]:
+    return {"label": label, "value": value, "detail": detail}
+
+
+def table_of(columns: Sequence[Column]) -> list[dict[str, Any]]:
+    """Return the table of all metrics: a row per metric, a cell per column, mean and 95 % interval."""
+    table = []
+    for name, metric in METRICS.items():
+        cells = []
+        for column in columns:
+            found = estimate([row[name] for row in column.rows])
+            cells.append(cell_of(found, metric.digits, len(column.rows)))
+        about = " ".join((metric.function.__doc__ or "").split())
+        table.append({"label": metric.label, "unit": metric.unit, "about": about, "cells": cells})
+    return table
+
+
+def cell_of(found: Estimate, digits: int, wanted: int) -> dict[str, str]:
+    """Return a cell: mean and interval; how many of `wanted` values it stands for, where that is not all."""
+    if found.count == 0:
+        return {"mean": "–", "interval": ""}
+    interval = "" if np.isnan(found.low) else f"[{found.low:.{digits}f}, {found.high:.{digits}f}]"
+    if found.count < wanted:
+        interval = f"{interval} {found.count} of {wanted}".strip()
+    return {"mean": f"{found.mean:.{digits}f}", "interval": interval}
