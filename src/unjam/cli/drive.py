@@ -73,7 +73,7 @@ def drive(
         result = run(scenario, driver, episodes, seed, road, reward, workers, folder, steps)
     if json:
         print_json(result.document())
-    else:
+    elif any(row["status"] != "failed" for rows in result.rows.values() for row in rows):
         console.print(metrics_table(result.rows))
         if result.report is not None:
             aside.print(f"report: {result.report}")

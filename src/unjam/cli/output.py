@@ -15,8 +15,11 @@ from unjam.files import to_json
 LINE_SECONDS = 5.0
 """time between two plain lines of progress where there is no terminal"""
 
-console = Console(highlight=False)
-aside = Console(stderr=True, highlight=False)
+PIPE_WIDTH = 160
+"""columns of a table where there is no terminal"""
+
+console = Console(highlight=False, width=None if sys.stdout.isatty() else PIPE_WIDTH)
+aside = Console(stderr=True, highlight=False, width=None if sys.stderr.isatty() else PIPE_WIDTH)
 """progress and messages: standard output is for results"""
 
 

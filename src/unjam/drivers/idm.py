@@ -37,6 +37,7 @@ class Human(Driver):
     """
 
     native: ClassVar[bool] = True
+    plain_numbers: ClassVar[bool] = True
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
         """Return what the paper's IDM would do; the simulator does not ask."""

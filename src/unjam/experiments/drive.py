@@ -105,9 +105,7 @@ def drive(
 
     seeds = [(seed + index,) for index in range(episodes)]
     with Workers(min(workers or os.cpu_count() or 1, episodes * len(drivers))) as pool:
-        found = evaluate(
-            made, drivers, seeds, pool, reward, lambda label, index, steps: progress and progress((label, index), steps)
-        )
+        found = evaluate(made, drivers, seeds, pool, reward, progress)
     report = None
     if folder is not None:
         about = {"scenario": scenario, "reward": reward or made.reward, "manifest": manifest()}

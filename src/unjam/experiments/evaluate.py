@@ -10,7 +10,7 @@ import pandas as pd
 from safetensors.numpy import save
 
 from unjam.drivers.driver import Driver
-from unjam.errors import EpisodeError, InputError, MissingPartError, UnjamError
+from unjam.errors import DiskError, EpisodeError, InputError, MissingPartError, UnjamError
 from unjam.files import make_folder, to_json, write_whole
 from unjam.reports.metrics import METRICS, measure
 from unjam.reports.statistics import estimate
@@ -52,11 +52,11 @@ def evaluate(
     seeds: Sequence[tuple[int, ...]],
     workers: Workers,
     reward: str = "",
-    progress: Callable[[str, int, int], None] | None = None,
+    progress: Callable[[tuple[str, int], int], None] | None = None,
 ) -> Evaluation:
     """Run every driver on every seed, and measure.
 
-    `progress` is called with the driver's label, the index of its episode, and the decisions made.
+    `progress` is called with (the driver's label, the index of its episode), and the decisions made so far.
     """
     pairs = [(label, index) for index in range(len(seeds)) for label in drivers]
     tasks = [
@@ -65,7 +65,7 @@ def evaluate(
 
     def told(task: int, steps: int) -> None:
         if progress is not None:
-            progress(*pairs[task], steps)
+            progress(pairs[task], steps)
 
     episodes = workers.run(tasks, told)
     by_label: dict[str, list[Episode]] = {label: [] for label in drivers}
@@ -81,7 +81,7 @@ def raise_failure(rows: Sequence[dict[str, Any]]) -> None:
     """Raise the first failure among the rows of episodes, as the error that it was."""
     for row in rows:
         if row["status"] == "failed":
-            kinds = {kind.__name__: kind for kind in (InputError, MissingPartError, EpisodeError)}
+            kinds = {kind.__name__: kind for kind in (InputError, MissingPartError, DiskError, EpisodeError)}
             kind = kinds.get(row["error"], UnjamError)
             again = "" if kind is InputError else f" (seed {row['seed']})"
             raise kind(f"{row['reason']}{again}")

@@ -28,6 +28,9 @@ class IDMParameters:
 
 PAPER_IDM = IDMParameters()
 
+HALVINGS = 60
+"""of the interval in which the equilibrium speed lies: to the last bit"""
+
 
 def desired_gap(speed: Array, approach_rate: Array, parameters: IDMParameters = PAPER_IDM) -> Array:
     """Return the gap s* that a driver wants at this speed and approach rate (Eq. 6).
@@ -81,10 +84,14 @@ def equilibrium_speed(gap: float, parameters: IDMParameters = PAPER_IDM) -> floa
 
     The inverse of `equilibrium_gap`; 0 where the gap is not above the standstill gap.
     """
-    from scipy.optimize import brentq  # costs a worker a quarter of its start-up, and no worker asks
-
     if gap <= parameters.minimum_gap:
         return 0.0
-    highest = parameters.desired_speed * (1.0 - 1e-12)
-    root = brentq(lambda speed: equilibrium_gap(speed, parameters) - gap, 0.0, highest, xtol=1e-12)
-    return float(root)  # pyright: ignore[reportArgumentType]
+    low, high = 0.0, parameters.desired_speed
+    # Halving by hand: importing scipy's root finder would cost a worker half a second at its start.
+    for _ in range(HALVINGS):
+        middle = (low + high) / 2.0
+        if equilibrium_gap(middle, parameters) < gap:
+            low = middle
+        else:
+            high = middle
+    return low

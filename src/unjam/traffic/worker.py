@@ -10,7 +10,7 @@ import time
 from typing import Any, BinaryIO
 
 from unjam.drivers.registry import driver_from_recipe
-from unjam.errors import UnjamError
+from unjam.errors import DISK_ERRNOS, UnjamError, disk_error
 from unjam.scenarios.registry import scenario_from_recipe
 from unjam.traffic.episode import run_episode
 from unjam.traffic.messages import Arrays, read_message, write_message
@@ -36,9 +36,8 @@ def main() -> None:
             except (BrokenPipeError, EOFError):
                 raise
             except Exception as error:  # every requested episode has a row, also one that failed
-                known = isinstance(error, UnjamError)
-                reason = str(error) if known else f"{type(error).__name__}: {error}"
-                episode = failed_episode(tuple(facts["seed"]), reason, type(error).__name__)
+                known = _known(error)
+                episode = failed_episode(tuple(facts["seed"]), str(known), type(known).__name__)
             answer, answer_arrays = pack_episode(episode)
             write_message(answers, {"episode": answer}, answer_arrays)
     except (BrokenPipeError, EOFError):
@@ -46,6 +45,13 @@ def main() -> None:
     finally:
         if simulation is not None:
             simulation.close()
+
+
+def _known(error: Exception) -> Exception:
+    """Return an error in the words of unjam."""
+    if isinstance(error, OSError) and error.errno in DISK_ERRNOS:
+        return disk_error(error, error.filename or "a temporary file")
+    return error if isinstance(error, UnjamError) else UnjamError(f"{type(error).__name__}: {error}")
 
 
 def _run(facts: dict[str, Any], arrays: Arrays, simulation: Simulation, answers: BinaryIO) -> Any:

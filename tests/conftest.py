@@ -1,0 +1,86 @@
+"""What all tests share."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import settings
+
+from unjam.drivers import LocalState
+from unjam.drivers.network import Network
+from unjam.traffic.simulation import Simulation
+
+settings.register_profile("unjam", deadline=None, derandomize=True)  # no timed tests, and the same each time
+settings.load_profile("unjam")
+
+
+@pytest.fixture
+def simulation() -> Iterator[Simulation]:
+    with Simulation() as opened:
+        yield opened
+
+
+@pytest.fixture
+def my_drivers(tmp_path: Path) -> Path:
+    """A user's file with drivers and rewards, good and bad."""
+    path = tmp_path / "mine.py"
+    path.write_text(
+        """
+import numpy as np
+
+def gentle(state):
+    return np.clip(0.2 * (state.leader_speed - state.speed) + 0.02 * (state.leader_gap - 8), -1, 0.3)
+
+class Keeper:
+    def __init__(self, gain=0.1, time_step=0.1):
+        self.gain = gain
+    def initial_memory(self, n):
+        return {"last": np.zeros(n)}
+    def act(self, state, memory):
+        return self.gain * (state.leader_gap - 10) + 0.1 * memory["last"], {"last": state.speed}
+
+def broken(state):
+    return state.speed * np.nan
+
+def short(state):
+    return np.zeros(len(state.speed) + 1)
+
+class NoMemory:
+    def act(self, state, memory):
+        return state.speed, memory
+
+class Raises:
+    def __init__(self):
+        raise RuntimeError("no battery")
+
+def raises(state):
+    raise ValueError("lost the map")
+
+def calm(outcome):
+    return {"speed": np.nanmean(outcome.speeds, axis=-1), "push": -np.abs(outcome.accelerations).sum(-1)}
+
+def wrong_reward(outcome):
+    return {"speed": np.full(len(outcome.crashed), np.nan)}
+
+not_callable = 3
+"""
+    )
+    return path
+
+
+def state_of(speed: object, leader_speed: object, gap: object) -> LocalState:
+    """A local state in which only the leader matters."""
+    own, leader, distance = (np.asarray(values, float) for values in (speed, leader_speed, gap))
+    return LocalState(own, leader, distance, own, distance, own * 0.0, own * 0.0 + 230.0)
+
+
+def random_network(inputs: int = 5, seed: int = 0, size: int = 16, scale: float = 0.3) -> Network:
+    """A network with random weights."""
+    generator = np.random.default_rng(seed)
+    sizes = [inputs, size, size, 1]
+    layers = tuple(
+        (generator.normal(size=(rows, columns)) * scale, generator.normal(size=columns) * scale)
+        for rows, columns in zip(sizes[:-1], sizes[1:], strict=True)
+    )
+    return Network(layers, authority=1.0, exploration_std=0.2)

@@ -1,0 +1,101 @@
+"""What all built-in drivers have in common."""
+
+import numpy as np
+import pytest
+import torch
+
+from unjam.drivers import DRIVERS, Driver, LocalState, ResidualDriver, check_driver
+from unjam.drivers.check import random_state
+from unjam.drivers.driver import single_row
+from unjam.drivers.registry import driver_from_recipe, named_driver, recipe_of
+
+from ..conftest import random_network
+
+EXPERTS = [
+    "human",
+    "idm",
+    "idm:time_headway=1.5",
+    "pi",
+    "pi:time_constant=0,safe_gap_rule=closing,first_command=zero",
+    "pi:window=0.3",
+    "follower-stopper",
+    "follower-stopper:desired_speed=4",
+    "constant:acceleration=0.2",
+]
+
+
+@pytest.fixture(params=EXPERTS)
+def expert(request: pytest.FixtureRequest) -> Driver:
+    return named_driver(request.param, 0.1)
+
+
+def test_every_driver_is_among_them() -> None:
+    assert {text.partition(":")[0] for text in EXPERTS} == set(DRIVERS)
+
+
+def test_keeps_the_contract(expert: Driver) -> None:
+    check_driver(expert)
+
+
+def test_plain_numbers_give_what_arrays_give(expert: Driver) -> None:
+    assert expert.plain_numbers
+    generator = np.random.default_rng(1)
+    memory = expert.initial_memory(1)
+    numbers = single_row(memory)
+    for _ in range(60):
+        state = random_state(generator, 1)
+        expected, memory = expert.act(state, memory)
+        found, numbers = expert.act(LocalState(*(float(values[0]) for values in state)), numbers)
+        assert type(found) is float
+        assert found == pytest.approx(float(expected[0]), abs=1e-12)
+
+
+def test_tensors_give_what_arrays_give(expert: Driver) -> None:
+    generator = np.random.default_rng(2)
+    memory = expert.initial_memory(6)
+    tensors = {key: torch.tensor(values) for key, values in memory.items()}
+    for _ in range(60):
+        state = random_state(generator, 6)
+        expected, memory = expert.act(state, memory)
+        found, tensors = expert.act(LocalState(*(torch.tensor(values) for values in state)), tensors)
+        np.testing.assert_allclose(found.numpy(), expected, atol=1e-12)
+
+
+def test_rows_of_different_age_do_not_mix(expert: Driver) -> None:
+    """Memories taken at different times, as the virtual environment takes them, go on as they would alone."""
+    generator = np.random.default_rng(3)
+    ages = [0, 1, 7, 400]
+    alone = []
+    for age in ages:
+        memory = expert.initial_memory(1)
+        for _ in range(age):
+            _, memory = expert.act(random_state(generator, 1), memory)
+        alone.append(memory)
+    together = {key: np.concatenate([memory[key] for memory in alone]) for key in alone[0]}
+    for _ in range(5):
+        state = random_state(generator, len(ages))
+        found, together = expert.act(state, together)
+        for row in range(len(ages)):
+            one = LocalState(*(values[row : row + 1] for values in state))
+            expected, alone[row] = expert.act(one, alone[row])
+            assert found[row] == pytest.approx(expected[0], abs=1e-12)
+
+
+def test_recipe_makes_the_same_driver_again(expert: Driver) -> None:
+    recipe, arrays = recipe_of(expert)
+    assert driver_from_recipe(recipe, arrays) == expert
+
+
+def test_recipe_of_a_residual_on_a_residual_keeps_both_networks() -> None:
+    inner = ResidualDriver(named_driver("pi", 0.1), random_network(5, seed=1), 1.0)
+    parts = ("local", "expert_acceleration", "expert_memory")
+    outer = ResidualDriver(inner, random_network(8, seed=2), 1.0, parts, hold=3)
+    again = driver_from_recipe(*recipe_of(outer))
+    check_driver(again)
+    generator = np.random.default_rng(4)
+    memories = [driver.initial_memory(4) for driver in (outer, again)]
+    for _ in range(10):
+        state = random_state(generator, 4)
+        expected, memories[0] = outer.act(state, memories[0])
+        found, memories[1] = again.act(state, memories[1])
+        np.testing.assert_array_equal(found, expected)

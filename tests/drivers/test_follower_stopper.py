@@ -1,0 +1,49 @@
+import numpy as np
+import pytest
+
+from unjam.drivers import FollowerStopper, LocalState
+
+from ..conftest import state_of
+
+
+def test_flows_reference_values() -> None:
+    driver = FollowerStopper(desired_speed=7.5, time_constant=0)
+    state = state_of([5, 7.5, 7.5, 8, 7], [7.5, 7.5, 8, 7, 5], [5, 10, 15, 20, 25])
+    found, _ = driver.act(state, driver.initial_memory(5))
+    np.testing.assert_allclose(found, [0, 0, 0, -5, 5], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("gap", "wanted"),
+    [(4.0, 0.0), (4.5, 0.0), (4.875, 2.0), (5.25, 4.0), (5.625, 6.0), (6.0, 8.0), (50.0, 8.0)],
+)
+def test_commanded_speed_in_each_region_at_equal_speeds(gap: float, wanted: float) -> None:
+    driver = FollowerStopper(desired_speed=8.0, time_constant=0)
+    found, _ = driver.act(state_of([4.0], [4.0], [gap]), driver.initial_memory(1))
+    assert found[0] * 0.1 + 4.0 == pytest.approx(wanted, abs=1e-12)
+
+
+def test_borders_grow_with_the_square_of_the_closing_speed() -> None:
+    driver = FollowerStopper(desired_speed=8.0, time_constant=0)
+    closing = 3.0
+    border = 4.5 + closing**2 / (2 * 1.5)
+    for gap, stands in ((border - 0.01, True), (border + 0.3, False)):
+        found, _ = driver.act(state_of([5.0], [2.0], [gap]), driver.initial_memory(1))
+        assert bool(found[0] * 0.1 + 5.0 < 1e-9) is stands
+
+
+def test_desired_speed_is_the_leaders_mean_by_default_so_that_it_sets_off() -> None:
+    driver, memory, speed = FollowerStopper(), None, 0.0
+    memory = driver.initial_memory(1)
+    for _ in range(200):
+        acceleration, memory = driver.act(state_of([speed], [4.0], [30.0]), memory)
+        speed = max(0.0, speed + min(1.0, float(acceleration[0])) * 0.1)
+    assert speed == pytest.approx(4.0, abs=1e-6)
+
+
+def test_recalls_the_leaders_speed() -> None:
+    driver = FollowerStopper(time_constant=0)
+    history = np.full((1, 380), 3.0)
+    memory = driver.recall(driver.initial_memory(1), LocalState(*([history] * 7)))
+    found, _ = driver.act(state_of([0.0], [3.0], [50.0]), memory)
+    assert found[0] == pytest.approx(30.0)

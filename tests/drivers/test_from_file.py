@@ -1,0 +1,56 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from unjam import check_driver
+from unjam.controller import make_driver
+from unjam.drivers.check import random_state
+from unjam.errors import InputError
+
+
+def test_a_function_becomes_a_driver(my_drivers: Path) -> None:
+    driver = make_driver(f"{my_drivers}:gentle", 0.1)
+    check_driver(driver)
+    assert not driver.plain_numbers
+
+
+def test_a_class_takes_parameters_and_the_time_step(my_drivers: Path) -> None:
+    driver = make_driver(f"{my_drivers}:Keeper:gain=0.5", 0.1)
+    check_driver(driver)
+    state = random_state(np.random.default_rng(0), 2)
+    found, memory = driver.act(state, driver.initial_memory(2))
+    np.testing.assert_allclose(found, 0.5 * (state.leader_gap - 10))
+    assert set(memory) == {"last"}
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("nobody", "has no 'nobody'; it has: .*gentle"),
+        ("NoMemory", r"has act\(\) but no initial_memory"),
+        ("Raises", "RuntimeError when made: no battery"),
+        ("not_callable", "neither a function nor a class"),
+        ("gentle:gain=1", "takes no parameters"),
+        ("Keeper:strength=1", "TypeError when made"),
+    ],
+)
+def test_says_what_is_wrong_with_a_file(my_drivers: Path, name: str, words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        make_driver(f"{my_drivers}:{name}", 0.1)
+
+
+def test_says_that_a_file_is_missing_or_fails(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="is not a file"):
+        make_driver(f"{tmp_path}/none.py:x", 0.1)
+    (tmp_path / "syntax.py").write_text("def x(:")
+    with pytest.raises(InputError, match="SyntaxError when loading"):
+        make_driver(f"{tmp_path}/syntax.py:x", 0.1)
+
+
+def test_a_file_may_import_its_neighbours(tmp_path: Path) -> None:
+    (tmp_path / "my_gains_of_mine.py").write_text("GAIN = 0.25")
+    (tmp_path / "main.py").write_text("from my_gains_of_mine import GAIN\ndef d(state): return GAIN * state.speed")
+    driver = make_driver(f"{tmp_path}/main.py:d", 0.1)
+    state = random_state(np.random.default_rng(0), 3)
+    np.testing.assert_allclose(driver.act(state, {})[0], 0.25 * state.speed)

@@ -1,0 +1,64 @@
+import numpy as np
+import pytest
+
+from unjam.drivers.network import network_arrays, network_from_arrays
+from unjam.errors import InputError
+
+from ..conftest import random_network
+
+
+def test_agrees_with_the_layers_written_out() -> None:
+    network = random_network(5)
+    observation = np.random.default_rng(1).normal(size=(7, 5))
+    hidden = observation
+    for weight, bias in network.layers[:-1]:
+        hidden = np.maximum(0.0, hidden @ weight + bias)
+    weight, bias = network.layers[-1]
+    np.testing.assert_allclose(network(observation), np.tanh(hidden @ weight + bias)[:, 0], atol=1e-12)
+
+
+def test_rows_at_once_equal_single_rows_and_plain_numbers() -> None:
+    network = random_network(5)
+    observation = np.random.default_rng(2).normal(size=(9, 5))
+    together = network(observation)
+    for row, expected in zip(observation, together, strict=True):
+        assert network(row[None])[0] == pytest.approx(expected, abs=1e-12)
+        assert network(tuple(map(float, row))) == pytest.approx(expected, abs=1e-12)
+
+
+def test_output_stays_within_its_authority() -> None:
+    network = random_network(5, scale=30.0)
+    assert np.abs(network(np.random.default_rng(3).normal(size=(50, 5)))).max() <= 1.0
+
+
+def test_exploration_adds_scaled_noise() -> None:
+    network = random_network(5)
+    observation, noise = np.zeros((3, 5)), np.array([-1.0, 0.0, 2.0])
+    np.testing.assert_allclose(network.explore(observation, noise) - network(observation), 0.2 * noise)
+
+
+def test_arrays_make_the_same_network_again() -> None:
+    network = random_network(5)
+    again = network_from_arrays(network_arrays(network), 1.0, 0.2)
+    observation = np.ones((2, 5))
+    np.testing.assert_array_equal(again(observation), network(observation))
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"0.bias": np.zeros(3)}, "weight and bias do not fit"),
+        ({"1.weight": np.zeros((3, 16))}, "3 inputs are not allowed; allowed: 16"),
+        ({"1.bias": np.full(16, np.nan)}, "not finite"),
+        ({"2.weight": np.zeros((16, 2)), "2.bias": np.zeros(2)}, "one output"),
+        ({"0.weight": np.zeros(5)}, "do not fit"),
+    ],
+)
+def test_refuses_weights_that_do_not_fit(change: dict[str, np.ndarray], words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        network_from_arrays({**network_arrays(random_network(5)), **change}, 1.0, 0.1)
+
+
+def test_refuses_no_weights() -> None:
+    with pytest.raises(InputError, match="one output"):
+        network_from_arrays({}, 1.0, 0.1)

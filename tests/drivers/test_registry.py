@@ -1,0 +1,46 @@
+import pytest
+
+from unjam.drivers import Constant, FollowerStopper, PISaturation
+from unjam.drivers.registry import describe, named_driver, recipe_of
+from unjam.errors import InputError
+
+
+def test_names_take_parameters() -> None:
+    assert named_driver("pi:window=10,safe_gap_rule=closing", 0.2) == PISaturation(
+        window=10, safe_gap_rule="closing", time_step=0.2
+    )
+    assert named_driver("follower-stopper:gaps=[1,2,3],desired_speed=5", 0.1) == FollowerStopper(
+        gaps=(1, 2, 3), desired_speed=5
+    )
+
+
+def test_description_names_what_differs_from_the_defaults() -> None:
+    assert describe(named_driver("pi", 0.5)) == "pi"
+    assert describe(named_driver("pi:window=10", 0.1)) == "pi:window=10.0"
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("poi", "driver: 'poi' is not allowed; allowed: human, idm, pi"),
+        ("pi:speed=3", "driver pi.speed: unknown name"),
+        ("pi:window=-1", "driver pi.window: -1 is not allowed; allowed: greater than 0"),
+        ("pi:window=wide", "driver pi.window: 'wide' is not allowed"),
+        ("pi:window=nan", "driver pi.window: nan is not allowed"),
+        ("pi:safe_gap_rule=none", "driver pi.safe_gap_rule"),
+        ("pi:window=1,oops", "allowed: key=value"),
+        ("constant:acceleration=[1]", "driver constant.acceleration"),
+    ],
+)
+def test_wrong_names_and_values_get_one_clear_line(text: str, words: str) -> None:
+    with pytest.raises(InputError, match=words) as caught:
+        named_driver(text, 0.1)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_class_of_ones_own_must_come_from_a_file() -> None:
+    class Mine(Constant):
+        pass
+
+    with pytest.raises(InputError, match="put your class in a file"):
+        recipe_of(Mine())

@@ -1,0 +1,98 @@
+import numpy as np
+import pytest
+
+from unjam.drivers import IDM, LocalState, PISaturation, ResidualDriver, check_driver
+from unjam.drivers.check import random_state
+from unjam.drivers.driver import single_row
+from unjam.drivers.network import Network
+from unjam.drivers.residual import observation_size
+
+from ..conftest import random_network
+
+ALL_PARTS = ("local", "expert_acceleration", "expert_memory", "loop_length")
+
+
+def zero_network(inputs: int) -> Network:
+    layers = ((np.ones((inputs, 4)), np.ones(4)), (np.zeros((4, 1)), np.zeros(1)))
+    return Network(layers, 1.0, 0.1)
+
+
+def test_with_a_zero_network_it_is_exactly_its_expert_within_the_limit() -> None:
+    expert = PISaturation(time_constant=0)
+    driver = ResidualDriver(expert, zero_network(5), 1.0)
+    generator = np.random.default_rng(0)
+    memory, expert_memory = driver.initial_memory(5), expert.initial_memory(5)
+    for _ in range(40):
+        state = random_state(generator, 5)
+        found, memory = driver.act(state, memory)
+        expected, expert_memory = expert.act(state, expert_memory)
+        np.testing.assert_array_equal(found, expected.clip(-1.0, 1.0))
+
+
+def test_adds_expert_and_residual_and_clips_the_sum() -> None:
+    driver = ResidualDriver(IDM(), random_network(5, scale=2.0), 1.0)
+    state = random_state(np.random.default_rng(1), 200)
+    decision = driver.decide(state, {})
+    expected = decision.expert + decision.residual
+    np.testing.assert_array_equal(decision.acceleration, expected.clip(-1.0, 1.0))
+    assert (np.abs(expected) > 1.0).any()
+    assert np.abs(decision.expert).max() <= 1.0
+
+
+@pytest.mark.parametrize("hold", [1, 3, 10])
+@pytest.mark.parametrize("parts", [("local",), ALL_PARTS])
+def test_keeps_the_contract_of_drivers(hold: int, parts: tuple) -> None:
+    expert = PISaturation()
+    network = random_network(observation_size(parts, expert))
+    check_driver(ResidualDriver(expert, network, 1.0, parts, hold))
+
+
+@pytest.mark.parametrize("hold", [1, 4])
+def test_plain_numbers_give_what_arrays_give(hold: int) -> None:
+    expert = PISaturation()
+    driver = ResidualDriver(expert, random_network(observation_size(ALL_PARTS, expert)), 1.0, ALL_PARTS, hold)
+    generator = np.random.default_rng(2)
+    memory = driver.initial_memory(1)
+    numbers = single_row(memory)
+    for _ in range(25):
+        state = random_state(generator, 1)
+        expected, memory = driver.act(state, memory)
+        found, numbers = driver.act(LocalState(*(float(values[0]) for values in state)), numbers)
+        assert found == pytest.approx(float(expected[0]), abs=1e-12)
+
+
+def test_holds_its_residual_for_as_many_decisions_as_asked() -> None:
+    driver = ResidualDriver(IDM(), random_network(5), 1.0, hold=3)
+    generator = np.random.default_rng(3)
+    memory, residuals = driver.initial_memory(2), []
+    for _ in range(9):
+        decision = driver.decide(random_state(generator, 2), memory)
+        memory = decision.memory
+        residuals.append(decision.residual)
+    for start in (0, 3, 6):
+        np.testing.assert_array_equal(residuals[start], residuals[start + 2])
+    assert not np.array_equal(residuals[2], residuals[3])
+
+
+def test_explores_only_when_given_noise() -> None:
+    driver = ResidualDriver(IDM(), random_network(5), 1.0)
+    state = random_state(np.random.default_rng(4), 3)
+    still = driver.decide(state, {}).residual
+    moved = driver.decide(state, {}, np.array([1.0, 0.0, -1.0])).residual
+    np.testing.assert_allclose(moved - still, [0.2, 0.0, -0.2], atol=1e-12)
+
+
+def test_a_residual_on_a_residual_that_both_hold_keep_apart() -> None:
+    inner = ResidualDriver(PISaturation(), random_network(5, seed=1), 1.0, hold=2)
+    outer = ResidualDriver(inner, random_network(5, seed=2), 1.0, hold=5)
+    check_driver(outer)
+
+
+def test_observes_what_was_asked_for() -> None:
+    driver = ResidualDriver(PISaturation(), random_network(9), 1.0, ALL_PARTS)
+    state = LocalState(*(np.array([value]) for value in (4.0, 5.0, 10.0, 3.0, 8.0, 20.0, 250.0)))
+    seen = driver.observation(state, driver.initial_memory(1))[0]
+    np.testing.assert_allclose(seen[:5], [0.4, 0.2, 0.5, -0.2, 0.4])
+    assert abs(seen[5]) <= 1.0
+    assert seen[6] == pytest.approx(0.4)  # mean own speed after one step is the own speed
+    assert seen[8] == pytest.approx(1.0)
