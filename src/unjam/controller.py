@@ -66,7 +66,14 @@ def load_controller(path: Path | str) -> Driver:
         if hashlib.sha256(weights).hexdigest() != manifest["sha256"][WEIGHTS]:
             raise InputError(f"controller {file.name}: damaged: its weights do not have the hash it names")
         return driver_from_recipe(manifest["driver"], load(weights))
-    except (zipfile.BadZipFile, SafetensorError, ValueError, KeyError, TypeError, NotImplementedError) as error:
+    except (
+        zipfile.BadZipFile,
+        SafetensorError,
+        ValueError,
+        KeyError,
+        TypeError,
+        NotImplementedError,
+    ) as error:
         raise InputError(f"controller {file.name}: not a controller: {error}") from None
 
 

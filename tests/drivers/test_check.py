@@ -67,7 +67,7 @@ def test_accepts_good_drivers(driver: Any) -> None:
         (RemembersItself(), "step 0: the same state and memory gave another acceleration"),
         (MixesRows(), "step 0: row 0 gave .* alone and .* among 8 rows"),
         (WritesIntoMemory(), r"step 0: act\(\) changed the memory"),
-        (NotFinite(), "step 0: acceleration is -inf"),
+        (NotFinite(), r"step \d: acceleration is -inf"),
         (WrongShape(), r"step 0: acceleration has shape \(8, 1\)"),
         (Words(), "step 0: acceleration is not numbers"),
         (Nothing(), r"has no initial_memory\(\)"),

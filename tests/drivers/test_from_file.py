@@ -50,7 +50,9 @@ def test_says_that_a_file_is_missing_or_fails(tmp_path: Path) -> None:
 
 def test_a_file_may_import_its_neighbours(tmp_path: Path) -> None:
     (tmp_path / "my_gains_of_mine.py").write_text("GAIN = 0.25")
-    (tmp_path / "main.py").write_text("from my_gains_of_mine import GAIN\ndef d(state): return GAIN * state.speed")
+    (tmp_path / "main.py").write_text(
+        "from my_gains_of_mine import GAIN\ndef d(state): return GAIN * state.speed"
+    )
     driver = make_driver(f"{tmp_path}/main.py:d", 0.1)
     state = random_state(np.random.default_rng(0), 3)
     np.testing.assert_allclose(driver.act(state, {})[0], 0.25 * state.speed)

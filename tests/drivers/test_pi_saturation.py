@@ -13,7 +13,9 @@ AROUND_A_RING = state_of([5, 7.5, 7.5, 8, 7], [7.5, 7.5, 8, 7, 5], [5, 10, 15, 2
 
 def test_flows_reference_values_on_the_first_call() -> None:
     found, _ = FLOW.act(AROUND_A_RING, FLOW.initial_memory(5))
-    np.testing.assert_allclose(np.minimum(found, 20.0), [20, -36.847826, -35.76087, -37.173913, -31.086957], atol=5e-7)
+    np.testing.assert_allclose(
+        np.minimum(found, 20.0), [20, -36.847826, -35.76087, -37.173913, -31.086957], atol=5e-7
+    )
 
 
 def literal_pi(states: list[tuple[float, float, float]], constant_gap: bool, from_zero: bool) -> list[float]:

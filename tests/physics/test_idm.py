@@ -6,7 +6,14 @@ from hypothesis import strategies as st
 
 from unjam.errors import InputError
 from unjam.parameters import build
-from unjam.physics import IDMParameters, desired_gap, equilibrium_gap, equilibrium_speed, idm_acceleration, next_speed
+from unjam.physics import (
+    IDMParameters,
+    desired_gap,
+    equilibrium_gap,
+    equilibrium_speed,
+    idm_acceleration,
+    next_speed,
+)
 from unjam.scenarios import Ring
 from unjam.traffic.simulation import Simulation
 
@@ -44,7 +51,9 @@ def test_equilibrium_speed_inverts_equilibrium_gap(gap: float) -> None:
 def test_ring_limits_are_the_papers() -> None:
     found = [equilibrium_speed(length / 22 - 5) for length in range(220, 280, 10)]
     np.testing.assert_allclose(found, [3.000, 3.454, 3.908, 4.362, 4.816, 5.269], atol=5e-4)
-    assert np.mean([equilibrium_speed(length / 22 - 5) for length in range(220, 271)]) == pytest.approx(4.135, abs=5e-4)
+    assert np.mean([equilibrium_speed(length / 22 - 5) for length in range(220, 271)]) == pytest.approx(
+        4.135, abs=5e-4
+    )
 
 
 def test_no_equilibrium_speed_below_the_standstill_gap() -> None:
@@ -59,7 +68,11 @@ def test_no_equilibrium_gap_beyond_the_desired_speed(speed: float) -> None:
 
 def test_one_definition_for_numpy_torch_and_numbers() -> None:
     generator = np.random.default_rng(0)
-    speed, leader, gap = generator.uniform(0, 15, 50), generator.uniform(0, 15, 50), generator.uniform(1, 60, 50)
+    speed, leader, gap = (
+        generator.uniform(0, 15, 50),
+        generator.uniform(0, 15, 50),
+        generator.uniform(1, 60, 50),
+    )
     arrays = idm_acceleration(speed, leader, gap)
     tensors = idm_acceleration(*(torch.tensor(values) for values in (speed, leader, gap)))
     numbers = [idm_acceleration(*map(float, row)) for row in zip(speed, leader, gap, strict=True)]

@@ -156,4 +156,4 @@ def seed_iteration(run_seed: int, iteration: int) -> None:
     """
     torch_seed, numpy_seed = np.random.SeedSequence([run_seed, iteration, 1]).generate_state(2)
     torch.manual_seed(int(torch_seed))
-    np.random.seed(int(numpy_seed))  # noqa: NPY002  (Stable-Baselines3 shuffles with NumPy's global one)
+    np.random.seed(int(numpy_seed))

@@ -48,7 +48,9 @@ class ActorAndCritic(nn.Module):
         super().__init__()
         self.inputs = inputs
         self.policy_net = _layers(inputs, hidden)
-        self.value_net = _layers(inputs + critic_inputs, hidden)  # TRPO tells the critic by `value` in its name
+        self.value_net = _layers(
+            inputs + critic_inputs, hidden
+        )  # TRPO tells the critic by `value` in its name
         self.latent_dim_pi = self.latent_dim_vf = hidden[-1]
 
     def forward(self, features: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -113,7 +115,9 @@ class ResidualPolicy(ActorCriticPolicy):
         """Return the NumPy twin: the same residual to 1e-6, and the same exploration noise."""
         actor = [*self.mlp_extractor.policy_net, *self.action_net]  # pyright: ignore[reportGeneralTypeIssues]
         layers = tuple(
-            (_array(layer.weight).T.copy(), _array(layer.bias)) for layer in actor if isinstance(layer, nn.Linear)
+            (_array(layer.weight).T.copy(), _array(layer.bias))
+            for layer in actor
+            if isinstance(layer, nn.Linear)
         )
         return Network(layers, self.authority, float(torch.exp(self.log_std.detach()).item()))
 

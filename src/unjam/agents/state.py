@@ -28,7 +28,11 @@ def learner_state(learner: EpisodicTRPO) -> tuple[dict[str, Any], Tensors]:
 def restore_learner(learner: EpisodicTRPO, counters: dict[str, Any], tensors: Tensors) -> None:
     """Put a learner made from the same configuration into the state that `learner_state` returned."""
     learner.policy.load_state_dict(
-        {name.removeprefix("policy."): tensor for name, tensor in tensors.items() if name.startswith("policy.")}
+        {
+            name.removeprefix("policy."): tensor
+            for name, tensor in tensors.items()
+            if name.startswith("policy.")
+        }
     )
     optimizer = learner.policy.optimizer
     entries: dict[int, dict[str, torch.Tensor]] = {}

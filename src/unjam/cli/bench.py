@@ -44,8 +44,12 @@ def bench(
         f"{found['over_bare_every_step']:.2f} of bare",
     )
     table.add_row(
-        "the first of these over TraCI", f"{found['traci_steps_per_s']:,.0f}", f"{found['over_traci']:.1f} times slower"
+        "the first of these over TraCI",
+        f"{found['traci_steps_per_s']:,.0f}",
+        f"{found['over_traci']:.1f} times slower",
     )
     console.print(table)
     for entry in found["scaling"]:
-        console.print(f"{entry['vehicles']:>5} vehicles: {entry['us_per_vehicle_step']:.2f} us a vehicle-step")
+        console.print(
+            f"{entry['vehicles']:>5} vehicles: {entry['us_per_vehicle_step']:.2f} us a vehicle-step"
+        )

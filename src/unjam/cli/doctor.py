@@ -27,7 +27,13 @@ def doctor(json: JsonOption = False) -> None:
         print_json(document)
     else:
         for check in checks:
-            mark = "[green]ok[/green]     " if check.ok else "[red]missing[/red]" if check.needed else "[yellow]no[/yellow]     "
+            mark = (
+                "[green]ok[/green]     "
+                if check.ok
+                else "[red]missing[/red]"
+                if check.needed
+                else "[yellow]no[/yellow]     "
+            )
             console.print(f"{mark} {check.name}: {check.found}")
             if not check.ok:
                 console.print(f"        {check.remedy}")

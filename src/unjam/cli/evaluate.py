@@ -11,7 +11,9 @@ from unjam.errors import InputError
 
 def evaluate(
     run: Annotated[Path, typer.Argument(help="Folder of a training run.")],
-    episodes: Annotated[int, typer.Option("--episodes", "-n", min=1, help="Held-out episodes per driver.")] = 20,
+    episodes: Annotated[
+        int, typer.Option("--episodes", "-n", min=1, help="Held-out episodes per driver.")
+    ] = 20,
     workers: WorkersOption = DEFAULT_WORKERS,
     json: JsonOption = False,
 ) -> None:

@@ -9,7 +9,8 @@ from unjam.cli.options import JsonOption
 
 
 def scenarios(
-    name: Annotated[str | None, typer.Argument(help="One scenario, in full.")] = None, json: JsonOption = False
+    name: Annotated[str | None, typer.Argument(help="One scenario, in full.")] = None,
+    json: JsonOption = False,
 ) -> None:
     """List the scenarios; of one, its road, observation, reward, limit and every parameter.
 
@@ -35,7 +36,9 @@ def scenarios(
         for key, scenario in SCENARIOS.items():
             facts = dict(scenario.facts())
             warmup = f"{scenario.warmup * scenario.simulation_step:g} s"
-            table.add_row(key, facts["road"], facts["vehicles"], facts["limit"], f"{scenario.horizon:,}", warmup)
+            table.add_row(
+                key, facts["road"], facts["vehicles"], facts["limit"], f"{scenario.horizon:,}", warmup
+            )
         console.print(table)
         return
     scenario = make_scenario(name)
@@ -58,7 +61,10 @@ def _common_facts(scenario: Any) -> list[tuple[str, str]]:
     step = scenario.simulation_step
     return [
         ("episode", f"{scenario.horizon:,} decisions of {scenario.decision_step:g} s; a collision ends it"),
-        ("warm-up", f"{scenario.warmup} all-human steps ({scenario.warmup * step:g} s), before control, not counted"),
+        (
+            "warm-up",
+            f"{scenario.warmup} all-human steps ({scenario.warmup * step:g} s), before control, not counted",
+        ),
         ("people", f"IDM with acceleration noise of std {scenario.noise_per_step:.3f} m/s2 a step"),
         ("action", f"acceleration within ±{scenario.action_limit:g} m/s2, {scenario.actuation}"),
         ("observation", "; ".join(OBSERVATION_NAMES["local"])),
@@ -123,10 +129,16 @@ def _parameter_table(rows: list[dict[str, Any]], title: str) -> Any:
     for column in (title, "default", "meaning"):
         table.add_column(column)
     for row in rows:
-        table.add_row(f"  {row['name']}", escape(_brief(row["default"])), escape(" ".join(row["about"].split())))
+        table.add_row(
+            f"  {row['name']}", escape(_brief(row["default"])), escape(" ".join(row["about"].split()))
+        )
     return table
 
 
 def _brief(value: Any) -> str:
     """Return a default as a table shows it."""
-    return ", ".join(f"{key}={entry:g}" for key, entry in value.items()) if isinstance(value, dict) else str(value)
+    return (
+        ", ".join(f"{key}={entry:g}" for key, entry in value.items())
+        if isinstance(value, dict)
+        else str(value)
+    )

@@ -11,7 +11,10 @@ from unjam.parameters import parse_assignments
 
 ScenarioArgument = Annotated[str, typer.Argument(help="Name of the scenario; `unjam scenarios` lists them.")]
 RewardOption = Annotated[
-    str, typer.Option("--reward", help="Reward by name, or your own: path.py:name.", show_default="the scenario's")
+    str,
+    typer.Option(
+        "--reward", help="Reward by name, or your own: path.py:name.", show_default="the scenario's"
+    ),
 ]
 EpisodesOption = Annotated[int, typer.Option("--episodes", "-n", min=1, help="Number of episodes.")]
 SeedOption = Annotated[int, typer.Option("--seed", min=0, help="First seed.")]

@@ -46,7 +46,9 @@ def metrics_table(rows_by_driver: dict[str, list[dict[str, Any]]]) -> Table:
                 cells.append("–")
                 continue
             digits = metric.digits
-            interval = f" [dim]\\[{found.low:.{digits}f}, {found.high:.{digits}f}][/dim]" if found.count > 1 else ""
+            interval = (
+                f" [dim]\\[{found.low:.{digits}f}, {found.high:.{digits}f}][/dim]" if found.count > 1 else ""
+            )
             share = f" [dim]{found.count} of {len(rows)}[/dim]" if found.count < len(rows) else ""
             cells.append(f"{found.mean:.{digits}f}{interval}{share}")
         table.add_row(metric.label, metric.unit, *cells)
@@ -103,5 +105,3 @@ def bar() -> Progress:
         console=aside,
         transient=True,
     )
-
-

@@ -11,7 +11,8 @@ from unjam.cli.options import JsonOption
 def report(
     folders: Annotated[list[Path], typer.Argument(help="Folders of results: of training runs, or of drive.")],
     out: Annotated[
-        Path | None, typer.Option("--out", help="The page to write.", show_default="report.html in the folder")
+        Path | None,
+        typer.Option("--out", help="The page to write.", show_default="report.html in the folder"),
     ] = None,
     json: JsonOption = False,
 ) -> None:

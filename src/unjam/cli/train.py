@@ -33,7 +33,8 @@ def train(
     preset: Annotated[str, typer.Option(help="Named starting point: demo, paper.")] = "",
     config: Annotated[Path | None, typer.Option(help="TOML file with any keys of the configuration.")] = None,
     settings: Annotated[
-        list[str] | None, typer.Option("--set", help="Any key of the configuration: key=value, trpo.gamma=0.995.")
+        list[str] | None,
+        typer.Option("--set", help="Any key of the configuration: key=value, trpo.gamma=0.995."),
     ] = None,
     steps: Annotated[int | None, typer.Option(min=1, help="Actual simulator steps to train for.")] = None,
     seed: Annotated[int | None, typer.Option(min=0, help="Seed of the whole run.")] = None,
@@ -50,7 +51,8 @@ def train(
     workers: WorkersOption = DEFAULT_WORKERS,
     out: OutOption = None,
     resume: Annotated[
-        Path | None, typer.Option(help="Go on with this run: after a stop, or with more --steps after its end.")
+        Path | None,
+        typer.Option(help="Go on with this run: after a stop, or with more --steps after its end."),
     ] = None,
     json: JsonOption = False,
 ) -> None:
@@ -124,9 +126,7 @@ class _Progress:
         """Show a row of progress."""
         if row["return_validation"] is not None:
             self._validated = f"{row['return_validation']:.0f}"
-        words = (
-            f"return {row['return_mean']:.0f}, validation {self._validated} (expert {row['return_expert']:.0f})"
-        )
+        words = f"return {row['return_mean']:.0f}, validation {self._validated} (expert {row['return_expert']:.0f})"
         if self._bar is not None:
             self._bar.update(self._task, completed=row["actual_steps"], description=words)
         elif row["iteration"] % LINE_EVERY == 0 or row["actual_steps"] >= self._steps:

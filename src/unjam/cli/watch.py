@@ -69,7 +69,9 @@ def watch(
         aside.print("drawing")
         write_video(episode, video, describe(driven), pace)
     if json:
-        print_json({"scenario": scenario, "driver": driver, "video": str(video) if video else None, "episode": row})
+        print_json(
+            {"scenario": scenario, "driver": driver, "video": str(video) if video else None, "episode": row}
+        )
     raise_failure([row])
     if not json and video is not None:
         console.print(str(video))

@@ -38,11 +38,11 @@ def check_driver(driver: Any, rows: int = 8, steps: int = 50, seed: int = 0) -> 
         before = _copy(memory)
         acceleration, after = driver.act(state, memory)
         acceleration = check_acceleration(acceleration, rows, f"step {step}")
+        if not _equal(memory, before):
+            raise InputError(f"driver: step {step}: act() changed the memory that it was given")
         again, _ = driver.act(state, before)
         if not np.array_equal(acceleration, again):
             raise InputError(f"driver: step {step}: the same state and memory gave another acceleration")
-        if not _equal(memory, before):
-            raise InputError(f"driver: step {step}: act() changed the memory that it was given")
         for row in range(rows):
             one = LocalState(*(values[row : row + 1] for values in state))
             alone, single[row] = driver.act(one, single[row])

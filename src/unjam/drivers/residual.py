@@ -7,7 +7,13 @@ from typing import NamedTuple
 import numpy as np
 
 from unjam.drivers.driver import Driver, Memory
-from unjam.drivers.local_state import ACCELERATION_SCALE, LOOP_LENGTH_SCALE, LocalState, ObservationPart, local_vector
+from unjam.drivers.local_state import (
+    ACCELERATION_SCALE,
+    LOOP_LENGTH_SCALE,
+    LocalState,
+    ObservationPart,
+    local_vector,
+)
 from unjam.drivers.network import Network
 from unjam.physics.arrays import Array, as_column, clip, join_columns, namespace
 

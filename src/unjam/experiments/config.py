@@ -18,6 +18,7 @@ from unjam.parameters import STRICT, Count, CountOrNone, build
 from unjam.scenarios.registry import make_scenario
 from unjam.scenarios.scenario import Scenario
 
+
 @dataclass(frozen=True, config=STRICT)
 class EvaluationSettings:
     """How a run is judged, always with the deterministic policy; its steps are counted apart."""

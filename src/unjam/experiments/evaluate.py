@@ -60,7 +60,8 @@ def evaluate(
     """
     pairs = [(label, index) for index in range(len(seeds)) for label in drivers]
     tasks = [
-        EpisodeTask(scenario, drivers[label], seeds[index], reward, record_fuel=True) for label, index in pairs
+        EpisodeTask(scenario, drivers[label], seeds[index], reward, record_fuel=True)
+        for label, index in pairs
     ]
 
     def told(task: int, steps: int) -> None:

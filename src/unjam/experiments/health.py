@@ -32,7 +32,9 @@ class Check:
 def check_health() -> list[Check]:
     """Return all checks, the costliest last: an episode in a worker process."""
     return [
-        Check("Python", sys.version_info >= (3, 11), platform.python_version(), "install Python 3.11 or newer"),
+        Check(
+            "Python", sys.version_info >= (3, 11), platform.python_version(), "install Python 3.11 or newer"
+        ),
         _sumo_package("libsumo"),
         _sumo_package("eclipse-sumo"),
         _sumo_package("traci", needed=False),
@@ -74,7 +76,9 @@ def _cache() -> Check:
         free = shutil.disk_usage(folder).free / 2**30
         writable = os.access(folder, os.W_OK)
     except OSError as error:
-        return Check("cache folder", False, f"{folder}: {error.strerror}", "set UNJAM_CACHE to a folder of yours")
+        return Check(
+            "cache folder", False, f"{folder}: {error.strerror}", "set UNJAM_CACHE to a folder of yours"
+        )
     found = f"{folder}, {free:.0f} GiB free"
     return Check("cache folder", writable and free > 0.1, found, "free some space, or set UNJAM_CACHE")
 
@@ -90,7 +94,13 @@ def _video() -> Check:
     try:
         return Check("mp4 video", True, f"imageio-ffmpeg {version('imageio-ffmpeg')}", needed=False)
     except PackageNotFoundError:
-        return Check("mp4 video", False, "not installed", "pip install 'unjam[video]'; .gif and .webp work without", False)
+        return Check(
+            "mp4 video",
+            False,
+            "not installed",
+            "pip install 'unjam[video]'; .gif and .webp work without",
+            False,
+        )
 
 
 def _episode() -> str:

@@ -128,7 +128,9 @@ class Run:
         if self._told is not None:
             self._told(row)
 
-    def _row(self, iteration: Iteration, validation: float | None, seconds: dict[str, float]) -> dict[str, Any]:
+    def _row(
+        self, iteration: Iteration, validation: float | None, seconds: dict[str, float]
+    ) -> dict[str, Any]:
         measured = [measure(episode) for episode in iteration.episodes]
 
         def mean(name: str) -> float:

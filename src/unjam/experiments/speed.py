@@ -96,9 +96,7 @@ def _scaling(driver: ResidualDriver, rounds: int) -> list[dict[str, float]]:
             ring = Ring(length=(length, length), vehicles=vehicles, cavs=vehicles // 22, horizon=horizon)
             with Simulation() as simulation:
                 costs[vehicles].append(1e6 / _loop_rate(ring, driver, simulation) / vehicles)
-    return [
-        {"vehicles": vehicles, "us_per_vehicle_step": median(found)} for vehicles, found in costs.items()
-    ]
+    return [{"vehicles": vehicles, "us_per_vehicle_step": median(found)} for vehicles, found in costs.items()]
 
 
 def _rate(run: Callable[[], object], steps: int) -> float:

@@ -19,7 +19,11 @@ def watch_in_window(scenario: Scenario, driver: Driver, seed: Sequence[int], pac
         MissingPartError: there is no display.
     """
     if sys.platform == "linux" and not os.environ.get("DISPLAY"):
-        raise MissingPartError("watch: no display; write a film: --video FILE, or use xvfb-run unjam watch ...")
+        raise MissingPartError(
+            "watch: no display; write a film: --video FILE, or use xvfb-run unjam watch ..."
+        )
     delay = 1000.0 * scenario.simulation_step / pace
-    with Simulation("gui", gui_options=("--start", "true", "--quit-on-end", "true", "--delay", str(delay))) as window:
+    with Simulation(
+        "gui", gui_options=("--start", "true", "--quit-on-end", "true", "--delay", str(delay))
+    ) as window:
         return run_episode(scenario, driver, seed, simulation=window)

@@ -111,12 +111,18 @@ def _trajectories(axes: Axes, episode: Shown, scale: Normalize) -> None:
         keep = np.abs(np.diff(position)) < episode.loop_length / 2  # not across the seam of the ring
         is_cav = column in episode.cavs
         lines = LineCollection(
-            list(segments[keep]), cmap=SPEED_COLOURS, norm=scale, linewidths=2.2 if is_cav else 1.1, rasterized=True
+            list(segments[keep]),
+            cmap=SPEED_COLOURS,
+            norm=scale,
+            linewidths=2.2 if is_cav else 1.1,
+            rasterized=True,
         )
         lines.set_array(episode.speeds[::every, column][:-1][keep])
         axes.add_collection(lines)
         if is_cav:
-            axes.add_collection(LineCollection(list(segments[keep]), colors="#d7263d", linewidths=0.7, rasterized=True))
+            axes.add_collection(
+                LineCollection(list(segments[keep]), colors="#d7263d", linewidths=0.7, rasterized=True)
+            )
     axes.set_xlim(times[0], times[-1])
     axes.set_ylim(0, episode.loop_length)
 
@@ -162,11 +168,20 @@ def learning_curve(
             steps = np.array([row["actual_steps"] for row in rows]) / 1000
             prefix = f"{label}: " if len(runs) > 1 else ""
             training = [row["return_mean"] for row in rows]
-            axes.plot(steps, training, color=colour, lw=1, alpha=0.45, label=f"{prefix}training, with exploration")
+            axes.plot(
+                steps, training, color=colour, lw=1, alpha=0.45, label=f"{prefix}training, with exploration"
+            )
             validated = [(0.0, rows[0]["return_expert"])]  # the policy starts as exactly its expert
             validated += [(step, row["return_validation"]) for step, row in zip(steps, rows, strict=True)]
             points = np.array([point for point in validated if point[1] is not None], float).reshape(-1, 2)
-            axes.plot(*points.T, color=colour, lw=1.8, marker="o", ms=3.5, label=f"{prefix}validation, deterministic")
+            axes.plot(
+                *points.T,
+                color=colour,
+                lw=1.8,
+                marker="o",
+                ms=3.5,
+                label=f"{prefix}validation, deterministic",
+            )
         for (label, value), style in zip(references.items(), ("--", ":", "-.", (0, (1, 3))), strict=False):
             axes.axhline(value, color=INK, lw=1.1, ls=style, label=label)
         axes.set_xlabel("actual simulator steps [thousands]")

@@ -51,13 +51,17 @@ def render(results: Sequence[Results]) -> str:
     columns = columns_of(results)
     panels = [_renamed(column) for column in columns if column.shown is not None][:MOST_PANELS]
     pictures = _pictures(results, panels)
-    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    environment = Environment(
+        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
     template = environment.from_string((page / "report.html").read_text(encoding="utf-8"))
     single = results[0] if len(results) == 1 else None
     return template.render(
         version=__version__,
         title=title_of(results),
-        lead=lead_of(single) if single else " ".join(f"{result.folder.name}: {lead_of(result)}" for result in results),
+        lead=lead_of(single)
+        if single
+        else " ".join(f"{result.folder.name}: {lead_of(result)}" for result in results),
         notes=[note for result in results for note in notes_of(result)],
         cards=cards_of(single) if single else [],
         pictures=pictures,
@@ -132,7 +136,9 @@ def _picture(both: tuple[str, str], text: str) -> Markup:
 
 def _source(result: Results) -> dict[str, Any]:
     about = result.about.get("manifest", {})
-    packages = ", ".join(f"{name} {version}" for name, version in about.get("packages", {}).items() if version)
+    packages = ", ".join(
+        f"{name} {version}" for name, version in about.get("packages", {}).items() if version
+    )
     commit = f", commit {about['commit']}" if about.get("commit") else ""
     facts = f"unjam {about.get('unjam')}{commit}, Python {about.get('python')}, {packages}; {about.get('started', '')}."
     return {

@@ -31,7 +31,9 @@ def outcome_of(episode: Episode) -> Outcome:
     return Outcome(
         speeds=episode.speeds[1:],
         accelerations=np.stack([trajectory.applied for trajectory in trajectories], 1),
-        headways=np.stack([time_headway(t.states.leader_gap[1:], t.states.speed[1:]) for t in trajectories], 1),
+        headways=np.stack(
+            [time_headway(t.states.leader_gap[1:], t.states.speed[1:]) for t in trajectories], 1
+        ),
         crashed=crashed,
     )
 

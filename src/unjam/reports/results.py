@@ -122,7 +122,7 @@ def command_to_repeat(results: Results) -> str:
 
 
 def _quoted(word: str) -> str:
-    return f"'{word}'" if any(letter in word for letter in " []*?$&|;<>(){}\"") else word
+    return f"'{word}'" if any(letter in word for letter in ' []*?$&|;<>(){}"') else word
 
 
 def steps_of(config: str) -> int:

@@ -47,7 +47,9 @@ def summarise(rows: Sequence[dict[str, Any]]) -> dict[str, Estimate]:
     return {name: estimate([row[name] for row in rows]) for name in METRICS}
 
 
-def paired_difference(rows: Sequence[dict[str, Any]], others: Sequence[dict[str, Any]], name: str) -> Estimate:
+def paired_difference(
+    rows: Sequence[dict[str, Any]], others: Sequence[dict[str, Any]], name: str
+) -> Estimate:
     """Return the estimate of the difference, same seeds paired, of a metric between two sets of rows."""
     other = {str(row["seed"]): row[name] for row in others}
     return estimate([row[name] - other[str(row["seed"])] for row in rows if str(row["seed"]) in other])

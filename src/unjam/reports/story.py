@@ -43,14 +43,20 @@ def title_of(results: Sequence[Results]) -> str:
     if len(results) > 1:
         return f"{names}: {len(results)} results compared"
     only = results[0]
-    return f"{names}: a trained residual on {only.about['expert']}" if only.trained else f"{names}: {', '.join(only.rows)}"
+    return (
+        f"{names}: a trained residual on {only.about['expert']}"
+        if only.trained
+        else f"{names}: {', '.join(only.rows)}"
+    )
 
 
 def lead_of(result: Results) -> str:
     """Return the main finding of a folder in a sentence or two, whichever way it went."""
     if result.trained is None:
         label, rows = next(iter(result.rows.items()))
-        speed, ratio = (estimate([row[name] for row in rows]) for name in ("mean_speed", "speed_limit_ratio_steady"))
+        speed, ratio = (
+            estimate([row[name] for row in rows]) for name in ("mean_speed", "speed_limit_ratio_steady")
+        )
         return (
             f"{label} on {result.about['scenario']}, {len(rows)} episodes: all vehicles drive "
             f"{speed.mean:.2f} m/s on average, and in steady state {100 * ratio.mean:.0f} % of the limit."

@@ -41,7 +41,9 @@ def write_video(episode: Episode, path: Path, title: str, pace: float = 10.0) ->
 def check_format(path: Path) -> None:
     """Raise `InputError` unless `write_video` can write such a file."""
     if path.suffix.lower() not in FORMATS:
-        raise InputError(f"video: {path.name!r} is not allowed; allowed: a name that ends in {', '.join(FORMATS)}")
+        raise InputError(
+            f"video: {path.name!r} is not allowed; allowed: a name that ends in {', '.join(FORMATS)}"
+        )
 
 
 def _write_mp4(frames: Iterator[Image.Image], path: Path) -> None:
@@ -49,7 +51,9 @@ def _write_mp4(frames: Iterator[Image.Image], path: Path) -> None:
         import imageio_ffmpeg
     except ImportError:
         raise MissingPartError("video: .mp4 needs imageio-ffmpeg: pip install 'unjam[video]'") from None
-    writer = imageio_ffmpeg.write_frames(str(path), (SIZE, SIZE), fps=FRAMES_PER_SECOND, ffmpeg_log_level="error")
+    writer = imageio_ffmpeg.write_frames(
+        str(path), (SIZE, SIZE), fps=FRAMES_PER_SECOND, ffmpeg_log_level="error"
+    )
     writer.send(None)
     for frame in frames:
         writer.send(np.asarray(frame.convert("RGB")).tobytes())

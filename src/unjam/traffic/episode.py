@@ -55,9 +55,7 @@ def run_episode(
     earned = make_reward(reward or scenario.reward)
     if simulation is None:
         with Simulation() as simulation:
-            return run_episode(
-                scenario, driver, seed, reward, explore, record_fuel, simulation, progress
-            )
+            return run_episode(scenario, driver, seed, reward, explore, record_fuel, simulation, progress)
     traffic = Traffic(scenario, seed, simulation, driver.plain_numbers, record_fuel)
     return _episode(traffic, seed, earned, drive_traffic(traffic, driver, explore, progress))
 

@@ -5,7 +5,7 @@ import os
 import shutil
 import subprocess
 import tempfile
-from functools import lru_cache
+from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
@@ -21,7 +21,7 @@ def cache_folder() -> Path:
     return Path(chosen) if chosen else Path(platformdirs.user_cache_dir("unjam"))
 
 
-@lru_cache(maxsize=None)
+@cache
 def sumo_program(name: str) -> str:
     """Return the path of one of SUMO's programs: the installed package's, else the one on the PATH.
 
@@ -42,7 +42,7 @@ def sumo_program(name: str) -> str:
     return found
 
 
-@lru_cache(maxsize=None)
+@cache
 def sumo_version() -> str:
     """Return the installed version of libsumo; `MissingPartError` where there is none."""
     try:

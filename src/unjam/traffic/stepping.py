@@ -106,7 +106,9 @@ class Traffic:
                 progress(0)
         if scenario.warmup:
             each = scenario.steps_per_decision
-            moments = list(range(scenario.warmup - each, -1, -each))[: round(HISTORY / scenario.decision_step)]
+            moments = list(range(scenario.warmup - each, -1, -each))[
+                : round(HISTORY / scenario.decision_step)
+            ]
             states = self.states(*self.speeds_and_positions(), np.array(self._cavs))
             history = LocalState(*(values[:, moments[::-1]] for values in states))
         if controlled:

@@ -96,9 +96,7 @@ class Workers:
             self.close()
             raise
 
-    def _run_one(
-        self, index: int, task: EpisodeTask, progress: Callable[[int, int], None] | None
-    ) -> Episode:
+    def _run_one(self, index: int, task: EpisodeTask, progress: Callable[[int, int], None] | None) -> Episode:
         worker = self._idle.get()
         problems = []
         try:
