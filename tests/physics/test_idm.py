@@ -74,8 +74,11 @@ def test_one_definition_for_numpy_torch_and_numbers() -> None:
         generator.uniform(1, 60, 50),
     )
     arrays = idm_acceleration(speed, leader, gap)
-    tensors = idm_acceleration(*(torch.tensor(values) for values in (speed, leader, gap)))
-    numbers = [idm_acceleration(*map(float, row)) for row in zip(speed, leader, gap, strict=True)]
+    tensors = idm_acceleration(torch.tensor(speed), torch.tensor(leader), torch.tensor(gap))
+    numbers = [
+        idm_acceleration(float(own), float(ahead), float(distance))
+        for own, ahead, distance in zip(speed, leader, gap, strict=True)
+    ]
     np.testing.assert_allclose(tensors.numpy(), arrays, rtol=1e-12)
     np.testing.assert_allclose(numbers, arrays, rtol=1e-12)
 

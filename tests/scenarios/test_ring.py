@@ -1,3 +1,5 @@
+import itertools
+
 import numpy as np
 import pytest
 
@@ -33,7 +35,7 @@ def test_parts_cover_the_range_without_overlap() -> None:
     parts = [Ring().part(index, 4) for index in range(4)]
     assert parts[0].length[0] == 220
     assert parts[-1].length[1] == 270
-    for before, after in zip(parts[:-1], parts[1:], strict=True):
+    for before, after in itertools.pairwise(parts):
         assert after.length[0] == before.length[1] + 1
 
 

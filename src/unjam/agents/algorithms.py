@@ -52,16 +52,17 @@ class SpacesOnly(gymnasium.Env[np.ndarray, np.ndarray]):
     def __init__(self, observation_space: spaces.Box, action_space: spaces.Box) -> None:
         self.observation_space = observation_space
         self.action_space = action_space
+        self._nothing = np.zeros(observation_space.low.shape, np.float32)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
         """Return zeros: Stable-Baselines3 resets before it learns."""
-        return np.zeros(self.observation_space.shape, np.float32), {}
+        return self._nothing, {}
 
 
 class EpisodicTRPO(TRPO):
     """TRPO whose rollouts are whole episodes from worker processes."""
 
-    policy: ResidualPolicy
+    policy: ResidualPolicy  # pyright: ignore[reportIncompatibleVariableOverride]
 
     def __init__(
         self,

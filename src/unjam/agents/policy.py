@@ -31,6 +31,7 @@ class ScaledValue(nn.Module):
     def __init__(self, inputs: int) -> None:
         super().__init__()
         self.linear = nn.Linear(inputs, 1)
+        self.scale: torch.Tensor
         self.register_buffer("scale", torch.tensor([0.0, 1.0]))
 
     def forward(self, features: torch.Tensor) -> torch.Tensor:
@@ -105,7 +106,7 @@ class ResidualPolicy(ActorCriticPolicy):
             log_std = self.log_std.detach()
             del self.log_std
             self.register_buffer("log_std", log_std)
-        self.optimizer = self.optimizer_class(self.parameters(), lr=lr_schedule(1), **self.optimizer_kwargs)
+        self.optimizer = self.optimizer_class(self.parameters(), lr=lr_schedule(1), **self.optimizer_kwargs)  # pyright: ignore[reportCallIssue]
 
     def scale_value(self, mean: float, std: float) -> None:
         """Fix the units of the value head."""

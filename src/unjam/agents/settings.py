@@ -43,7 +43,7 @@ class PolicySettings:
 
 @dataclass(frozen=True, config=STRICT)
 class TRPOSettings:
-    """Trust region policy optimisation. Where they differ from Table B5, the preset `paper` has the paper's."""
+    """Trust region policy optimisation; the preset `paper` has the values of Table B5 where these differ."""
 
     batch_steps: Count = 12_000
     """actual steps in an iteration, rounded up to whole episodes"""

@@ -30,8 +30,8 @@ def drive(
         typer.Option(
             "--driver",
             "-d",
-            help="Who drives the CAVs: a name, name:parameter=value, your own path.py:name, a run folder, or a "
-            ".unjam file. Given several times, they are compared on the same traffic.",
+            help="Who drives the CAVs: a name, name:parameter=value, your own path.py:name, a run folder, or "
+            "a .unjam file. Given several times, they are compared on the same traffic.",
         ),
     ],
     episodes: EpisodesOption = 5,

@@ -1,5 +1,6 @@
 """`unjam evaluate`: judge a trained run on held-out seeds, beside every expert and all-human traffic."""
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
 
@@ -45,7 +46,7 @@ def evaluate(
     result = TrainResult(run, found.rows, gain_of(config, found.rows))
     write_report([run], result.report)
     if json:
-        gain = result.gain._asdict() if result.gain else None
+        gain = asdict(result.gain) if result.gain else None
         drivers = [
             {
                 "driver": driver,

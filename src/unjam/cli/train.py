@@ -1,6 +1,7 @@
 """`unjam train`: learn a residual on an expert."""
 
 from contextlib import nullcontext
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -126,7 +127,8 @@ class _Progress:
         """Show a row of progress."""
         if row["return_validation"] is not None:
             self._validated = f"{row['return_validation']:.0f}"
-        words = f"return {row['return_mean']:.0f}, validation {self._validated} (expert {row['return_expert']:.0f})"
+        expert = f"expert {row['return_expert']:.0f}"
+        words = f"return {row['return_mean']:.0f}, validation {self._validated} ({expert})"
         if self._bar is not None:
             self._bar.update(self._task, completed=row["actual_steps"], description=words)
         elif row["iteration"] % LINE_EVERY == 0 or row["actual_steps"] >= self._steps:
@@ -155,7 +157,7 @@ def _print_result(result: Any, json: bool) -> None:
                 "folder": str(result.folder),
                 "controller": str(result.controller),
                 "report": str(result.report),
-                "gain": result.gain._asdict() if result.gain else None,
+                "gain": asdict(result.gain) if result.gain else None,
                 "drivers": {
                     driver: {name: found.mean for name, found in summarise(rows).items()}
                     for driver, rows in result.rows.items()

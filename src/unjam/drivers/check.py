@@ -55,7 +55,7 @@ def check_driver(driver: Any, rows: int = 8, steps: int = 50, seed: int = 0) -> 
 
 
 def check_acceleration(acceleration: Any, rows: int, where: str) -> np.ndarray:
-    """Return what a driver answered as an array; raise `InputError` unless it is finite and has `rows` rows."""
+    """Return a driver's answer as an array; raise `InputError` unless it is finite and has `rows` rows."""
     try:
         array = np.asarray(acceleration, dtype=np.float64)
     except (TypeError, ValueError):

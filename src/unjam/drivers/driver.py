@@ -47,7 +47,7 @@ class Driver:
         raise NotImplementedError
 
     def memory_features(self, memory: Memory) -> Array | None:
-        """Return what of `memory` a residual network may see, shape (n, m), about unit size; None: nothing."""
+        """Return what a residual network may see of `memory`, (n, m), about unit size; None: nothing."""
         return None
 
 

@@ -36,7 +36,7 @@ def judge(
     episodes: int | None = None,
     progress: Callable[[tuple[str, int], int], None] | None = None,
 ) -> Evaluation:
-    """Evaluate the controller of a run beside others on the same held-out seeds, and save it all in its folder.
+    """Evaluate a run's controller beside others on the same held-out seeds, and save it all in its folder.
 
     `baselines` and `episodes` are the configuration's where they are not given.
     """

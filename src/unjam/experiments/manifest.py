@@ -35,7 +35,7 @@ def _version(package: str) -> str | None:
 
 
 def _commit() -> str | None:
-    """Return the commit of the source tree that this package runs from, `+` where it was changed; None elsewhere."""
+    """Return the commit of the source tree that this runs from, `+` where it was changed; None elsewhere."""
     here = Path(__file__).parent
     try:
         found = subprocess.run(

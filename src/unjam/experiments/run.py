@@ -29,7 +29,7 @@ Told = Callable[[dict[str, Any]], None]
 
 
 class Run:
-    """One training run in its folder: collects, learns, validates, keeps checkpoints, and judges at the end."""
+    """One training run in its folder: collects, learns, validates, keeps checkpoints."""
 
     def __init__(self, folder: Path, config: RunConfig, workers: Workers, told: Told | None = None) -> None:
         """Prepare a run, from its newest checkpoint if it has one."""

@@ -4,6 +4,7 @@ Machines differ, and one machine differs from minute to minute: what counts are 
 their parts measured in turn.
 """
 
+import itertools
 import os
 import time
 from collections.abc import Callable
@@ -37,7 +38,7 @@ def neural_driver(hold: int) -> ResidualDriver:
     sizes = [5, 64, 64, 1]
     layers = tuple(
         (generator.normal(size=(inputs, outputs)) / 100, np.zeros(outputs))
-        for inputs, outputs in zip(sizes[:-1], sizes[1:], strict=True)
+        for inputs, outputs in itertools.pairwise(sizes)
     )
     return ResidualDriver(PISaturation(), Network(layers, 1.0, 0.1), 1.0, hold=hold)
 

@@ -1,4 +1,4 @@
-"""Train: from a configuration to a folder that holds everything about the run. `unjam train`, `unjam.train`."""
+"""Train: from a configuration to a folder with everything about the run. `unjam train`, `unjam.train`."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace

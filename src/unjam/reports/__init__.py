@@ -1,0 +1,1 @@
+"""Metrics, statistics, pictures, the report: what is said of results."""

@@ -67,7 +67,7 @@ def render(results: Sequence[Results]) -> str:
         pictures=pictures,
         picture=lambda name, text: _picture(pictures[name], text),
         shown_drawn=", ".join(f"{key} {value:g}" for key, value in panels[0].drawn.items()) if panels else "",
-        learning_note="Validation uses fixed seeds and chooses the controller; the table below uses other seeds.",
+        learning_note="Validation uses fixed seeds and chooses the controller; the table uses other seeds.",
         columns=[column.name for column in columns],
         table=table_of(columns),
         table_note=_table_note(columns),
@@ -129,9 +129,8 @@ def _references(results: Sequence[Results]) -> dict[str, float]:
 
 def _picture(both: tuple[str, str], text: str) -> Markup:
     wide, narrow = both
-    return Markup(
-        f'<picture><source media="(max-width: 640px)" srcset="{narrow}"><img src="{wide}" alt="{escape(text)}"></picture>'
-    )
+    small = f'<source media="(max-width: 640px)" srcset="{narrow}">'
+    return Markup(f'<picture>{small}<img src="{wide}" alt="{escape(text)}"></picture>')
 
 
 def _source(result: Results) -> dict[str, Any]:
@@ -140,7 +139,8 @@ def _source(result: Results) -> dict[str, Any]:
         f"{name} {version}" for name, version in about.get("packages", {}).items() if version
     )
     commit = f", commit {about['commit']}" if about.get("commit") else ""
-    facts = f"unjam {about.get('unjam')}{commit}, Python {about.get('python')}, {packages}; {about.get('started', '')}."
+    made_with = f"unjam {about.get('unjam')}{commit}, Python {about.get('python')}, {packages}"
+    facts = f"{made_with}; {about.get('started', '')}."
     return {
         "name": result.folder.name,
         "command": command_to_repeat(result),

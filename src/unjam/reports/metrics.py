@@ -113,7 +113,7 @@ def share_standing(episode: Episode) -> float:
 
 
 def time_to_dissolve(episode: Episode) -> float:
-    """Time until the wave that an episode starts with is dissolved [s]; NaN where there is none, or it never is.
+    """Time until the wave that an episode starts with is dissolved [s]; NaN if there is none or it stays.
 
     From the first decision to the first moment from which on the std of speed across vehicles stays below
     0.3 m/s for 60 s on end.
@@ -169,7 +169,7 @@ def shield_max_braking(episode: Episode) -> float:
 
 
 def fuel_ml_per_km(episode: Episode) -> float:
-    """Fuel of all vehicles per kilometre driven [ml/km], by the scenario's emission class; NaN if not recorded.
+    """Fuel of all vehicles per kilometre [ml/km], by the scenario's emission class; NaN if not recorded.
 
     SUMO's emission model: https://sumo.dlr.de/docs/Models/Emissions.html
     """

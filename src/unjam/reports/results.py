@@ -17,7 +17,7 @@ Floats = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class Shown:
-    """The episode of one driver that pictures show; T decisions, N vehicles. All drivers have the same seed."""
+    """The episode of one driver that pictures show; T decisions, N vehicles. All share one seed."""
 
     driver: str
     step: float
@@ -39,7 +39,7 @@ class Shown:
     @property
     def times(self) -> NDArray[np.float64]:
         """[s], shape (T + 1,)."""
-        return np.arange(len(self.speeds)) * self.step
+        return np.arange(len(self.speeds), dtype=np.float64) * self.step
 
     @property
     def cavs(self) -> list[int]:
@@ -89,9 +89,9 @@ def read_results(folder: Path) -> Results:
         rows.setdefault(row["driver"], []).append({key: _nan(value) for key, value in row.items()})
     shown = {}
     for number, entry in enumerate(about.pop("shown")):
-        values = {key: _nan(value) for key, value in entry.items() if key != "seed"}
-        names = ("speeds", "positions", "gaps", "outline")
-        shown[entry["driver"]] = Shown(**values, **{name: arrays[f"{number}.{name}"] for name in names})
+        values: dict[str, Any] = {key: _nan(value) for key, value in entry.items() if key != "seed"}
+        values |= {name: arrays[f"{number}.{name}"] for name in ("speeds", "positions", "gaps", "outline")}
+        shown[entry["driver"]] = Shown(**values)
     return Results(folder, about, rows, shown, read_progress(folder), _text(folder / "config.toml"))
 
 

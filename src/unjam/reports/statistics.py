@@ -1,7 +1,8 @@
 """Means over seeds, and how far to trust them."""
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.stats import bootstrap
@@ -12,7 +13,8 @@ CONFIDENCE = 0.95
 RESAMPLES = 2000
 
 
-class Estimate(NamedTuple):
+@dataclass(frozen=True)
+class Estimate:
     """A mean over seeds with its bootstrap interval; NaN where there is nothing to average."""
 
     mean: float

@@ -104,7 +104,7 @@ def notes_of(result: Results) -> list[str]:
     if leaning > 0.01:
         hardest = max(row["shield_max_braking"] for row in rows)
         notes.append(
-            f"{label} leans on the simulator's safety check: it overrides {100 * leaning:.1f} % of the commands, "
+            f"{label} leans on the simulator's safety check: it overrides {100 * leaning:.1f} % of commands, "
             f"braking up to {hardest:.1f} m/s² harder than asked."
         )
     return notes
@@ -118,11 +118,10 @@ def cards_of(result: Results) -> list[dict[str, str]]:
     def mean(name: str, of: list[dict[str, Any]] = rows) -> float:
         return estimate([row[name] for row in of]).mean
 
-    human = result.rows.get("human")
-    compared = human is not None and label != "human"
+    human = [] if label == "human" else result.rows.get("human", [])
 
     def beside(name: str, form: str) -> str:
-        return f"all-human: {format(mean(name, human), form)}" if compared else label
+        return f"all-human: {format(mean(name, human), form)}" if human else label
 
     ratio = "speed_limit_ratio_steady"
     cards = [

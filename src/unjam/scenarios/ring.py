@@ -51,7 +51,7 @@ class Ring(Scenario):
         length = float(generator.integers(self.length[0], self.length[1], endpoint=True))
         cavs = {round(index * self.vehicles / self.cavs) for index in range(self.cavs)}
         ids = tuple(f"{'cav' if index in cavs else 'human'}_{index}" for index in range(self.vehicles))
-        positions = np.arange(self.vehicles) * (length / self.vehicles)
+        positions = np.arange(self.vehicles, dtype=np.float64) * (length / self.vehicles)
         return Road(
             nodes=_nodes(length),
             edges=_edges(length, self.humans.desired_speed),

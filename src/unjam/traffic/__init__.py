@@ -1,0 +1,1 @@
+"""The actual environment: SUMO, episodes, worker processes."""

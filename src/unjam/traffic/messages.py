@@ -2,7 +2,7 @@
 
 import json
 import struct
-from typing import Any, BinaryIO
+from typing import IO, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +13,7 @@ Arrays = dict[str, NDArray[Any]]
 _LENGTHS = struct.Struct(">QQ")
 
 
-def write_message(pipe: BinaryIO, facts: dict[str, Any], arrays: Arrays | None = None) -> None:
+def write_message(pipe: IO[bytes], facts: dict[str, Any], arrays: Arrays | None = None) -> None:
     """Write one message: `facts` as JSON, and arrays by name."""
     text = json.dumps(facts).encode()
     data = save({name: np.ascontiguousarray(array) for name, array in arrays.items()}) if arrays else b""
@@ -21,7 +21,7 @@ def write_message(pipe: BinaryIO, facts: dict[str, Any], arrays: Arrays | None =
     pipe.flush()
 
 
-def read_message(pipe: BinaryIO) -> tuple[dict[str, Any], Arrays]:
+def read_message(pipe: IO[bytes]) -> tuple[dict[str, Any], Arrays]:
     """Return the next message; raise `EOFError` where the other side is gone."""
     text_length, data_length = _LENGTHS.unpack(_read_exactly(pipe, _LENGTHS.size))
     facts = json.loads(_read_exactly(pipe, text_length))
@@ -29,7 +29,7 @@ def read_message(pipe: BinaryIO) -> tuple[dict[str, Any], Arrays]:
     return facts, load(data) if data else {}
 
 
-def _read_exactly(pipe: BinaryIO, length: int) -> bytes:
+def _read_exactly(pipe: IO[bytes], length: int) -> bytes:
     parts = []
     while length:
         part = pipe.read(length)

@@ -147,7 +147,8 @@ def unpack_episode(facts: dict[str, Any], arrays: dict[str, Floats]) -> Episode:
                 **{name: arrays[f"{index}.{name}"] for name in _TRAJECTORY_ARRAYS},
             )
         )
-    scalars = {key: value for key, value in facts.items() if key != "trajectories"}
+    values: dict[str, Any] = {**facts, **{name: arrays[name] for name in _ARRAYS}}
     for name in ("seed", "vehicle_ids", "cav_ids"):
-        scalars[name] = tuple(scalars[name])
-    return Episode(**scalars, **{name: arrays[name] for name in _ARRAYS}, trajectories=tuple(trajectories))
+        values[name] = tuple(values[name])
+    values["trajectories"] = tuple(trajectories)
+    return Episode(**values)

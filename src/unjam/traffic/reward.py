@@ -45,7 +45,7 @@ def _mean(values: Array) -> Array:
 
 
 def released(outcome: Outcome) -> dict[str, Array]:
-    """Reward what Table 1 was computed with on ring and figure eight: 4 mean v / 20 - 4 mean |a|; 0 at a crash.
+    """Reward behind Table 1 on ring and figure eight: 4 mean v / 20 - 4 mean |a|; 0 at a crash.
 
     Source: the authors' released code, after Flow's wave attenuation environment.
     """

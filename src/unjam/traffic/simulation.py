@@ -118,7 +118,7 @@ class Simulation:
 
     def command_speeds(self, ids: Iterable[str], speeds: Iterable[float]) -> None:
         """Ask for the speeds that `ids` shall have after the next step [m/s]: plain floats."""
-        for name, speed in zip(ids, speeds):
+        for name, speed in zip(ids, speeds, strict=True):
             self._set_speed(name, speed)
 
     def replace_speeds(self, ids: Iterable[str], speeds: Iterable[float]) -> None:

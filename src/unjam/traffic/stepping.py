@@ -147,7 +147,10 @@ class Traffic:
             self._log_applied.fromlist(applied)
             for _ in range(scenario.steps_per_decision):
                 speeds = self._speeds
-                commanded = [next_speed(speeds[place], wanted, step) for place, wanted in zip(cavs, applied)]
+                commanded = [
+                    next_speed(speeds[place], wanted, step)
+                    for place, wanted in zip(cavs, applied, strict=True)
+                ]
                 self._log_commanded.fromlist(commanded)
                 self._simulation.command_speeds(self.road.cav_ids, commanded)
                 self._simulate()
@@ -182,7 +185,7 @@ class Traffic:
         return noise[:, 0].tolist() if self.single else list(noise)
 
     def _draw_noise(self) -> list[float]:
-        """Return the change of speed that noise makes in this step, none for CAVs [m/s]; keep many for later."""
+        """Return by how much noise changes each speed in this step, not at all for CAVs [m/s]."""
         draws = self._noise_generator.standard_normal((NOISE_BLOCK, len(self._human_mask)))
         scale = self.scenario.noise_per_step * self.scenario.simulation_step
         self._noise_rows = (draws * np.where(self._human_mask, scale, 0.0)).tolist()[::-1]
@@ -214,14 +217,14 @@ class Traffic:
         return loop_state(speeds, positions, near, self.road.loop_length)
 
     def applied(self) -> NDArray[np.float64]:
-        """Return what the CAVs were told within the action limit, of humans what they did [m/s2], (T, CAVs)."""
+        """Return the CAVs' commands within the action limit, of humans what they did [m/s2], (T, CAVs)."""
         if self._log_applied:
             return np.array(self._log_applied).reshape(-1, len(self._cavs))
         speeds = np.array(self._log_speeds).reshape(-1, len(self._human_mask))[:, self._cavs]
         return np.diff(speeds[:: self.scenario.steps_per_decision], axis=0) / self.scenario.decision_step
 
     def shield(self) -> NDArray[np.float64]:
-        """Return the hardest braking that SUMO added to each command, zero where it let it pass, (T, CAVs)."""
+        """Return the hardest braking that SUMO added to each command, zero if it let it pass, (T, CAVs)."""
         if not self._log_commanded:
             return np.zeros_like(self.applied())
         commanded = np.array(self._log_commanded).reshape(-1, len(self._cavs))

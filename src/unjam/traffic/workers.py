@@ -144,7 +144,7 @@ class _Worker:
     def _start(self) -> subprocess.Popen[bytes]:
         # A BLAS with threads of its own would fight with the other workers for the cores.
         environment = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
-        self._errors = tempfile.TemporaryFile()
+        self._errors = tempfile.TemporaryFile()  # noqa: SIM115  (lives as long as the process)
         process = subprocess.Popen(
             [sys.executable, "-m", "unjam.traffic.worker"],
             stdin=subprocess.PIPE,
