@@ -1,0 +1,52 @@
+# make demo   sets everything up and trains a residual on the ring: ends with the path of a report
+# make test   the tests that take minutes; make test-all adds the slow ones
+# make check  lint, format, types; make docs builds the site; make bench measures speed
+#
+# On a machine where pip would fetch a CUDA build of torch, the CPU build is a tenth of the size:
+#   make demo TORCH_INDEX="--index-url https://download.pytorch.org/whl/cpu"
+
+PYTHON ?= python3
+VENV ?= .venv
+TORCH_INDEX ?=
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet -c constraints.txt
+
+.PHONY: demo test test-all check docs bench clean
+
+demo: $(VENV)/.installed
+	$(BIN)/unjam train ring --preset demo
+
+test: $(VENV)/.installed-dev
+	$(BIN)/python -m pytest -n 2 -m "not slow"
+
+test-all: $(VENV)/.installed-dev
+	$(BIN)/python -m pytest -n 2
+
+check: $(VENV)/.installed-dev
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/pyright
+
+docs: $(VENV)/.installed-dev
+	$(BIN)/python -m sphinx -q -W -b html docs docs/_build/html
+	@echo docs/_build/html/index.html
+
+bench: $(VENV)/.installed
+	$(BIN)/unjam bench
+
+clean:
+	rm -rf $(VENV) docs/_build .pytest_cache .ruff_cache
+
+$(VENV)/.installed: pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+		{ echo "unjam needs Python 3.11 or newer; name one: make demo PYTHON=python3.11"; exit 3; }
+	@echo "setting up $(VENV): a few minutes, once"
+	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	@$(PIP) $(TORCH_INDEX) torch
+	@$(PIP) -e .
+	@touch $@
+
+$(VENV)/.installed-dev: $(VENV)/.installed
+	@echo "adding what tests, checks and docs need"
+	@$(PIP) -e ".[dev]"
+	@touch $@
