@@ -1,5 +1,6 @@
 """What all tests share."""
 
+import itertools
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -81,6 +82,6 @@ def random_network(inputs: int = 5, seed: int = 0, size: int = 16, scale: float 
     sizes = [inputs, size, size, 1]
     layers = tuple(
         (generator.normal(size=(rows, columns)) * scale, generator.normal(size=columns) * scale)
-        for rows, columns in zip(sizes[:-1], sizes[1:], strict=True)
+        for rows, columns in itertools.pairwise(sizes)
     )
     return Network(layers, authority=1.0, exploration_std=0.2)
