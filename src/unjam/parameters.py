@@ -40,7 +40,7 @@ def one_line(error: ValidationError, field: str) -> str:
     if problem["type"] == "missing":
         return f"{name}: missing"
     if problem["type"] == "value_error" and not problem["loc"]:  # a check across fields names them itself
-        return f"{name}.{problem['msg'].removeprefix('Value error, ')}"
+        return f"{name}.{problem['msg'].removeprefix('Value error, ')}".removeprefix(".")
     allowed = problem["msg"].removeprefix("Input should be ").removeprefix("Value error, ")
     return f"{name}: {problem['input']!r} is not allowed; allowed: {allowed}"
 

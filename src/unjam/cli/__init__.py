@@ -3,6 +3,7 @@
 import os
 import signal
 import sys
+from itertools import pairwise
 from types import FrameType
 from typing import Annotated
 
@@ -79,8 +80,17 @@ def _run() -> int:
         return _say("terminated", TERMINATED)
     except Exception as error:
         if hasattr(error, "format_message"):  # what typer says of a wrong command line
-            return _say(error.format_message(), 2)  # pyright: ignore[reportAttributeAccessIssue]
+            return _say(f"{error.format_message()}{_given(error)}", 2)  # pyright: ignore[reportAttributeAccessIssue]
         raise
+
+
+def _given(error: Exception) -> str:
+    """Return what was given for the option that is wrong: typer's own words leave it out."""
+    for option in getattr(getattr(error, "param", None), "opts", []):
+        for word, following in pairwise([*sys.argv, ""]):
+            if word == option and following:
+                return f"; given: {following!r}"
+    return ""
 
 
 def _say(message: str, code: int) -> int:

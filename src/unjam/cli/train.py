@@ -113,10 +113,9 @@ class _Progress:
         self._validated = "-"
 
     def __enter__(self) -> "_Progress":
-        self._console.print(f"training into {self._folder}")
         if self._bar is not None:
             self._bar.start()
-            self._task = self._bar.add_task("first validation", total=self._steps)
+            self._task = self._bar.add_task(f"training into {self._folder}", total=self._steps)
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -131,7 +130,7 @@ class _Progress:
         words = f"return {row['return_mean']:.0f}, validation {self._validated} ({expert})"
         if self._bar is not None:
             self._bar.update(self._task, completed=row["actual_steps"], description=words)
-        elif row["iteration"] % LINE_EVERY == 0 or row["actual_steps"] >= self._steps:
+        elif row["iteration"] % LINE_EVERY == 1 or row["actual_steps"] >= self._steps:
             self._console.print(
                 f"iteration {row['iteration']}: {row['actual_steps']:,} of {self._steps:,} steps, {words}"
             )

@@ -9,6 +9,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
+from traceback import extract_tb
 from typing import Any
 
 from unjam.drivers.driver import Driver, Memory
@@ -48,6 +49,13 @@ def load_object(path: Path, name: str) -> Any:
         public = ", ".join(key for key in vars(module) if not key.startswith("_")) or "nothing"
         raise InputError(f"{path.name}: has no {name!r}; it has: {public}")
     return getattr(module, name)
+
+
+def user_error(error: Exception, path: Path, name: str) -> InputError:
+    """Return what went wrong in `name` of the user's file, with the last line of that file that ran."""
+    lines = [str(frame.lineno) for frame in extract_tb(error.__traceback__) if frame.filename == str(path)]
+    place = f" (line {lines[-1]})" if lines else ""
+    return InputError(f"{path.name}:{name}: {type(error).__name__}: {error}{place}")
 
 
 @dataclass(frozen=True)
@@ -95,8 +103,11 @@ class FileDriver(Driver):
         return recall(memory, history) if recall else memory
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
-        """Return the user's acceleration and memory."""
-        return self.inner.act(state, memory)
+        """Return the user's acceleration and memory; raise `InputError` where the user's code fails."""
+        try:
+            return self.inner.act(state, memory)
+        except Exception as error:
+            raise user_error(error, self.path, self.name) from error
 
     def memory_features(self, memory: Memory) -> Array | None:
         """Return the user's features of the memory, if the driver has any."""

@@ -16,6 +16,7 @@ from unjam.experiments.run import Run, Told
 from unjam.files import make_folder, to_json, write_whole
 from unjam.reports.html import write_report
 from unjam.reports.statistics import Estimate, paired_difference
+from unjam.traffic.reward import make_reward
 from unjam.traffic.workers import Workers
 
 
@@ -64,6 +65,8 @@ def train(
         DiskError: the disk is full; the last checkpoint is whole.
     """
     folder = Path(folder)
+    config.make_expert()  # wrong names are told before anything is written
+    make_reward(config.reward or config.make_scenario().reward)
     if resume:
         continue_folder(folder, config)
     else:

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
-from unjam.drivers.from_file import is_file_reference, load_object
+from unjam.drivers.from_file import is_file_reference, load_object, user_error
 from unjam.errors import InputError, wrong
 from unjam.physics.arrays import Array, at_least, namespace
 
@@ -103,13 +103,17 @@ def make_reward(text: str) -> Reward:
         if text not in REWARDS:
             raise wrong("reward", text, ", ".join([*REWARDS, "path.py:name"]))
         return REWARDS[text]
-    path, _, name = text.rpartition(":")
-    function = load_object(Path(path), name)
+    file, _, name = text.rpartition(":")
+    path = Path(file).resolve()
+    function = load_object(path, name)
     if not callable(function) or inspect.isclass(function):
-        raise InputError(f"{Path(path).name}:{name}: is not a function of an Outcome")
+        raise InputError(f"{path.name}:{name}: is not a function of an Outcome")
 
     def checked(outcome: Outcome) -> dict[str, Array]:
-        terms = function(outcome)
+        try:
+            terms = function(outcome)
+        except Exception as error:
+            raise user_error(error, path, name) from error
         return terms if isinstance(terms, dict) else {"reward": terms}
 
     return checked

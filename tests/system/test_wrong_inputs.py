@@ -1,0 +1,161 @@
+"""Wrong input: one clear line, the right exit code, and nothing half-written."""
+
+import resource
+import shutil
+from pathlib import Path
+
+import pytest
+
+from tests.system.conftest import Run
+
+SMALL = ["--length", "60", "--vehicles", "5", "--set", "horizon=60"]
+
+WRONG: dict[str, tuple[str, list[str]]] = {
+    "unknown verb": ("fly", ["fly"]),
+    "unknown option": ("--fast", ["drive ring --driver pi --fast"]),
+    "no driver": ("--driver", ["drive ring"]),
+    "unknown scenario": ("ring, ring-warm, ring-jammed", ["drive nowhere --driver pi"]),
+    "unknown driver": ("human, idm, pi", ["drive ring --driver ghost"]),
+    "unknown parameter of a driver": ("driver pi.ghost: unknown name", ["drive ring --driver pi:ghost=1"]),
+    "word for a number": ("time_constant: 'fast'", ["drive ring --driver pi:time_constant=fast"]),
+    "negative parameter": ("time_constant: -1", ["drive ring --driver pi:time_constant=-1"]),
+    "no episodes": ("episodes", ["drive ring --driver pi --episodes 0"]),
+    "word for a count": ("many", ["drive ring --driver pi --episodes many"]),
+    "length that is no number": ("length: '2x0'", ["drive ring --driver pi --length 2x0"]),
+    "ring too short for its vehicles": (">= 154 m", ["drive ring --driver pi --length 30"]),
+    "range the wrong way round": ("length: 220 m", ["drive ring --driver pi --length 270-220"]),
+    "one vehicle": ("vehicles: 1", ["drive ring --driver pi --vehicles 1"]),
+    "more CAVs than vehicles": ("cavs: 23", ["drive ring --driver pi --cavs 23"]),
+    "unknown key of a scenario": ("ghost: unknown name", ["drive ring --driver pi --set ghost=1"]),
+    "word for a noise": ("noise: 'loud'", ["drive ring --driver pi --set noise=loud"]),
+    "not a number": ("noise: nan", ["drive ring --driver pi --set noise=nan"]),
+    "no horizon": ("horizon: 0", ["drive ring --driver pi --set horizon=0"]),
+    "unknown way of actuation": ("actuation: 'wild'", ["drive ring --driver pi --set actuation=wild"]),
+    "setting without a value": ("key=value", ["drive ring --driver pi --set horizon"]),
+    "unknown reward": ("released, eq16", ["drive ring --driver pi --reward gold"]),
+    "reward that is not in the file": ("has no 'ghost'", ["drive ring --driver pi --reward mine.py:ghost"]),
+    "reward that is NaN": (
+        "reward: step 0: term 'speed' is nan",
+        ["drive ring --driver pi --reward mine.py:wrong_reward"],
+    ),
+    "driver file that is missing": ("is not a file", ["drive ring --driver none.py:gentle"]),
+    "driver that is not in the file": ("has no 'ghost'", ["drive ring --driver mine.py:ghost"]),
+    "driver file with an error in it": ("SyntaxError", ["drive ring --driver torn.py:gentle"]),
+    "driver that cannot be made": ("no battery", ["drive ring --driver mine.py:Raises"]),
+    "driver that answers NaN": ("step 0: acceleration", ["drive ring --driver mine.py:broken"]),
+    "driver that answers too many": ("allowed: one for each", ["drive ring --driver mine.py:short"]),
+    "driver that raises": (
+        "mine.py:raises: ValueError: lost the map (line",
+        ["drive ring --driver mine.py:raises"],
+    ),
+    "controller that is missing": ("does not exist", ["drive ring --driver none.unjam"]),
+    "controller that is none": ("not a controller", ["drive ring --driver torn.unjam"]),
+    "folder that is not empty": ("full' is not empty", ["drive ring --driver pi --out full"]),
+    "missing configuration": ("none.toml: No such file", ["train ring --config none.toml"]),
+    "configuration that is not TOML": ("not TOML", ["train ring --config torn.toml"]),
+    "unknown key of the configuration": ("ghost: unknown name", ["train ring --set ghost=1"]),
+    "discount above one": ("trpo.gamma: 1.5", ["train ring --set trpo.gamma=1.5"]),
+    "unknown preset": ("preset: 'ghost'", ["train ring --preset ghost"]),
+    "unknown learner": ("agent: 'ghost'", ["train ring --agent ghost"]),
+    "unknown expert": ("ghost", ["train ring --expert ghost"]),
+    "negative seed": ("seed", ["train ring --seed -1"]),
+    "training into a folder that is not empty": ("--resume full", ["train ring --out full"]),
+    "resuming what is no run": ("not a run folder", ["train --resume full"]),
+    "resuming with a preset": ("not allowed beside it", ["train --resume full --preset demo"]),
+    "evaluating what is no run": ("not a run folder", ["evaluate full"]),
+    "report of nothing": ("has no evaluation.json", ["report full"]),
+    "report of damaged results": ("damaged", ["report damaged"]),
+    "film of an unknown kind": (".gif, .webp, .mp4", ["watch ring --driver pi --video film.avi"]),
+}
+
+
+@pytest.fixture
+def files(tmp_path: Path, my_drivers: Path) -> None:
+    (tmp_path / "torn.py").write_text("def gentle(state:\n")
+    (tmp_path / "torn.unjam").write_bytes(b"PK\x03\x04 not really")
+    (tmp_path / "torn.toml").write_text("scenario = ring\n")
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "precious.txt").write_text("keep me")
+    (tmp_path / "damaged").mkdir()
+    (tmp_path / "damaged" / "evaluation.json").write_text('{"rows": [')
+
+
+@pytest.mark.parametrize("name", WRONG)
+@pytest.mark.usefixtures("files")
+def test_wrong_input_gets_one_line_and_exit_code_2(name: str, unjam: Run, tmp_path: Path) -> None:
+    words, (line,) = WRONG[name]
+    ran = unjam(*line.split())
+    assert ran.returncode == 2, ran.stderr
+    assert words in ran.stderr
+    assert one_line(ran.stderr)
+    assert ran.stdout == ""
+    assert (tmp_path / "full" / "precious.txt").read_text() == "keep me"
+    assert not list(tmp_path.rglob("*.part"))
+
+
+def one_line(stderr: str) -> bool:
+    lines = stderr.strip().splitlines()
+    return len(lines) == 1 and lines[0].startswith("unjam: ") and "Traceback" not in stderr
+
+
+def test_there_are_enough_wrong_inputs() -> None:
+    assert len(WRONG) >= 30
+
+
+def test_missing_sumo_is_code_3_and_how_to_install_it(unjam: Run, tmp_path: Path) -> None:
+    (tmp_path / "libsumo").mkdir()
+    (tmp_path / "libsumo" / "__init__.py").write_text("raise ImportError('libproj.so.25: cannot open')")
+    ran = unjam("drive", "ring", "--driver", "pi", environment={"PYTHONPATH": str(tmp_path)})
+    assert ran.returncode == 3
+    assert one_line(ran.stderr)
+    assert "libproj.so.25" in ran.stderr
+    assert "pip install libsumo" in ran.stderr
+
+
+def test_doctor_names_what_is_missing(unjam: Run, tmp_path: Path) -> None:
+    (tmp_path / "libsumo").mkdir()
+    (tmp_path / "libsumo" / "__init__.py").write_text("raise ImportError('gone')")
+    ran = unjam("doctor", environment={"PYTHONPATH": str(tmp_path)})
+    assert ran.returncode == 3
+    assert "missing an episode in a worker: libsumo cannot be imported (gone)" in ran.stdout
+
+
+def test_window_without_a_display_is_code_3(unjam: Run) -> None:
+    ran = unjam("watch", "ring", "--driver", "pi", environment={"DISPLAY": ""})
+    assert ran.returncode == 3
+    assert one_line(ran.stderr)
+    assert "--video" in ran.stderr
+
+
+def test_disk_that_fills_up_is_code_74(unjam: Run, tmp_path: Path) -> None:
+    def little_space() -> None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
+
+    unjam("drive", "ring", "--driver", "pi", *SMALL)  # so that the network is made already
+    ran = unjam("drive", "ring", "--driver", "pi", *SMALL, "--out", "new", preexec_fn=little_space)
+    assert ran.returncode == 74, ran.stderr
+    assert one_line(ran.stderr)
+    assert "cannot write" in ran.stderr
+    assert not list((tmp_path / "new").rglob("*.part"))
+
+
+def test_cache_that_cannot_be_written_is_code_74(unjam: Run, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    ran = unjam("drive", "ring", "--driver", "pi", environment={"UNJAM_CACHE": str(tmp_path / "file")})
+    assert ran.returncode == 74, ran.stderr
+    assert one_line(ran.stderr)
+
+
+def test_disk_that_fills_up_in_training_leaves_a_whole_checkpoint(unjam: Run, tmp_path: Path) -> None:
+    def little_space() -> None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (90_000, 90_000))
+
+    train = ["train", "ring", *SMALL[:4], "--set", "road.horizon=60", "--set", "trpo.batch_steps=120"]
+    train += ["--set", "evaluation.episodes=1", "--set", "evaluation.validation_episodes=1"]
+    assert unjam(*train, "--steps", 240, "--out", "run").returncode == 0
+    shutil.rmtree(tmp_path / "run" / "checkpoint" / "000001")
+    before = (tmp_path / "run" / "progress.jsonl").read_text()
+    ran = unjam("train", "--resume", "run", "--steps", 100_000, preexec_fn=little_space)
+    assert ran.returncode == 74, ran.stderr
+    assert (tmp_path / "run" / "progress.jsonl").read_text().startswith(before)
+    assert unjam("train", "--resume", "run", "--steps", 360).returncode == 0
