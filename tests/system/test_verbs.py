@@ -1,0 +1,232 @@
+"""Every verb, called as a user calls it, on the actual simulator."""
+
+import json
+import signal
+import subprocess
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.system.conftest import UNJAM, Run
+
+SMALL = ["--length", "60", "--vehicles", "5", "--set", "horizon=80"]
+TINY_RUN = [
+    *["train", "ring", "--length", "60", "--vehicles", "5", "--set", "road.horizon=80", "--workers", "1"],
+    *["--set", "trpo.batch_steps=160", "--set", "evaluation.episodes=2"],
+    *["--set", "evaluation.validation_episodes=1", "--set", "evaluation.every=2"],
+]
+
+METRICS_OF_THE_DESIGN = [
+    "mean_speed",
+    "mean_speed_steady",
+    "speed_std_fleet",
+    "speed_std_cav",
+    "cav_mean_speed",
+    "return",
+    "return_eq16",
+    "mean_abs_accel",
+    "collisions",
+    "min_ttc",
+    "fuel_ml_per_km",
+    "throughput_veh_per_h",
+    "backlog_veh",
+    "shield_override_share",
+    "speed_limit_ratio",
+    "speed_limit_ratio_steady",
+]
+
+VERBS = ["scenarios", "drivers", "drive", "train", "evaluate", "report", "watch", "bench", "doctor"]
+
+
+def document(ran: subprocess.CompletedProcess[str]) -> Any:
+    assert ran.returncode == 0, ran.stderr
+    return json.loads(ran.stdout)
+
+
+def test_drive_prints_one_json_document(unjam: Run) -> None:
+    found = document(unjam("drive", "ring", "--driver", "pi", "--episodes", 2, "--seed", 7, *SMALL, "--json"))
+    assert (found["scenario"], found["driver"]) == ("ring", "pi")
+    assert [row["seed"] for row in found["episodes"]] == [7, 8]
+    for row in found["episodes"]:
+        assert row["status"] == "completed"
+        assert row["steps"] == 80
+        assert set(METRICS_OF_THE_DESIGN) <= set(row)
+    assert set(METRICS_OF_THE_DESIGN) <= set(found["mean"])
+    speeds = [row["mean_speed"] for row in found["episodes"]]
+    assert found["mean"]["mean_speed"] == pytest.approx(sum(speeds) / 2)
+
+
+def test_drive_prints_a_table_and_the_path_of_a_report(unjam: Run, tmp_path: Path) -> None:
+    ran = unjam("drive", "ring", "-d", "human", "-d", "pi:window=10", *SMALL, "--out", "mine")
+    assert ran.returncode == 0, ran.stderr
+    header, *lines = ran.stdout.splitlines()
+    assert header.split() == ["metric", "unit", "human", "pi:window=10"]
+    assert len(lines) >= len(METRICS_OF_THE_DESIGN)
+    assert "report: mine/report.html" in ran.stderr
+    assert (tmp_path / "mine" / "report.html").is_file()
+
+
+def test_drive_counts_up_its_folders(unjam: Run, tmp_path: Path) -> None:
+    for _ in range(2):
+        assert unjam("drive", "ring", "--driver", "pi", "-n", 1, *SMALL).returncode == 0
+    assert sorted(path.name for path in (tmp_path / "runs").iterdir()) == ["drive-ring-001", "drive-ring-002"]
+
+
+def test_drive_does_not_depend_on_the_number_of_workers(unjam: Run) -> None:
+    one, two = (
+        unjam("drive", "ring", "-d", "pi", "-n", 3, *SMALL, "--no-report", "--json", "--workers", workers)
+        for workers in (1, 2)
+    )
+    assert one.stdout == two.stdout != ""
+
+
+def test_drive_with_the_users_own_driver_and_reward(unjam: Run, my_drivers: Path) -> None:
+    found = document(
+        unjam("drive", "ring", "-d", "mine.py:gentle", "--reward", "mine.py:calm", "-n", 1, *SMALL, "--json")
+    )
+    assert found["driver"] == "mine.py:gentle"
+    assert found["mean"]["return"] > 0
+
+
+def test_an_episode_that_fails_keeps_the_others(unjam: Run, my_drivers: Path) -> None:
+    ran = unjam("drive", "ring", "-d", "pi", "-d", "mine.py:broken", "-n", 1, *SMALL, "--json")
+    assert ran.returncode == 2
+    pi, broken = json.loads(ran.stdout)["drivers"]
+    assert pi["episodes"][0]["status"] == "completed"
+    assert broken["episodes"][0]["status"] == "failed"
+    assert "step 0" in broken["episodes"][0]["reason"]
+
+
+def test_scenarios_and_drivers_list_what_there_is(unjam: Run) -> None:
+    assert set(document(unjam("scenarios", "--json"))) >= {"ring", "ring-warm", "ring-jammed"}
+    ring = document(unjam("scenarios", "ring", "--json"))
+    assert ring["parameters"]["vehicles"] == 22
+    assert "ring of 220-270 m" in unjam("scenarios").stdout
+    drivers = document(unjam("drivers", "--json"))
+    assert set(drivers) >= {"human", "idm", "pi", "follower-stopper", "constant"}
+    assert all(row["about"] for driver in drivers.values() for row in driver["parameters"])
+
+
+def test_doctor_finds_everything_here(unjam: Run) -> None:
+    found = document(unjam("doctor", "--json"))
+    assert found["ok"] is True
+    assert {"netconvert", "an episode in a worker"} <= {check["name"] for check in found["checks"]}
+
+
+def test_train_evaluate_report_and_go_on(unjam: Run, tmp_path: Path) -> None:
+    trained = document(unjam(*TINY_RUN, "--steps", 320, "--out", "run", "--json"))
+    run = tmp_path / "run"
+    assert {"human", "pi", "follower-stopper", "trained"} == set(trained["drivers"])
+    progress = [json.loads(line) for line in (run / "progress.jsonl").read_text().splitlines()]
+    assert [row["actual_steps"] for row in progress] == [160, 320]
+
+    went_on = document(unjam("train", "--resume", "run", "--steps", 480, "--json"))
+    assert went_on["folder"] == "run"
+    progress = [json.loads(line) for line in (run / "progress.jsonl").read_text().splitlines()]
+    assert [row["actual_steps"] for row in progress] == [160, 320, 480]
+
+    judged = document(unjam("evaluate", "run", "--episodes", 3, "--json"))
+    assert {"idm", "constant", "trained"} <= {entry["driver"] for entry in judged["drivers"]}
+    assert all(len(entry["episodes"]) == 3 for entry in judged["drivers"])
+
+    (run / "report.html").unlink()
+    assert document(unjam("report", "run", "--json"))["report"] == "run/report.html"
+    assert "A trained residual on pi".lower() in (run / "report.html").read_text().lower()
+
+    driven = document(unjam("drive", "ring", "--driver", "run", *SMALL, "-n", 1, "--json"))
+    assert driven["episodes"][0]["status"] == "completed"
+
+    on_top = document(
+        unjam(*TINY_RUN, "--steps", 160, "--expert", "run/controller.unjam", "--out", "second", "--json")
+    )
+    assert "pi + residual" in on_top["drivers"]
+    both = document(unjam("report", "run", "second", "--out", "both.html", "--json"))
+    assert (tmp_path / both["report"]).is_file()
+
+
+def test_train_without_an_expert(unjam: Run) -> None:
+    found = document(unjam(*TINY_RUN, "--steps", 160, "--expert", "none", "--out", "alone", "--json"))
+    assert found["gain"] is None
+
+
+def test_watch_writes_a_film_without_a_display(unjam: Run, tmp_path: Path) -> None:
+    ran = unjam("watch", "ring", "--driver", "pi", *SMALL, "--video", "film.gif", environment={"DISPLAY": ""})
+    assert ran.returncode == 0, ran.stderr
+    assert (tmp_path / "film.gif").read_bytes()[:4] == b"GIF8"
+
+
+@pytest.mark.slow
+def test_bench_prints_ratios(unjam: Run) -> None:
+    found = document(unjam("bench", "--rounds", 1, "--json"))
+    assert 0.0 < found["over_bare"] < 1.0
+    assert found["over_traci"] > 1.0
+    assert [entry["vehicles"] for entry in found["scaling"]] == [22, 220, 2200]
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_every_verb_explains_itself_with_an_example(verb: str, unjam: Run) -> None:
+    ran = unjam(verb, "--help", environment={"COLUMNS": "120"})
+    assert ran.returncode == 0
+    assert f"unjam {verb}" in ran.stdout
+    assert "Example" in ran.stdout
+    assert "--json" in ran.stdout
+
+
+def test_shell_completion_knows_the_verbs(unjam: Run) -> None:
+    ran = unjam(
+        environment={
+            "_UNJAM_COMPLETE": "complete_bash",
+            "COMP_WORDS": "unjam dri",
+            "COMP_CWORD": "1",
+            "_TYPER_COMPLETE_ARGS": "unjam dri",
+        }
+    )
+    assert set(ran.stdout.split()) == {"drive", "drivers"}
+
+
+def test_version(unjam: Run) -> None:
+    import unjam as package
+
+    assert unjam("--version").stdout.strip() == f"unjam {package.__version__}"
+
+
+@pytest.mark.parametrize(("sign", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_stopped_run_leaves_no_process_and_can_go_on(
+    sign: signal.Signals, code: int, unjam: Run, tmp_path: Path
+) -> None:
+    command = [str(UNJAM), *TINY_RUN, "--steps", "1000000", "--out", "run"]
+    with subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True) as process:
+        progress = tmp_path / "run" / "progress.jsonl"
+        wait_until(lambda: progress.exists() and progress.read_text().count("\n") >= 2)
+        workers = children_of(process.pid)
+        assert workers
+        process.send_signal(sign)
+        _, words = process.communicate(timeout=10)
+    assert process.returncode == code
+    assert "Traceback" not in words
+    wait_until(lambda: not any(Path(f"/proc/{worker}").exists() for worker in workers))
+    made = progress.read_text().count("\n")
+    assert unjam("train", "--resume", "run", "--steps", (made + 1) * 160).returncode == 0
+
+
+def children_of(pid: int) -> list[int]:
+    found = subprocess.run(["pgrep", "-P", str(pid)], capture_output=True, text=True, check=False)
+    return [int(word) for word in found.stdout.split()]
+
+
+def wait_until(condition: Any, seconds: float = 60.0) -> None:
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "waited in vain"
+        time.sleep(0.05)
+
+
+def test_a_reader_who_leaves_early_is_no_error(tmp_path: Path) -> None:
+    command = [str(UNJAM), "scenarios", "ring"]
+    with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        assert process.stderr is not None
+        process.stdout.close()
+        assert b"Traceback" not in process.stderr.read()
