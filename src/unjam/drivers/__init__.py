@@ -7,7 +7,7 @@ from unjam.drivers.follower_stopper import FollowerStopper
 from unjam.drivers.idm import IDM, Human
 from unjam.drivers.local_state import LocalState
 from unjam.drivers.pi_saturation import PISaturation
-from unjam.drivers.registry import DRIVERS
+from unjam.drivers.registry import DRIVERS, describe
 from unjam.drivers.residual import ResidualDriver
 
 __all__ = [
@@ -22,4 +22,5 @@ __all__ = [
     "PISaturation",
     "ResidualDriver",
     "check_driver",
+    "describe",
 ]

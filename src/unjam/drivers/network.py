@@ -20,7 +20,7 @@ class Network:
     network to 1e-6.
     """
 
-    layers: tuple[tuple[Floats, Floats], ...]
+    layers: tuple[tuple[Floats, Floats], ...] = field(repr=False)
     """(weight of shape (inputs, outputs), bias of shape (outputs,)) of each layer; one output at the end"""
     authority: float
     """largest residual acceleration [m/s2]"""

@@ -1,0 +1,53 @@
+"""Tables of the documentation, made from the measured files under results/: no number is typed in."""
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+import pandas as pd
+from IPython.display import HTML
+
+from unjam.reports.metrics import METRICS
+from unjam.reports.statistics import estimate
+
+RESULTS = Path(__file__).parent.parent / "results"
+
+
+def rows_of(name: str) -> dict[str, list[dict]]:
+    """Return the rows of a results file, by driver."""
+    rows: dict[str, list[dict]] = {}
+    for row in json.loads((RESULTS / name).read_text())["rows"]:
+        rows.setdefault(row["driver"], []).append(
+            {key: float("nan") if value is None else value for key, value in row.items()}
+        )
+    return rows
+
+
+def metrics_of(name: str, metrics: Sequence[str]) -> pd.DataFrame:
+    """Return a table of a results file: a row per driver, mean and 95 % bootstrap interval per metric."""
+    table = {}
+    for driver, rows in rows_of(name).items():
+        cells = {}
+        for metric in metrics:
+            found, about = estimate([row[metric] for row in rows]), METRICS[metric]
+            heading = f"{about.label} [{about.unit}]" if about.unit else about.label
+            cells[heading] = f"{found.mean:.{about.digits}f}" if found.count else "never"
+            if found.count > 1:
+                cells[heading] += f" [{found.low:.{about.digits}f}, {found.high:.{about.digits}f}]"
+            if 0 < found.count < len(rows):
+                cells[heading] += f" in {found.count} of {len(rows)}"
+        table[driver] = cells
+    return pd.DataFrame.from_dict(table, orient="index")
+
+
+def mean_of(name: str, driver: str, metric: str) -> float:
+    """Return the mean of one metric of one driver in a results file."""
+    return estimate([row[metric] for row in rows_of(name)[driver]]).mean
+
+
+def show(table: pd.DataFrame, index: bool = False, digits: int = 3) -> HTML:
+    """Return a table in the style of the site."""
+    html = table.to_html(
+        index=index, border=0, classes="docutils align-default", float_format=f"{{:.{digits}f}}".format
+    )
+    return HTML(f'<div class="table-wrapper">{html}</div>')
