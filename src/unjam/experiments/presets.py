@@ -17,5 +17,5 @@ PRESETS: dict[str, dict[str, Any]] = {
         "trpo": {"batch_steps": 6000, "spread": False, "gamma": 0.995, "target_kl": 0.01},
     },
     # Ends within about five minutes on two cores, evaluation included.
-    "demo": {"steps": 600_000},
+    "demo": {"steps": 960_000},
 }
