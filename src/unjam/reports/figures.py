@@ -54,7 +54,9 @@ def data_uri(figure: Figure, kind: Literal["png", "svg"]) -> str:
         return _data_uri("image/svg+xml", content)
     figure.savefig(content, format="png", dpi=130)
     small = io.BytesIO()
-    Image.open(content).convert("RGB").quantize(128).save(small, "PNG", optimize=True)
+    # A sixth of the size. Maximum coverage keeps colours that are rare: the CAV's, and the fastest.
+    quantized = Image.open(content).convert("RGB").quantize(256, Image.Quantize.MAXCOVERAGE)
+    quantized.save(small, "PNG", optimize=True)
     return _data_uri("image/png", small)
 
 
@@ -114,14 +116,14 @@ def _trajectories(axes: Axes, episode: Shown, scale: Normalize) -> None:
             list(segments[keep]),
             cmap=SPEED_COLOURS,
             norm=scale,
-            linewidths=2.2 if is_cav else 1.1,
+            linewidths=2.6 if is_cav else 1.1,
             rasterized=True,
         )
         lines.set_array(episode.speeds[::every, column][:-1][keep])
         axes.add_collection(lines)
         if is_cav:
             axes.add_collection(
-                LineCollection(list(segments[keep]), colors="#d7263d", linewidths=0.7, rasterized=True)
+                LineCollection(list(segments[keep]), colors="#d7263d", linewidths=1.3, rasterized=True)
             )
     axes.set_xlim(times[0], times[-1])
     axes.set_ylim(0, episode.loop_length)

@@ -13,6 +13,9 @@ from unjam.reports.statistics import Estimate, estimate, paired_difference
 CLOSE_HEADWAY = 1.0
 """time headway below which the report says so [s]; the paper's h_max"""
 
+BEYOND_LIMIT = 1.01
+"""share of the limit above which the report explains how that can be"""
+
 
 @dataclass(frozen=True)
 class Column:
@@ -99,6 +102,12 @@ def notes_of(result: Results) -> list[str]:
             f"({result.about['reward']}) does not ask for distance."
             if result.about["reward"] == "released"
             else f"{label} drives close: its smallest time headway is {closest:.2f} s."
+        )
+    ratio = estimate([row["speed_limit_ratio_steady"] for row in rows]).mean
+    if ratio > BEYOND_LIMIT:
+        notes.append(
+            f"With {label} all vehicles drive at {100 * ratio:.0f} % of the limit, which is how fast people "
+            "alone could drive alike: the CAV keeps a smaller gap than they would."
         )
     leaning = estimate([row["shield_override_share"] for row in rows]).mean
     if leaning > 0.01:
