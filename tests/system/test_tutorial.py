@@ -11,8 +11,6 @@ TUTORIAL = Path(__file__).parents[2] / "docs" / "tutorial.ipynb"
 def test_the_tutorial_runs(tmp_path: Path) -> None:
     notebook = nbformat.read(TUTORIAL, as_version=4)
     NotebookClient(notebook, timeout=600, resources={"metadata": {"path": str(tmp_path)}}).execute()
-    words = "".join(
-        output.get("text", "") for cell in notebook.cells for output in cell.get("outputs", ())
-    )
+    words = "".join(output.get("text", "") for cell in notebook.cells for output in cell.get("outputs", ()))
     assert "pi     mean speed" in words
     assert "return beyond the expert" in words
