@@ -20,6 +20,12 @@ EXPERTS = [
     "pi:window=0.3",
     "follower-stopper",
     "follower-stopper:desired_speed=4",
+    "acc",
+    "acc:time_gap=2,set_speed=5",
+    "lacc:lag=0.4",
+    "lacc:lag=0.01",
+    "bcm:desired_speed=4",
+    "ovm",
     "constant:acceleration=0.2",
 ]
 

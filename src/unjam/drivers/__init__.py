@@ -1,18 +1,25 @@
 """Who drives a CAV: experts, learned residuals, your own."""
 
+from unjam.drivers.acc import ACC, LACC
+from unjam.drivers.bilateral import BCM
 from unjam.drivers.check import check_driver
 from unjam.drivers.constant import Constant
 from unjam.drivers.driver import Driver, Memory
 from unjam.drivers.follower_stopper import FollowerStopper
 from unjam.drivers.idm import IDM, Human
 from unjam.drivers.local_state import LocalState
+from unjam.drivers.ovm import OVM
 from unjam.drivers.pi_saturation import PISaturation
 from unjam.drivers.registry import DRIVERS, describe
 from unjam.drivers.residual import ResidualDriver
 
 __all__ = [
+    "ACC",
+    "BCM",
     "DRIVERS",
     "IDM",
+    "LACC",
+    "OVM",
     "Constant",
     "Driver",
     "FollowerStopper",

@@ -6,12 +6,15 @@ from typing import Any
 
 import numpy as np
 
+from unjam.drivers.acc import ACC, LACC
+from unjam.drivers.bilateral import BCM
 from unjam.drivers.constant import Constant
 from unjam.drivers.driver import Driver
 from unjam.drivers.follower_stopper import FollowerStopper
 from unjam.drivers.from_file import FileDriver, is_file_reference
 from unjam.drivers.idm import IDM, Human
 from unjam.drivers.network import network_arrays, network_from_arrays
+from unjam.drivers.ovm import OVM
 from unjam.drivers.pi_saturation import PISaturation
 from unjam.drivers.residual import ResidualDriver
 from unjam.errors import wrong
@@ -22,6 +25,10 @@ DRIVERS: dict[str, type[Driver]] = {
     "idm": IDM,
     "pi": PISaturation,
     "follower-stopper": FollowerStopper,
+    "acc": ACC,
+    "lacc": LACC,
+    "bcm": BCM,
+    "ovm": OVM,
     "constant": Constant,
 }
 

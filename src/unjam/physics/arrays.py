@@ -21,6 +21,8 @@ class _Floats:
 
     minimum = staticmethod(min)
     isnan = staticmethod(math.isnan)
+    cos = staticmethod(math.cos)
+    sin = staticmethod(math.sin)
 
     @staticmethod
     def where(condition: bool, then: float, otherwise: float) -> float:
@@ -28,7 +30,7 @@ class _Floats:
 
 
 def namespace(array: Array) -> Any:
-    """Return what has `where`, `minimum` and `isnan` for this kind of number.
+    """Return what has `where`, `minimum`, `isnan`, `cos` and `sin` for this kind of number.
 
     That is `numpy`, `torch`, or their like for plain floats.
     """
