@@ -8,7 +8,9 @@ manifest names that file and its hash.
 import hashlib
 import io
 import json
+import lzma
 import zipfile
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +21,7 @@ from unjam import __version__
 from unjam.drivers.driver import Driver
 from unjam.drivers.from_file import is_file_reference
 from unjam.drivers.registry import DRIVERS, driver_from_recipe, named_driver, recipe_of
+from unjam.drivers.residual import ResidualDriver, observation_size
 from unjam.errors import InputError
 
 SUFFIX = ".unjam"
@@ -65,16 +68,32 @@ def load_controller(path: Path | str) -> Driver:
             raise InputError(f"controller {file.name}: format {manifest['format']!r} is unknown")
         if hashlib.sha256(weights).hexdigest() != manifest["sha256"][WEIGHTS]:
             raise InputError(f"controller {file.name}: damaged: its weights do not have the hash it names")
-        return driver_from_recipe(manifest["driver"], load(weights))
+        driver = driver_from_recipe(manifest["driver"], load(weights))
+        _check_inputs(driver)
+        return driver
     except (
         zipfile.BadZipFile,
+        zlib.error,
+        lzma.LZMAError,
         SafetensorError,
+        OSError,
+        EOFError,
         ValueError,
         KeyError,
         TypeError,
-        NotImplementedError,
+        AttributeError,
+        RuntimeError,  # encrypted, of a kind that zipfile does not know, or nested without end
     ) as error:
         raise InputError(f"controller {file.name}: not a controller: {error}") from None
+
+
+def _check_inputs(driver: Driver) -> None:
+    """Raise `InputError` where a network does not see as many numbers as its driver shows it."""
+    while isinstance(driver, ResidualDriver):
+        shown = observation_size(driver.parts, driver.expert)
+        if driver.network.inputs != shown:
+            raise InputError(f"network: {driver.network.inputs} inputs are not allowed; allowed: {shown}")
+        driver = driver.expert
 
 
 def _read_part(archive: zipfile.ZipFile, name: str) -> bytes:

@@ -41,6 +41,8 @@ def make_folder(path: Path) -> None:
     """Make a folder and those above it; raise `DiskError` where that is impossible."""
     try:
         path.mkdir(parents=True, exist_ok=True)
+    except FileExistsError as error:
+        raise disk_error(error, path) from None
     except OSError as error:
         raise _disk(error, path) from None
 

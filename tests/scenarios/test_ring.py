@@ -73,7 +73,7 @@ def test_recipe_makes_the_same_scenario_again() -> None:
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"length": (250, 230)}, "length: 230 m is not allowed as the longest; allowed: >= 250 m"),
+        ({"length": (250, 230)}, "length: 230 m is not allowed as the largest; allowed: >= 250 m"),
         ({"vehicles": 50}, "length: 220 m is not allowed for 50 vehicles; allowed: >= 350 m"),
         ({"vehicles": 1}, "vehicles: 1 is not allowed"),
         ({"cavs": 30}, "cavs: 30 is not allowed; allowed: <= vehicles, 22"),

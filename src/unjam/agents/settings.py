@@ -16,7 +16,7 @@ Share = Annotated[float, Field(ge=0, le=1)]
 class PolicySettings:
     """The residual network and how it explores."""
 
-    hidden: tuple[Count, ...] = (64, 64)
+    hidden: Annotated[tuple[Count, ...], Field(min_length=1)] = (64, 64)
     """units of the hidden layers, of the policy and of the value network"""
     observe: Annotated[tuple[ObservationPart, ...], Field(min_length=1)] = (
         "local",

@@ -12,7 +12,7 @@ from unjam.errors import InputError
 Floats = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Network:
     """A perceptron with ReLU layers and a bounded output: `authority * tanh(last layer)`.
 

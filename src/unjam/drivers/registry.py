@@ -1,10 +1,13 @@
 """All drivers by name, and how a driver is written down so that another process can make it again."""
 
+import hashlib
 from dataclasses import asdict, fields, is_dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
+from pydantic import Field
+from pydantic.dataclasses import dataclass
 
 from unjam.drivers.acc import ACC, LACC
 from unjam.drivers.bilateral import BCM
@@ -13,12 +16,13 @@ from unjam.drivers.driver import Driver
 from unjam.drivers.follower_stopper import FollowerStopper
 from unjam.drivers.from_file import FileDriver, is_file_reference
 from unjam.drivers.idm import IDM, Human
+from unjam.drivers.local_state import ObservationPart
 from unjam.drivers.network import network_arrays, network_from_arrays
 from unjam.drivers.ovm import OVM
 from unjam.drivers.pi_saturation import PISaturation
 from unjam.drivers.residual import ResidualDriver
 from unjam.errors import wrong
-from unjam.parameters import build, parse_assignments
+from unjam.parameters import STRICT, Count, NotNegative, Positive, build, parse_assignments
 
 DRIVERS: dict[str, type[Driver]] = {
     "human": Human,
@@ -84,6 +88,19 @@ def _make(name: str, parameters: dict[str, Any], time_step: float) -> Driver:
     return build(kind, parameters, f"driver {name}")
 
 
+@dataclass(frozen=True, config=STRICT)
+class _ResidualRecipe:
+    """How a residual driver is written down, without its weights."""
+
+    kind: Literal["residual"]
+    expert: dict[str, Any]
+    action_limit: Positive
+    parts: Annotated[tuple[ObservationPart, ...], Field(min_length=1)]
+    hold: Count
+    authority: Positive
+    exploration_std: NotNegative
+
+
 def recipe_of(driver: Driver, prefix: str = "") -> tuple[Recipe, dict[str, np.ndarray]]:
     """Return the recipe of a driver and the arrays of its networks; `driver_from_recipe` undoes it."""
     if isinstance(driver, ResidualDriver):
@@ -104,6 +121,7 @@ def recipe_of(driver: Driver, prefix: str = "") -> tuple[Recipe, dict[str, np.nd
             "kind": "file",
             "path": str(driver.path),
             "name": driver.name,
+            "sha256": hashlib.sha256(driver.path.read_bytes()).hexdigest(),
             "parameters": driver.parameters,
             "time_step": driver.time_step,
         }
@@ -116,7 +134,7 @@ def recipe_of(driver: Driver, prefix: str = "") -> tuple[Recipe, dict[str, np.nd
 
 def driver_from_recipe(recipe: Recipe, arrays: dict[str, np.ndarray], prefix: str = "") -> Driver:
     """Return the driver that `recipe_of` wrote down; raise `InputError` where the recipe is not valid."""
-    kind = recipe.get("kind")
+    kind = recipe.get("kind") if isinstance(recipe, dict) else recipe
     if kind == "named" and recipe["name"] in DRIVERS:
         return build(DRIVERS[recipe["name"]], recipe["parameters"], f"driver {recipe['name']}")
     if kind == "file":
@@ -128,12 +146,13 @@ def driver_from_recipe(recipe: Recipe, arrays: dict[str, np.ndarray], prefix: st
             for name, array in arrays.items()
             if name.startswith(prefix) and not name.startswith(expert_prefix)
         }
+        found = build(_ResidualRecipe, recipe, "driver recipe")
         return ResidualDriver(
-            driver_from_recipe(recipe["expert"], arrays, expert_prefix),
-            network_from_arrays(own, recipe["authority"], recipe["exploration_std"]),
-            recipe["action_limit"],
-            tuple(recipe["parts"]),
-            recipe["hold"],
+            driver_from_recipe(found.expert, arrays, expert_prefix),
+            network_from_arrays(own, found.authority, found.exploration_std),
+            found.action_limit,
+            found.parts,
+            found.hold,
         )
     raise wrong("driver recipe", kind, "named, file, residual")
 
@@ -143,12 +162,32 @@ def describe(driver: Driver) -> str:
     if isinstance(driver, ResidualDriver):
         return f"{describe(driver.expert)} + residual"
     if isinstance(driver, FileDriver):
-        return f"{driver.path.name}:{driver.name}"
+        return ":".join([driver.path.name, driver.name, *_listed(driver.parameters)])
     recipe, _ = recipe_of(driver)
     default = {field.name: field.default for field in fields(driver)}  # pyright: ignore[reportArgumentType]
-    changed = [
-        f"{key}={value}"
+    changed = {
+        key: value
         for key, value in recipe["parameters"].items()
         if value != default[key] and key != "time_step"
-    ]
-    return ":".join([recipe["name"], *([",".join(changed)] if changed else [])])
+    }
+    return ":".join([recipe["name"], *_listed(changed)])
+
+
+def _listed(parameters: dict[str, Any]) -> list[str]:
+    return [",".join(f"{key}={value}" for key, value in parameters.items())] if parameters else []
+
+
+def free_label(driver: Driver, taken: dict[str, Driver]) -> str:
+    """Return the description of a driver, numbered where another driver has it already."""
+    label, number = describe(driver), 1
+    while label in taken and not _same(taken[label], driver):
+        number += 1
+        label = f"{describe(driver)} ({number})"
+    return label
+
+
+def _same(one: Driver, other: Driver) -> bool:
+    (recipe, arrays), (other_recipe, other_arrays) = recipe_of(one), recipe_of(other)
+    return recipe == other_recipe and all(
+        np.array_equal(array, other_arrays[name]) for name, array in arrays.items()
+    )

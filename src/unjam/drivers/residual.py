@@ -15,6 +15,7 @@ from unjam.drivers.local_state import (
     local_vector,
 )
 from unjam.drivers.network import Network
+from unjam.errors import InputError
 from unjam.physics.arrays import Array, as_column, clip, join_columns, namespace
 
 
@@ -55,6 +56,8 @@ def observe(
             features = expert.memory_features(memory)
             if features is not None:
                 blocks.append(features)
+    if not blocks:
+        raise InputError("policy.observe: expert_memory alone is not allowed: the expert remembers nothing")
     return join_columns(blocks)
 
 
@@ -151,4 +154,7 @@ def observation_size(parts: tuple[ObservationPart, ...], expert: Driver) -> int:
     one = np.ones(1)
     state = LocalState(*([one] * len(LocalState._fields)))
     acceleration, memory = expert.act(state, expert.initial_memory(1))
+    if np.shape(acceleration) != (1,):
+        shape = np.shape(acceleration)
+        raise InputError(f"driver: acceleration has shape {shape}; allowed: one for each CAV")
     return observe(parts, state, acceleration, expert, memory).shape[1]

@@ -45,7 +45,7 @@ def load_checkpoint(folder: Path) -> tuple[dict[str, Any], Tensors] | None:
             data = (place / TENSORS).read_bytes()
             if state.pop("sha256") == _hash(state, data):
                 return state, load(data)
-        except (OSError, ValueError, KeyError, AttributeError, SafetensorError):
+        except (OSError, ValueError, KeyError, TypeError, AttributeError, SafetensorError):
             continue
     if places:
         raise InputError(f"checkpoint: all {len(places)} under {folder} are damaged")

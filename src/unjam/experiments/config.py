@@ -3,10 +3,10 @@
 import tomllib
 from dataclasses import asdict, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import tomli_w
-from pydantic import model_validator
+from pydantic import Field, field_validator, model_validator
 from pydantic.dataclasses import dataclass
 
 from unjam.agents.settings import PolicySettings, TRPOSettings
@@ -48,13 +48,20 @@ class RunConfig:
     """a name or `path.py:name`; empty: the scenario's own"""
     steps: Count = 960_000
     """actual steps of training"""
-    seed: CountOrNone = 0
+    seed: Annotated[int, Field(ge=0, lt=1_000_000)] = 0
+    """of the whole run; numbers from a million on are those of the episodes that judge"""
     workers: Count = 2
     policy: PolicySettings = field(default_factory=PolicySettings)
     trpo: TRPOSettings = field(default_factory=TRPOSettings)
     evaluation: EvaluationSettings = field(default_factory=EvaluationSettings)
     preset: str = ""
     """which preset this started from, for the record"""
+
+    @field_validator("road")
+    @classmethod
+    def _plain(cls, road: dict[str, Any]) -> dict[str, Any]:
+        """Return the changes as a TOML file gives them back, so that a run knows its own road again."""
+        return {key: list(value) if isinstance(value, tuple) else value for key, value in road.items()}
 
     @model_validator(mode="after")
     def _possible(self) -> "RunConfig":
@@ -105,7 +112,7 @@ def load_config(
 def read_toml(path: Path) -> dict[str, Any]:
     """Return the content of a TOML file; raise `InputError` where it is missing or not TOML."""
     try:
-        return tomllib.loads(path.read_text())
+        return tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise InputError(f"config file {path}: {error.strerror}") from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:

@@ -8,8 +8,8 @@ from typing import Any
 
 from unjam.controller import make_driver
 from unjam.drivers.driver import Driver
-from unjam.drivers.registry import describe
-from unjam.errors import InputError
+from unjam.drivers.registry import driver_names, free_label
+from unjam.errors import InputError, wrong
 from unjam.experiments.evaluate import evaluate, raise_failure, save_evaluation
 from unjam.experiments.manifest import manifest
 from unjam.files import make_folder
@@ -88,6 +88,9 @@ def drive(
     Raises:
         InputError: something is wrong with the arguments; nothing was started.
     """
+    for name, number, least in (("episodes", episodes, 1), ("seed", seed, 0), ("workers", workers, 1)):
+        if number is not None and number < least:
+            raise wrong(name, number, f">= {least}")
     made = make_scenario(scenario, road)
     given = [driver] if isinstance(driver, (str, Driver)) else list(driver)
     drivers: dict[str, Driver] = {}
@@ -95,7 +98,9 @@ def drive(
         if isinstance(entry, str):
             drivers[entry] = make_driver(entry, made.decision_step)
         else:
-            drivers[describe(entry)] = entry
+            drivers[free_label(entry, drivers)] = entry
+    if not drivers:
+        raise wrong("driver", driver, driver_names())
     make_reward(reward or made.reward)
     folder = Path(out) if out is not None else None
     if folder is not None and folder.exists() and (not folder.is_dir() or any(folder.iterdir())):

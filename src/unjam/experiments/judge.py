@@ -5,7 +5,7 @@ from pathlib import Path
 
 from unjam.controller import make_driver
 from unjam.drivers.driver import Driver
-from unjam.drivers.registry import describe
+from unjam.drivers.registry import describe, free_label
 from unjam.experiments.config import RunConfig
 from unjam.experiments.evaluate import Evaluation, evaluate, held_out_seeds, raise_failure, save_evaluation
 from unjam.experiments.manifest import manifest
@@ -18,14 +18,12 @@ TRAINED = "trained"
 def comparison(config: RunConfig, folder: Path, baselines: Sequence[str]) -> dict[str, Driver]:
     """Return the drivers to compare, by label: the baselines, the run's expert, its trained controller."""
     time_step = config.make_scenario().decision_step
-    drivers = {}
+    expert = {} if config.expert == "none" else {describe(made := config.make_expert()): made}
+    drivers: dict[str, Driver] = {}
     for name in baselines:
         driver = make_driver(name, time_step)
-        drivers[describe(driver)] = driver
-    if config.expert != "none":
-        expert = config.make_expert()
-        drivers[describe(expert)] = expert
-    return {**drivers, TRAINED: make_driver(str(folder), time_step)}
+        drivers[free_label(driver, {**expert, **drivers})] = driver
+    return {**drivers, **expert, TRAINED: make_driver(str(folder), time_step)}
 
 
 def judge(

@@ -54,7 +54,16 @@ def measure_speed(rounds: int = ROUNDS, told: Callable[[str], None] | None = Non
     """
     say = told or (lambda _: None)
     if hasattr(os, "sched_setaffinity"):
-        os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+        cores = os.sched_getaffinity(0)
+        os.sched_setaffinity(0, {min(cores)})
+        try:
+            return _measure(rounds, say)
+        finally:
+            os.sched_setaffinity(0, cores)
+    return _measure(rounds, say)
+
+
+def _measure(rounds: int, say: Callable[[str], None]) -> dict[str, Any]:
     ring, driver = SCENARIOS["ring"], neural_driver(PolicySettings().hold)
     every_step = neural_driver(1)
     found: dict[str, list[float]] = {"bare": [], "episode": [], "every_step": [], "loop": [], "traci": []}

@@ -7,7 +7,9 @@ from typing import Any
 
 import torch
 
+from unjam.controller import make_driver
 from unjam.drivers.registry import describe
+from unjam.drivers.residual import observation_size
 from unjam.errors import InputError
 from unjam.experiments.config import RunConfig, load_config, to_toml
 from unjam.experiments.judge import TRAINED, judge
@@ -65,8 +67,11 @@ def train(
         DiskError: the disk is full; the last checkpoint is whole.
     """
     folder = Path(folder)
-    config.make_expert()  # wrong names are told before anything is written
-    make_reward(config.reward or config.make_scenario().reward)
+    scenario = config.make_scenario()  # what is wrong is told before anything is written
+    observation_size(config.policy.observe, config.make_expert())
+    make_reward(config.reward or scenario.reward)
+    for name in config.evaluation.baselines:
+        make_driver(name, scenario.decision_step)
     if resume:
         continue_folder(folder, config)
     else:
@@ -92,7 +97,7 @@ def start_folder(folder: Path, config: RunConfig) -> None:
     Raises:
         InputError: the folder holds something already.
     """
-    if folder.exists() and any(folder.iterdir()):
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise InputError(f"out: {str(folder)!r} is not empty; allowed: a new folder, or --resume {folder}")
     make_folder(folder)
     write_whole(folder / "config.toml", to_toml(config))

@@ -9,7 +9,16 @@ from pydantic.dataclasses import dataclass
 
 from unjam.parameters import STRICT, Count
 from unjam.physics.idm import equilibrium_speed
-from unjam.scenarios.scenario import VEHICLE_LENGTH, Road, Scenario, cav_type, human_type
+from unjam.scenarios.closed_road import (
+    Edge,
+    cavs_among,
+    check_counts,
+    loop_traffic,
+    part_of_range,
+    vehicle_names,
+    words_of_range,
+)
+from unjam.scenarios.scenario import VEHICLE_LENGTH, Road, Scenario
 
 EDGES = 4
 
@@ -34,53 +43,35 @@ class Ring(Scenario):
 
     @model_validator(mode="after")
     def _fits(self) -> "Ring":
-        shortest, longest = self.length
-        if longest < shortest:
-            raise ValueError(f"length: {longest} m is not allowed as the longest; allowed: >= {shortest} m")
+        check_counts("length", self.length, self.vehicles, self.cavs)
+        shortest = self.length[0]
         needed = self.vehicles * (VEHICLE_LENGTH + self.humans.minimum_gap)
         if shortest < needed:
             raise ValueError(
                 f"length: {shortest} m is not allowed for {self.vehicles} vehicles; allowed: >= {needed:g} m"
             )
-        if self.cavs > self.vehicles:
-            raise ValueError(f"cavs: {self.cavs} is not allowed; allowed: <= vehicles, {self.vehicles}")
         return self
 
     def draw(self, generator: np.random.Generator) -> Road:
         """Return a ring of random length with its vehicles."""
         length = float(generator.integers(self.length[0], self.length[1], endpoint=True))
-        cavs = {round(index * self.vehicles / self.cavs) for index in range(self.cavs)}
-        ids = tuple(f"{'cav' if index in cavs else 'human'}_{index}" for index in range(self.vehicles))
+        ids = vehicle_names(self.vehicles, self.cavs)
         positions = np.arange(self.vehicles, dtype=np.float64) * (length / self.vehicles)
         return Road(
             nodes=_nodes(length),
             edges=_edges(length, self.humans.desired_speed),
+            connections="",
             netconvert_options=("--no-internal-links", "true", "--no-turnarounds", "true"),
-            traffic=self._traffic(length, ids, positions),
+            traffic=loop_traffic(self, _loop(length), ids, positions),
             vehicle_ids=ids,
-            cav_ids=tuple(name for name in ids if name.startswith("cav")),
+            cav_ids=cavs_among(ids),
             start_positions=positions,
             loop_length=length,
+            crossings=(),
             limit_speed=equilibrium_speed(length / self.vehicles - VEHICLE_LENGTH, self.humans),
             outline=_outline(length),
             drawn={"length": length},
         )
-
-    def _traffic(self, length: float, ids: tuple[str, ...], positions: np.ndarray) -> str:
-        seconds = self.simulation_step * (self.warmup + self.horizon * self.steps_per_decision)
-        laps = int(seconds * self.humans.desired_speed / length) + 2
-        lines = ["<routes>", human_type(self), cav_type(self)]
-        for first in range(EDGES):
-            edges = " ".join(f"edge_{(first + index) % EDGES}" for index in range(EDGES))
-            lines.append(f'<route id="from_{first}" edges="{edges}" repeat="{laps}"/>')
-        for name, position in zip(ids, positions, strict=True):
-            edge = min(int(position / (length / EDGES)), EDGES - 1)
-            place = float(position) - edge * length / EDGES
-            lines.append(
-                f'<vehicle id="{name}" type="human" route="from_{edge}" depart="0" departSpeed="0" '
-                f'departLane="0" departPos="{place!r}"/>'
-            )
-        return "\n".join([*lines, "</routes>"])
 
     @property
     def drawn_ranges(self) -> dict[str, tuple[float, float]]:
@@ -89,16 +80,12 @@ class Ring(Scenario):
 
     def part(self, index: int, count: int) -> "Ring":
         """Return this ring with one of `count` equal parts of its lengths."""
-        shortest, longest = self.length
-        borders = np.linspace(shortest, longest + 1, count + 1).astype(int)
-        low, high = int(borders[index]), int(borders[index + 1]) - 1
-        return replace(self, length=(low, max(low, high)))
+        return replace(self, length=part_of_range(self.length, index, count))
 
     def facts(self) -> list[tuple[str, str]]:
         """Return the ring's own facts for `unjam scenarios`."""
-        lengths = "-".join(str(length) for length in dict.fromkeys(self.length))
         return [
-            ("road", f"ring of {lengths} m"),
+            ("road", f"ring of {words_of_range(self.length)} m"),
             ("vehicles", f"{self.vehicles} ({self.cavs} CAV)"),
             ("limit", f"{self._limits()} m/s"),
         ]
@@ -122,6 +109,11 @@ def _nodes(length: float) -> str:
         x, y = _point(2 * np.pi * index / EDGES, radius)
         lines.append(f'<node id="node_{index}" x="{x:.6f}" y="{y:.6f}" type="priority"/>')
     return "\n".join([*lines, "</nodes>"])
+
+
+def _loop(length: float) -> list[Edge]:
+    each = length / EDGES
+    return [Edge(f"edge_{index}", index * each, each) for index in range(EDGES)]
 
 
 def _edges(length: float, speed: float) -> str:

@@ -2,10 +2,11 @@
 
 from dataclasses import dataclass as plain_dataclass
 from dataclasses import field
-from typing import Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from unjam.parameters import STRICT, Count, CountOrNone, NotNegative, Positive
@@ -19,7 +20,16 @@ Actuation = Literal["shielded", "raw", "flow"]
 
 `shielded`: exactly, until it is unsafe; then SUMO brakes, and the override is counted.
 `raw`: exactly, always; a collision ends the episode.
-`flow`: as in Flow, the CAV is also bound by the human IDM and can never accelerate beyond it.
+`flow`: as in Flow, the CAV is also bound by SUMO's human model and can never accelerate beyond it.
+"""
+
+People = Literal["native", "commanded"]
+"""Who computes how people drive.
+
+`native`: SUMO's own IDM with the scenario's parameters, to whose speeds noise is added.
+`commanded`: the same IDM and noise as a speed command in every step, as Flow does it, over a quicker model
+of SUMO's that keeps vehicles safe and obeys the right of way. SUMO's IDM with the paper's parameters alone is
+far more timid where roads cross.
 """
 
 
@@ -32,6 +42,8 @@ class Road:
     edges: str
     """XML of the edges, for netconvert"""
     netconvert_options: tuple[str, ...]
+    connections: str
+    """XML of the connections, for netconvert; empty: all that are possible"""
     traffic: str
     """XML of vehicle types, routes and vehicles"""
     vehicle_ids: tuple[str, ...]
@@ -42,6 +54,8 @@ class Road:
     """front bumper of each vehicle along the route at the start [m]"""
     loop_length: float
     """length of the closed road [m]"""
+    crossings: tuple[tuple[float, float], ...]
+    """where along the road it crosses another way: there SUMO drives commanded people itself [m]"""
     limit_speed: float
     """speed that the traffic cannot exceed in the long run [m/s]: the scenario's own limit"""
     outline: NDArray[np.float64]
@@ -75,6 +89,11 @@ class Scenario:
     exactly; `flow` bound by the human IDM"""
     humans: IDMParameters = field(default_factory=IDMParameters)
     """how people drive"""
+    people: People = "native"
+    """who computes how people drive: `native` SUMO's own IDM; `commanded` the same IDM as a speed command in
+    every step, as in Flow"""
+    impatience: Annotated[float, Field(ge=0, le=1)] = 0.0
+    """how readily vehicles that must yield take a gap in crossing traffic (SUMO's `impatience`)"""
     noise: NotNegative = 0.2
     """standard deviation of the humans' acceleration noise [m/s2]"""
     noise_scaling: Literal["sqrt-step", "none"] = "sqrt-step"
@@ -130,6 +149,7 @@ def vehicle_type(name: str, scenario: Scenario, **attributes: Any) -> str:
         "speedFactor": 1.0,
         "speedDev": 0.0,  # without it SUMO draws factors between 0.8 and 1.2
         "sigma": 0.0,
+        "impatience": scenario.impatience,
         "emissionClass": scenario.emission_class,
     }
     pairs = " ".join(f'{key}="{value}"' for key, value in {**common, **attributes}.items())
@@ -137,18 +157,26 @@ def vehicle_type(name: str, scenario: Scenario, **attributes: Any) -> str:
 
 
 def human_type(scenario: Scenario) -> str:
-    """Return the XML of the human drivers: SUMO's own IDM with the scenario's parameters."""
+    """Return the XML of the human drivers: SUMO's own IDM with the scenario's parameters.
+
+    Under commanded people lies Flow's layer: quick, and with no gap of its own.
+    """
     humans = scenario.humans
+    layer = {
+        "accel": humans.max_acceleration,
+        "decel": humans.comfortable_deceleration,
+        "tau": humans.time_headway,
+        "minGap": humans.minimum_gap,
+    }
+    if scenario.people == "commanded":
+        layer = {"accel": 2.6, "decel": 4.5, "tau": 1.0, "minGap": 0.0}
     return vehicle_type(
         "human",
         scenario,
         carFollowModel="IDM",
-        accel=humans.max_acceleration,
-        decel=humans.comfortable_deceleration,
-        tau=humans.time_headway,
         delta=humans.exponent,
-        minGap=humans.minimum_gap,
         maxSpeed=humans.desired_speed,
+        **layer,
     )
 
 

@@ -58,7 +58,7 @@ def network_file(road: Road) -> Path:
         MissingPartError: netconvert is missing.
         DiskError: the cache cannot be written.
     """
-    content = "\n".join([sumo_version(), *road.netconvert_options, road.nodes, road.edges])
+    content = "\n".join([sumo_version(), *road.netconvert_options, road.nodes, road.edges, road.connections])
     name = hashlib.sha256(content.encode()).hexdigest()[:24]
     target = cache_folder() / "networks" / f"{name}.net.xml"
     if target.exists():
@@ -79,6 +79,11 @@ def _netconvert(road: Road, folder: Path) -> Path:
     nodes, edges, made = folder / "road.nod.xml", folder / "road.edg.xml", folder / "road.net.xml"
     nodes.write_text(road.nodes)
     edges.write_text(road.edges)
+    extra = []
+    if road.connections:
+        connections = folder / "road.con.xml"
+        connections.write_text(road.connections)
+        extra = [f"--connection-files={connections}"]
     command = [
         sumo_program("netconvert"),
         f"--node-files={nodes}",
@@ -86,6 +91,7 @@ def _netconvert(road: Road, folder: Path) -> Path:
         f"--output-file={made}",
         "--offset.disable-normalization=true",
         "--precision=6",
+        *extra,
         *road.netconvert_options,
     ]
     done = subprocess.run(command, capture_output=True, text=True, check=False)

@@ -65,6 +65,8 @@ class Workers:
         self.count = count
         self._silence = silence
         self._attempts = attempts
+        # Of all workers, so that nothing stays behind of one that was killed.
+        self._temporary = tempfile.TemporaryDirectory(prefix="unjam-")
         self._idle: queue.SimpleQueue[_Worker] = queue.SimpleQueue()
         self._all: list[_Worker] = []
         self._lock = threading.Lock()
@@ -73,7 +75,7 @@ class Workers:
             self._idle.put(self._new_worker())
 
     def _new_worker(self) -> "_Worker":
-        worker = _Worker(self._silence)
+        worker = _Worker(self._silence, self._temporary.name)
         with self._lock:
             self._all.append(worker)
         return worker
@@ -119,6 +121,7 @@ class Workers:
             for worker in self._all:
                 worker.stop()
         self._threads.shutdown(wait=True, cancel_futures=True)
+        self._temporary.cleanup()
 
     def __enter__(self) -> Self:
         return self
@@ -136,14 +139,16 @@ class _WorkerLost(Exception):
 class _Worker:
     """One worker process and the pipe to it."""
 
-    def __init__(self, silence: float) -> None:
+    def __init__(self, silence: float, temporary: str) -> None:
         self._silence = silence
+        self._temporary = temporary
         self._process: subprocess.Popen[bytes] | None = None
         self._stopped = False
 
     def _start(self) -> subprocess.Popen[bytes]:
         # A BLAS with threads of its own would fight with the other workers for the cores.
-        environment = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+        single = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+        environment = {**os.environ, **single, "TMPDIR": self._temporary}
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115  (lives as long as the process)
         process = subprocess.Popen(
             [sys.executable, "-m", "unjam.traffic.worker"],

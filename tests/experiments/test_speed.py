@@ -1,0 +1,65 @@
+import os
+from collections.abc import Iterator
+
+import pytest
+
+from unjam.drivers import PISaturation
+from unjam.drivers.check import check_driver
+from unjam.experiments import speed
+from unjam.experiments.speed import measure_speed, neural_driver
+
+RATES = ("bare_steps_per_s", "episode_steps_per_s", "traci_steps_per_s", "every_step_steps_per_s")
+
+
+@pytest.fixture
+def short(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Measures less, and so less exactly."""
+    monkeypatch.setattr(speed, "TRACI_STEPS", 50)
+    monkeypatch.setattr(speed, "SIZES", {22: 200, 66: 100})
+
+
+@pytest.fixture(autouse=True)
+def cores() -> Iterator[None]:
+    """Gives the other tests back the cores that they had."""
+    if not hasattr(os, "sched_setaffinity"):
+        yield
+        return
+    before = os.sched_getaffinity(0)
+    yield
+    os.sched_setaffinity(0, before)
+
+
+@pytest.mark.parametrize("hold", [1, 10])
+def test_the_driver_that_is_timed_keeps_the_contract(hold: int) -> None:
+    driver = neural_driver(hold)
+    check_driver(driver)
+    assert driver.expert == PISaturation()
+    assert driver.hold == hold
+    assert [weight.shape for weight, _ in driver.network.layers] == [(5, 64), (64, 64), (64, 1)]
+
+
+@pytest.mark.usefixtures("short")
+def test_measures_rates_and_their_ratios() -> None:
+    told: list[str] = []
+    found = measure_speed(1, told.append)
+    assert found["rounds"] == 1
+    assert min(found[name] for name in RATES) > 0
+    assert found["over_bare"] == pytest.approx(found["episode_steps_per_s"] / found["bare_steps_per_s"])
+    assert found["over_bare_every_step"] == pytest.approx(
+        found["every_step_steps_per_s"] / found["bare_steps_per_s"]
+    )
+    assert found["over_traci"] > 2.0
+    costs = [entry["us_per_vehicle_step"] for entry in found["scaling"]]
+    assert [entry["vehicles"] for entry in found["scaling"]] == [22, 66]
+    assert found["growth"] == max(costs) / costs[0]
+    assert told == ["round 1 of 1", "larger roads"]
+
+
+@pytest.mark.usefixtures("short")
+@pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="no choice of cores here")
+def test_a_measurement_gives_back_the_cores_that_it_did_not_use() -> None:
+    before = os.sched_getaffinity(0)
+    if len(before) < 2:
+        pytest.skip("a single core")
+    measure_speed(1)
+    assert os.sched_getaffinity(0) == before

@@ -1,0 +1,410 @@
+import hashlib
+import io
+import json
+import pickle
+import struct
+import tempfile
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from safetensors.numpy import save
+
+from unjam.controller import (
+    FORMAT,
+    LARGEST_PART,
+    MANIFEST,
+    WEIGHTS,
+    controller_bytes,
+    load_controller,
+    make_driver,
+)
+from unjam.drivers import IDM, FollowerStopper, PISaturation, ResidualDriver
+from unjam.drivers.check import random_state
+from unjam.drivers.driver import Driver
+from unjam.drivers.from_file import FileDriver
+from unjam.drivers.network import network_arrays
+from unjam.drivers.registry import recipe_of
+from unjam.drivers.residual import observation_size
+from unjam.errors import InputError
+
+from .conftest import random_network
+
+ALL_PARTS = ("local", "expert_acceleration", "expert_memory", "loop_length")
+ABOUT = {"scenario": "ring", "iteration": 3}
+
+
+def residual(expert: Driver, seed: int = 0, hold: int = 1) -> ResidualDriver:
+    network = random_network(observation_size(ALL_PARTS, expert), seed)
+    return ResidualDriver(expert, network, 1.0, ALL_PARTS, hold)
+
+
+def actions(driver: Driver) -> np.ndarray:
+    generator, memory, found = np.random.default_rng(0), driver.initial_memory(3), []
+    for _ in range(30):
+        acceleration, memory = driver.act(random_state(generator, 3), memory)
+        found.append(acceleration)
+    return np.array(found)
+
+
+def written(folder: Path, content: bytes) -> Path:
+    path = folder / "it.unjam"
+    path.write_bytes(content)
+    return path
+
+
+def refused(path: Path) -> str:
+    """The one line with which a controller is refused."""
+    with pytest.raises(InputError) as caught:
+        load_controller(path)
+    line = str(caught.value)
+    assert "\n" not in line
+    assert line.startswith("controller")
+    return line
+
+
+def parts_of(content: bytes) -> tuple[dict[str, Any], bytes]:
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        return json.loads(archive.read(MANIFEST)), archive.read(WEIGHTS)
+
+
+def archive_of(**parts: bytes | str) -> bytes:
+    content = io.BytesIO()
+    with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
+        for name, part in parts.items():
+            archive.writestr({"manifest": MANIFEST, "weights": WEIGHTS}.get(name, name), part)
+    return content.getvalue()
+
+
+def with_weights(weights: bytes, change: Callable[[dict[str, Any]], object] = lambda manifest: None) -> bytes:
+    """A controller whose hash fits its weights, whatever they are."""
+    manifest, _ = parts_of(controller_bytes(residual(IDM()), ABOUT))
+    manifest["sha256"][WEIGHTS] = hashlib.sha256(weights).hexdigest()
+    change(manifest)
+    return archive_of(manifest=json.dumps(manifest), weights=weights)
+
+
+def with_manifest(change: Callable[[dict[str, Any]], object]) -> bytes:
+    return with_weights(save(recipe_of(residual(IDM()))[1]), change)
+
+
+@pytest.mark.parametrize(
+    "driver",
+    [
+        PISaturation(window=20),
+        residual(PISaturation()),
+        residual(FollowerStopper(), hold=7),
+        residual(residual(residual(PISaturation(), 1, hold=3), 2), 3, hold=5),
+    ],
+    ids=["expert", "residual", "held residual", "residual of a residual of a residual"],
+)
+def test_a_controller_acts_as_the_driver_it_was_made_of(tmp_path: Path, driver: Driver) -> None:
+    loaded = load_controller(written(tmp_path, controller_bytes(driver, ABOUT)))
+    np.testing.assert_array_equal(actions(loaded), actions(driver))
+    assert type(loaded) is type(driver)
+
+
+def test_the_networks_of_a_nested_residual_are_not_mixed_up(tmp_path: Path) -> None:
+    inner = residual(IDM(), 1)
+    driver = residual(inner, 2)
+    loaded = load_controller(written(tmp_path, controller_bytes(driver, ABOUT)))
+    assert isinstance(loaded, ResidualDriver)
+    assert isinstance(loaded.expert, ResidualDriver)
+    for found, given_ in ((loaded.network, driver.network), (loaded.expert.network, inner.network)):
+        for name, array in network_arrays(given_).items():
+            np.testing.assert_array_equal(network_arrays(found)[name], array)
+        assert (found.authority, found.exploration_std) == (given_.authority, given_.exploration_std)
+
+
+def test_the_same_driver_has_the_same_bytes(tmp_path: Path) -> None:
+    content = controller_bytes(residual(PISaturation()), ABOUT)
+    assert controller_bytes(residual(PISaturation()), ABOUT) == content
+    assert controller_bytes(load_controller(written(tmp_path, content)), ABOUT) == content
+    assert controller_bytes(residual(PISaturation(), seed=1), ABOUT) != content
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        assert {part.date_time for part in archive.infolist()} == {(1980, 1, 1, 0, 0, 0)}  # no matter when
+
+
+def test_the_manifest_says_what_it_is() -> None:
+    manifest, weights = parts_of(controller_bytes(residual(IDM()), ABOUT))
+    assert manifest["format"] == FORMAT
+    assert manifest["scenario"] == "ring"
+    assert manifest["iteration"] == 3
+    assert manifest["driver"]["expert"]["name"] == "idm"
+    assert manifest["sha256"] == {WEIGHTS: hashlib.sha256(weights).hexdigest()}
+
+
+def test_an_expert_of_the_users_own_is_named_with_the_hash_of_its_file(my_drivers: Path) -> None:
+    manifest, _ = parts_of(controller_bytes(residual(FileDriver(my_drivers, "gentle")), ABOUT))
+    assert manifest["driver"]["expert"]["path"] == str(my_drivers)
+    assert hashlib.sha256(my_drivers.read_bytes()).hexdigest() in json.dumps(manifest)
+
+
+def test_an_expert_of_the_users_own_works_and_its_loss_is_told(tmp_path: Path, my_drivers: Path) -> None:
+    driver = residual(FileDriver(my_drivers, "gentle"))
+    path = written(tmp_path, controller_bytes(driver, ABOUT))
+    np.testing.assert_array_equal(actions(load_controller(path)), actions(driver))
+    my_drivers.unlink()
+    with pytest.raises(InputError, match=r"mine\.py' is not a file"):
+        load_controller(path)
+
+
+def test_changed_weights_are_noticed(tmp_path: Path) -> None:
+    manifest, weights = parts_of(controller_bytes(residual(IDM()), ABOUT))
+    changed = bytearray(weights)
+    changed[-3] ^= 1
+    content = archive_of(manifest=json.dumps(manifest), weights=bytes(changed))
+    assert "damaged: its weights do not have the hash it names" in refused(written(tmp_path, content))
+
+
+@settings(max_examples=300)
+@given(place=st.floats(0, 1, exclude_max=True), bits=st.integers(1, 255))
+def test_a_changed_byte_is_refused_or_changes_nothing(place: float, bits: int) -> None:
+    driver = residual(PISaturation())
+    content = bytearray(controller_bytes(driver, ABOUT))
+    content[int(place * len(content))] ^= bits
+    with tempfile.TemporaryDirectory() as folder:
+        try:
+            loaded = load_controller(written(Path(folder), bytes(content)))
+        except InputError:
+            return
+    assert controller_bytes(loaded, ABOUT) == controller_bytes(driver, ABOUT)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.01, 0.3, 0.5, 0.9, 0.99])
+def test_a_file_cut_short_is_refused(tmp_path: Path, share: float) -> None:
+    content = controller_bytes(residual(IDM()), ABOUT)
+    assert "not a controller" in refused(written(tmp_path, content[: int(share * len(content))]))
+
+
+def test_bytes_before_the_archive_do_no_harm_and_none_are_run(tmp_path: Path) -> None:
+    driver = residual(IDM())
+    content = b"#!/bin/sh\ntouch run\n" + controller_bytes(driver, ABOUT)
+    np.testing.assert_array_equal(actions(load_controller(written(tmp_path, content))), actions(driver))
+    assert not (tmp_path / "run").exists()
+
+
+DIRECTORY = b"PK\x01\x02"
+"""how an entry of a zip archive's directory begins"""
+
+
+@pytest.mark.parametrize(
+    ("offset", "kind", "value"),
+    [
+        (8, "<H", 1),
+        (10, "<H", 8),
+        (10, "<H", 12),
+        (10, "<H", 14),
+        (10, "<H", 77),
+        (24, "<I", 10),
+        (42, "<I", 2**31),
+        (42, "<I", 2**32 - 1),
+    ],
+    ids=[
+        "encrypted",
+        "deflated, it says",
+        "bzip2, it says",
+        "lzma, it says",
+        "unknown compression",
+        "smaller than it is",
+        "beyond the end",
+        "far beyond the end",
+    ],
+)
+@pytest.mark.parametrize("part", [0, 1])
+def test_an_archive_that_lies_about_a_part_is_refused(
+    tmp_path: Path, part: int, offset: int, kind: str, value: int
+) -> None:
+    content = bytearray(controller_bytes(residual(IDM()), ABOUT))
+    entry = content.index(DIRECTORY)
+    if part == 1:
+        entry = content.index(DIRECTORY, entry + 1)
+    struct.pack_into(kind, content, entry + offset, value)
+    refused(written(tmp_path, bytes(content)))
+
+
+@pytest.mark.parametrize("content", [b"", b"nonsense", b"PK\x03\x04 not really", bytes(1000)])
+def test_what_is_no_archive_is_refused(tmp_path: Path, content: bytes) -> None:
+    assert "controller it.unjam: not a controller" in refused(written(tmp_path, content))
+
+
+def test_an_archive_without_a_part_is_refused(tmp_path: Path) -> None:
+    manifest, weights = parts_of(controller_bytes(residual(IDM()), ABOUT))
+    assert WEIGHTS in refused(written(tmp_path, archive_of(manifest=json.dumps(manifest))))
+    assert MANIFEST in refused(written(tmp_path, archive_of(weights=weights)))
+    refused(written(tmp_path, archive_of()))
+
+
+@pytest.mark.parametrize("part", ["manifest", "weights"])
+def test_a_part_that_unpacks_to_too_much_is_refused(tmp_path: Path, part: str) -> None:
+    manifest, weights = parts_of(controller_bytes(residual(IDM()), ABOUT))
+    parts = {"manifest": json.dumps(manifest).encode(), "weights": weights, part: bytes(LARGEST_PART + 1)}
+    path = written(tmp_path, archive_of(**parts))
+    assert path.stat().st_size < LARGEST_PART / 100
+    assert f"{LARGEST_PART + 1} bytes; allowed: at most {LARGEST_PART}" in refused(path)
+
+
+@pytest.mark.parametrize("manifest", ["", "{", "[]", "3", "null", "{}", '"format"', "\xff", '{"format": 1}'])
+def test_a_manifest_that_is_none_is_refused(tmp_path: Path, manifest: str) -> None:
+    content = archive_of(manifest=manifest.encode("latin-1"), weights=save({"x": np.zeros(1)}))
+    refused(written(tmp_path, content))
+
+
+@pytest.mark.parametrize("number", [0, 2, "1", None, [1]])
+def test_another_format_is_refused(tmp_path: Path, number: object) -> None:
+    content = with_manifest(lambda manifest: manifest.update(format=number))
+    assert f"format {number!r} is unknown" in refused(written(tmp_path, content))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"kind": "magic"},
+        {"kind": None},
+        {"kind": "named", "name": "magic", "parameters": {}},
+        {"kind": "named", "name": ["pi"], "parameters": {}},
+        {"kind": "named", "name": "pi", "parameters": {"window": -1}},
+        {"kind": "named", "name": "pi", "parameters": {"charm": 1}},
+        {"kind": "named", "name": "pi", "parameters": 3},
+        {"expert": None},
+        {"expert": "pi"},
+        {"expert": []},
+        {"parts": ["stars"]},
+        {"parts": []},
+        {"parts": 3},
+        {"hold": 0},
+        {"hold": 2.5},
+        {"hold": "long"},
+        {"action_limit": -1.0},
+        {"action_limit": float("nan")},
+        {"action_limit": "much"},
+        {"authority": float("inf")},
+        {"authority": "all"},
+        {"exploration_std": float("nan")},
+        {"exploration_std": None},
+    ],
+    ids=str,
+)
+def test_a_recipe_that_makes_no_sense_is_refused(tmp_path: Path, change: dict[str, Any]) -> None:
+    path = written(tmp_path, with_manifest(lambda manifest: manifest["driver"].update(change)))
+    with pytest.raises(InputError) as caught:
+        load_controller(path)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("recipe", [None, [], "pi", 3])
+def test_a_recipe_that_is_no_table_is_refused(tmp_path: Path, recipe: object) -> None:
+    with pytest.raises(InputError) as caught:
+        load_controller(written(tmp_path, with_manifest(lambda manifest: manifest.update(driver=recipe))))
+    assert "\n" not in str(caught.value)
+
+
+def test_a_recipe_of_endless_depth_is_refused(tmp_path: Path) -> None:
+    manifest = '{"format": 1, "driver": ' + '{"expert": ' * 100_000 + "1" + "}" * 100_001
+    refused(written(tmp_path, archive_of(manifest=manifest, weights=save({"x": np.zeros(1)}))))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"1.weight": np.zeros((3, 16))},
+        {"1.bias": np.zeros(3)},
+        {"0.weight": np.zeros(16)},
+        {"2.weight": np.zeros((16, 2)), "2.bias": np.zeros(2)},
+        {"1.bias": np.full(16, np.nan)},
+        {"1.bias": np.full(16, np.inf)},
+        {"0.weight": np.zeros((3, 16))},
+    ],
+    ids=["inputs", "bias", "dimensions", "outputs", "nan", "infinite", "not what it observes"],
+)
+def test_weights_of_a_wrong_shape_or_not_finite_are_refused(
+    tmp_path: Path, change: dict[str, np.ndarray]
+) -> None:
+    arrays = {**recipe_of(residual(IDM()))[1], **change}
+    with pytest.raises(InputError) as caught:
+        load_controller(written(tmp_path, with_weights(save(arrays))))
+    assert "\n" not in str(caught.value)
+
+
+def test_weights_that_are_missing_are_refused(tmp_path: Path) -> None:
+    arrays = recipe_of(residual(IDM()))[1]
+    del arrays["1.bias"]
+    with pytest.raises(InputError, match="network layer 1"):
+        load_controller(written(tmp_path, with_weights(save(arrays))))
+
+
+class Trap:
+    """Makes a file when it is unpickled."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Path.touch, (self.path,)
+
+
+@pytest.mark.parametrize("part", ["weights", "manifest", "data.pkl"])
+def test_a_pickle_inside_is_never_run(tmp_path: Path, part: str) -> None:
+    sprung = tmp_path / "sprung"
+    trap = pickle.dumps(Trap(sprung))
+    manifest, weights = parts_of(
+        with_weights(trap if part == "weights" else save(recipe_of(residual(IDM()))[1]))
+    )
+    parts = {"manifest": json.dumps(manifest).encode(), "weights": weights, part: trap}
+    path = written(tmp_path, archive_of(**parts))
+    if part == "data.pkl":
+        np.testing.assert_array_equal(actions(load_controller(path)), actions(residual(IDM())))
+    else:
+        assert "not a controller" in refused(path)
+    assert not sprung.exists()
+
+
+def test_a_part_named_outside_the_archive_is_not_unpacked(tmp_path: Path) -> None:
+    folder = tmp_path / "inner"
+    folder.mkdir()
+    content = io.BytesIO(controller_bytes(residual(IDM()), ABOUT))
+    with zipfile.ZipFile(content, "a") as archive:
+        archive.writestr("../escaped", "out")
+    load_controller(written(folder, content.getvalue()))
+    assert [path.name for path in tmp_path.iterdir()] == ["inner"]
+
+
+def test_a_run_folder_stands_for_its_controller(tmp_path: Path) -> None:
+    driver = residual(PISaturation())
+    (tmp_path / "controller.unjam").write_bytes(controller_bytes(driver, ABOUT))
+    for made in (load_controller(tmp_path), load_controller(str(tmp_path)), make_driver(str(tmp_path), 0.1)):
+        np.testing.assert_array_equal(actions(made), actions(driver))
+
+
+def test_what_is_not_there_is_refused(tmp_path: Path) -> None:
+    assert "does not exist" in refused(tmp_path / "none.unjam")
+    assert "controller.unjam' does not exist" in refused(tmp_path)
+
+
+def test_a_driver_is_made_from_its_name_file_or_path(
+    tmp_path: Path, my_drivers: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = written(tmp_path, controller_bytes(residual(IDM()), ABOUT))
+    assert make_driver("pi", 0.1) == PISaturation()
+    assert make_driver("pi", 0.5) == PISaturation(time_step=0.5)
+    assert make_driver("pi:window=30,time_constant=0", 0.1) == PISaturation(window=30, time_constant=0)
+    assert make_driver(f"{my_drivers}:gentle", 0.1) == FileDriver(my_drivers, "gentle")
+    np.testing.assert_array_equal(actions(make_driver(str(path), 0.1)), actions(residual(IDM())))
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "pi").mkdir()  # a folder does not hide a driver of its name
+    assert make_driver("pi", 0.1) == PISaturation()
+
+
+@pytest.mark.parametrize("text", ["", "nobody", "runs/none", "pi:speed=1", "none.unjam", "pi:window=0"])
+def test_what_names_no_driver_is_refused_in_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError) as caught:
+        make_driver(text, 0.1)
+    assert "\n" not in str(caught.value)

@@ -1,0 +1,209 @@
+"""What may import what: the order of the layers, and which packages stay out of which of them."""
+
+import ast
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import unjam
+
+SOURCE = Path(unjam.__file__).parent
+MODULES = {path.relative_to(SOURCE).as_posix(): ast.parse(path.read_text()) for path in SOURCE.rglob("*.py")}
+
+ORDER = ("physics", "drivers", "scenarios", "traffic", "virtual", "agents", "experiments", "cli")
+"""each may import those before it, and none after it"""
+EVERYWHERE = {"", "errors", "files", "parameters"}
+"""what has no place in the order: it imports none of the layers"""
+ALLOWED = {
+    "controller": {"drivers"},
+    "reports": {"physics", "drivers", "scenarios", "traffic"},
+    "experiments": {"controller", "reports"},
+    "cli": {"controller", "reports"},
+}
+"""what else a part may import"""
+LAZY = {"__init__": {"controller", "drivers", "experiments", "reports", "traffic"}, "__main__": {"cli"}}
+TORCH = {"torch", "stable_baselines3", "sb3_contrib"}
+LONGEST = 300
+
+
+def imported(tree: ast.AST) -> Iterator[str]:
+    """Every module that is imported, wherever in the file, in whatever way."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, "imports name the whole module"
+            assert node.module is not None
+            yield node.module
+            if node.module == "unjam":
+                yield from (f"unjam.{alias.name}" for alias in node.names if not alias.name.startswith("__"))
+        elif isinstance(node, ast.Call) and name_of(node.func) in ("import_module", "__import__"):
+            yield from texts_of(node.args[0], tree)
+
+
+def texts_of(argument: ast.expr, tree: ast.AST) -> list[str]:
+    """The module names that the argument of an import at run time can be."""
+    if isinstance(argument, ast.Constant):
+        return [str(argument.value)]
+    if isinstance(argument, ast.Subscript) and isinstance(argument.value, ast.Name):
+        named = argument.value.id
+    elif isinstance(argument, ast.Name):
+        named = argument.id
+    else:
+        raise AssertionError(f"cannot tell what is imported by {ast.unparse(argument)}")
+    return [
+        constant.value
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Assign) and any(name_of(target) == named for target in node.targets)
+        for constant in ast.walk(node.value)
+        if isinstance(constant, ast.Constant) and isinstance(constant.value, str)
+    ]
+
+
+def name_of(node: ast.expr) -> str:
+    return node.attr if isinstance(node, ast.Attribute) else node.id if isinstance(node, ast.Name) else ""
+
+
+def part_of(module: str) -> str:
+    """The part of the package that a file or a dotted name of it belongs to."""
+    return module.removesuffix(".py").split("/")[0]
+
+
+def importers(packages: set[str]) -> set[str]:
+    """The files that import one of `packages` from outside."""
+    return {
+        module
+        for module, tree in MODULES.items()
+        if packages & {name.partition(".")[0] for name in imported(tree)}
+    }
+
+
+def own_imports(tree: ast.AST) -> set[str]:
+    """The parts of the package that a file imports."""
+    names = [name for name in imported(tree) if name.partition(".")[0] == "unjam"]
+    return {(*name.split("."), "")[1] for name in names}
+
+
+def allowed_parts(part: str) -> set[str]:
+    if part in LAZY:
+        return LAZY[part]
+    before = set(ORDER[: ORDER.index(part) + 1]) if part in ORDER else {part}
+    return EVERYWHERE | before | ALLOWED.get(part, set())
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_a_module_imports_only_what_lies_below_it(module: str) -> None:
+    assert own_imports(MODULES[module]) <= allowed_parts(part_of(module))
+
+
+def test_what_all_may_import_imports_no_layer() -> None:
+    for part in EVERYWHERE - {""}:
+        assert own_imports(MODULES[f"{part}.py"]) <= EVERYWHERE
+
+
+def test_every_part_has_its_place() -> None:
+    known = {*ORDER, *ALLOWED, *EVERYWHERE, *LAZY}
+    assert {part_of(module) for module in MODULES} <= known
+
+
+def test_reports_read_folders_and_know_neither_agents_nor_experiments() -> None:
+    for module, tree in MODULES.items():
+        if part_of(module) == "reports":
+            assert not own_imports(tree) & {"agents", "experiments", "controller", "cli"}, module
+
+
+def test_sumo_is_imported_in_one_place() -> None:
+    assert importers({"libsumo", "traci", "sumolib"}) == {"traffic/simulation.py"}
+
+
+def test_learning_libraries_are_imported_only_where_we_learn() -> None:
+    found = importers(TORCH)
+    assert {part_of(module) for module in found} <= {"agents", "experiments", "virtual"}
+    assert "agents/policy.py" in found
+
+
+def test_only_the_command_line_prints_with_its_libraries() -> None:
+    found = importers({"typer", "rich", "click"})
+    assert {part_of(module) for module in found} == {"cli"}
+
+
+@pytest.mark.parametrize("package", ["pickle", "cloudpickle", "dill", "joblib", "marshal", "shelve", "yaml"])
+def test_nothing_reads_files_that_can_run_code(package: str) -> None:
+    assert importers({package}) == set()
+
+
+def calls(tree: ast.AST) -> Iterator[ast.Call]:
+    return (node for node in ast.walk(tree) if isinstance(node, ast.Call))
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_nothing_is_evaluated_and_no_shell_is_asked(module: str) -> None:
+    for call in calls(MODULES[module]):
+        if isinstance(call.func, ast.Name):
+            assert call.func.id not in ("eval", "exec", "compile", "execfile"), call.lineno
+        assert name_of(call.func) not in ("system", "popen"), call.lineno
+        for keyword in call.keywords:
+            if keyword.arg == "shell":
+                assert isinstance(keyword.value, ast.Constant), call.lineno
+                assert keyword.value.value is False, call.lineno
+            if keyword.arg == "allow_pickle":
+                assert isinstance(keyword.value, ast.Constant), call.lineno
+                assert keyword.value.value is False, call.lineno
+        if name_of(call.func) == "load" and ast.unparse(call.func).startswith("torch."):
+            raise AssertionError(f"{module}:{call.lineno}: torch.load unpickles")
+
+
+def test_a_users_file_is_run_in_one_place() -> None:
+    found = {
+        module
+        for module, tree in MODULES.items()
+        for call in calls(tree)
+        if name_of(call.func) == "exec_module"
+    }
+    assert found == {"drivers/from_file.py"}
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_a_file_can_be_read_at_one_sitting(module: str) -> None:
+    assert len((SOURCE / module).read_text().splitlines()) <= LONGEST
+
+
+def loaded_by(program: str) -> set[str]:
+    """The packages that are loaded after `program`, in a process of its own."""
+    lines = [program, "import sys", "print('loaded:', *sys.modules)"]
+    ran = subprocess.run(
+        [sys.executable, "-c", "\n".join(lines)], capture_output=True, text=True, timeout=120, check=True
+    )
+    return set(ran.stdout.rpartition("loaded:")[2].split())
+
+
+HELP = """
+from unjam.cli import app
+try:
+    app({arguments!r}, standalone_mode=True)
+except SystemExit as end:
+    assert not end.code, end.code
+"""
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["--version"], ["train", "--help"], ["drive", "--help"]])
+def test_help_loads_nothing_that_takes_time(arguments: list[str]) -> None:
+    found = loaded_by(HELP.format(arguments=arguments))
+    assert "typer" in found
+    assert not found & (TORCH | {"libsumo", "traci", "matplotlib", "pandas", "scipy"})
+
+
+@pytest.mark.parametrize(
+    "module", ["traffic.worker", "experiments.drive", "experiments.judge", "experiments.config", "controller"]
+)
+def test_what_learns_nothing_loads_no_learning_library(module: str) -> None:
+    found = loaded_by(f"import unjam.{module}")
+    assert f"unjam.{module}" in found
+    assert not found & TORCH
+
+
+def test_a_worker_loads_neither_tables_nor_pictures() -> None:
+    assert not loaded_by("import unjam.traffic.worker") & {"pandas", "matplotlib", "gymnasium"}

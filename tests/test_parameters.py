@@ -1,0 +1,122 @@
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pydantic import model_validator
+from pydantic.dataclasses import dataclass
+
+from unjam.errors import InputError
+from unjam.parameters import (
+    STRICT,
+    Count,
+    CountOrNone,
+    NotNegative,
+    Positive,
+    build,
+    parse_assignments,
+    parse_value,
+)
+
+
+@dataclass(frozen=True, config=STRICT)
+class Inner:
+    size: Count = 1
+
+
+@dataclass(frozen=True, config=STRICT)
+class Outer:
+    needed: float
+    positive: Positive = 1.0
+    share: NotNegative = 0.0
+    extra: CountOrNone = 0
+    inner: Inner = Inner()
+    names: tuple[str, ...] = ()
+
+    @model_validator(mode="after")
+    def _order(self) -> "Outer":
+        if self.extra > self.inner.size:
+            raise ValueError(f"extra: {self.extra} is not allowed; allowed: <= {self.inner.size}")
+        return self
+
+
+def test_builds_nested_parameters() -> None:
+    made = build(Outer, {"needed": 2, "inner": {"size": 3}, "names": ["a"], "extra": 3}, "here")
+    assert made == Outer(needed=2.0, inner=Inner(size=3), names=("a",), extra=3)
+    assert type(made.needed) is float
+
+
+@pytest.mark.parametrize(
+    ("values", "line"),
+    [
+        ({}, "here.needed: missing"),
+        ({"needed": 1, "other": 2}, "here.other: unknown name"),
+        ({"needed": 1, "inner": {"other": 2}}, "here.inner.other: unknown name"),
+        (
+            {"needed": "x"},
+            "here.needed: 'x' is not allowed; allowed: a valid number, unable to parse string as a number",
+        ),
+        ({"needed": 1, "positive": 0}, "here.positive: 0 is not allowed; allowed: greater than 0"),
+        ({"needed": 1, "share": -1}, "here.share: -1 is not allowed; allowed: greater than or equal to 0"),
+        (
+            {"needed": 1, "inner": {"size": 0}},
+            "here.inner.size: 0 is not allowed; allowed: greater than or equal to 1",
+        ),
+        ({"needed": float("nan")}, "here.needed: nan is not allowed; allowed: a finite number"),
+        ({"needed": 1, "extra": 2}, "here.extra: 2 is not allowed; allowed: <= 1"),
+        ({"needed": 1, "names": [1]}, "here.names.0: 1 is not allowed; allowed: a valid string"),
+    ],
+)
+def test_says_in_one_line_what_is_wrong(values: dict[str, Any], line: str) -> None:
+    with pytest.raises(InputError) as caught:
+        build(Outer, values, "here")
+    assert str(caught.value) == line
+
+
+def test_without_a_field_the_line_begins_with_the_name() -> None:
+    with pytest.raises(InputError) as caught:
+        build(Outer, {}, "")
+    assert str(caught.value) == "needed: missing"
+    with pytest.raises(InputError) as caught:
+        build(Outer, {"needed": 1, "extra": 2}, "")
+    assert str(caught.value) == "extra: 2 is not allowed; allowed: <= 1"
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("3", 3),
+        ("3.5", 3.5),
+        ("1e-3", 1e-3),
+        ("true", True),
+        ("[220, 270]", [220, 270]),
+        ("['a', \"b\"]", ["a", "b"]),
+        ("{time_headway = 1.3}", {"time_headway": 1.3}),
+        ("pi", "pi"),
+        ("pi:window=30", "pi:window=30"),
+        ("'3'", "3"),
+        ("", ""),
+        ("my driver.py:x", "my driver.py:x"),
+    ],
+)
+def test_reads_a_value_as_toml_does_and_else_as_text(text: str, value: object) -> None:
+    found = parse_value(text)
+    assert found == value
+    assert type(found) is type(value)
+
+
+def test_reads_assignments() -> None:
+    found = parse_assignments(["trpo.gamma=0.9", " seed = 3 ", "expert=pi:window=30"], "--set")
+    assert found == {"trpo.gamma": 0.9, "seed": 3, "expert": "pi:window=30"}
+
+
+@pytest.mark.parametrize("text", ["gamma", "=3", " =3", ""])
+def test_refuses_what_assigns_nothing(text: str) -> None:
+    with pytest.raises(InputError) as caught:
+        parse_assignments([text], "--set")
+    assert str(caught.value) == f"--set: {text!r} is not allowed; allowed: key=value"
+
+
+@given(st.integers() | st.booleans() | st.floats(allow_nan=False, allow_infinity=False))
+def test_numbers_come_back_as_they_were_written(value: float) -> None:
+    assert parse_value(str(value).lower()) == value

@@ -1,0 +1,47 @@
+import inspect
+import subprocess
+import sys
+
+import pytest
+
+import unjam
+
+
+@pytest.mark.parametrize("name", unjam.__all__)
+def test_each_public_name_is_there_and_explained(name: str) -> None:
+    found = getattr(unjam, name)
+    assert found.__name__ == name
+    assert len(inspect.getdoc(found) or "") > 20
+
+
+def test_every_name_that_can_be_imported_is_listed() -> None:
+    assert sorted(unjam._PLACES) == sorted(unjam.__all__)
+
+
+@pytest.mark.parametrize("name", ["drvie", "Ring", "_drive"])
+def test_an_unknown_name_is_an_attribute_error(name: str) -> None:
+    with pytest.raises(AttributeError, match=f"module 'unjam' has no attribute '{name}'"):
+        getattr(unjam, name)
+
+
+def test_importing_all_of_it_gives_all_of_it() -> None:
+    namespace: dict[str, object] = {}
+    exec("from unjam import *", namespace)
+    assert set(unjam.__all__) <= namespace.keys()
+
+
+def test_importing_it_alone_imports_nothing_heavy() -> None:
+    heavy = {"torch", "numpy", "libsumo", "matplotlib", "pandas"}
+    program = f"import sys, unjam; print(*({heavy!r} & set(sys.modules)))"
+    ran = subprocess.run([sys.executable, "-c", program], capture_output=True, timeout=60, check=True)
+    assert ran.stdout.strip() == b""
+
+
+def test_functions_name_the_types_of_what_they_take_and_return() -> None:
+    for name in unjam.__all__:
+        found = getattr(unjam, name)
+        if inspect.isfunction(found):
+            signature = inspect.signature(found)
+            untyped = [p.name for p in signature.parameters.values() if p.annotation is p.empty]
+            assert not untyped, f"{name}: {untyped}"
+            assert signature.return_annotation is not signature.empty, name
