@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 from typing import Any
 
-from unjam.errors import DISK_ERRNOS, disk_error
+from unjam.errors import DISK_ERRNOS, DiskError, disk_error
 
 
 def write_whole(path: Path, content: bytes | str) -> None:
@@ -35,6 +35,12 @@ def append_line(path: Path, line: str) -> None:
             file.write(line + "\n")
     except OSError as error:
         raise _disk(error, path) from None
+
+
+def check_folder(path: Path) -> None:
+    """Raise `DiskError` unless the folder that `path` would be written to is there."""
+    if not path.absolute().parent.is_dir():
+        raise DiskError(f"cannot write {path}: no such folder")
 
 
 def make_folder(path: Path) -> None:

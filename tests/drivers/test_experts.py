@@ -26,6 +26,8 @@ EXPERTS = [
     "lacc:lag=0.01",
     "bcm:desired_speed=4",
     "ovm",
+    "pacer",
+    "pacer:harmonics=[7,-0.8,0.7,-1.3,0.7]",
     "constant:acceleration=0.2",
 ]
 

@@ -53,7 +53,8 @@ def test_draws_are_scaled_over_their_range() -> None:
 
 
 def test_warmups_of_the_named_rings() -> None:
-    assert {name: scenario.warmup for name, scenario in SCENARIOS.items()} == {
+    rings = {name: scenario.warmup for name, scenario in SCENARIOS.items() if name.startswith("ring")}
+    assert rings == {
         "ring": 0,
         "ring-warm": 750,
         "ring-jammed": 6000,

@@ -50,6 +50,7 @@ def watch(
     from unjam.drivers.registry import describe
     from unjam.experiments.evaluate import raise_failure
     from unjam.experiments.watch import watch_in_window
+    from unjam.files import check_folder
     from unjam.reports.metrics import measure
     from unjam.reports.video import check_format, write_video
     from unjam.scenarios.registry import make_scenario
@@ -61,6 +62,7 @@ def watch(
         episode = watch_in_window(road, driven, (seed,), pace)
     else:
         check_format(video)
+        check_folder(video)
         aside.print("driving")
         with Workers(1) as workers:
             episode = workers.run([EpisodeTask(road, driven, (seed,))])[0]

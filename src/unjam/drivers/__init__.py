@@ -9,6 +9,7 @@ from unjam.drivers.follower_stopper import FollowerStopper
 from unjam.drivers.idm import IDM, Human
 from unjam.drivers.local_state import LocalState
 from unjam.drivers.ovm import OVM
+from unjam.drivers.pacer import Pacer
 from unjam.drivers.pi_saturation import PISaturation
 from unjam.drivers.registry import DRIVERS, describe
 from unjam.drivers.residual import ResidualDriver
@@ -27,6 +28,7 @@ __all__ = [
     "LocalState",
     "Memory",
     "PISaturation",
+    "Pacer",
     "ResidualDriver",
     "check_driver",
     "describe",

@@ -19,6 +19,7 @@ from unjam.drivers.idm import IDM, Human
 from unjam.drivers.local_state import ObservationPart
 from unjam.drivers.network import network_arrays, network_from_arrays
 from unjam.drivers.ovm import OVM
+from unjam.drivers.pacer import Pacer
 from unjam.drivers.pi_saturation import PISaturation
 from unjam.drivers.residual import ResidualDriver
 from unjam.errors import wrong
@@ -33,6 +34,7 @@ DRIVERS: dict[str, type[Driver]] = {
     "lacc": LACC,
     "bcm": BCM,
     "ovm": OVM,
+    "pacer": Pacer,
     "constant": Constant,
 }
 

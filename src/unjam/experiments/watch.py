@@ -22,7 +22,7 @@ def watch_in_window(scenario: Scenario, driver: Driver, seed: Sequence[int], pac
         raise MissingPartError(
             "watch: no display; write a film: --video FILE, or use xvfb-run unjam watch ..."
         )
-    delay = 1000.0 * scenario.simulation_step / pace
+    delay = 1000.0 / pace  # [ms] for a second of simulation, however many steps it has
     with Simulation(
         "gui", gui_options=("--start", "true", "--quit-on-end", "true", "--delay", str(delay))
     ) as window:

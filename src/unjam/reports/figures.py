@@ -3,6 +3,7 @@
 import base64
 import io
 from collections.abc import Sequence
+from itertools import cycle
 from typing import Any, Literal
 
 import numpy as np
@@ -93,6 +94,8 @@ def space_time(shown: Sequence[Shown], wide: bool = True) -> Figure:
             if number + columns >= count:
                 axes.set_xlabel("time [s]")
                 axes.tick_params(labelbottom=True)
+        panels[0, 0].set_xlim(0, max(episode.times[-1] for episode in shown))  # the panels share their axes
+        panels[0, 0].set_ylim(0, max(episode.loop_length for episode in shown))
         mappable = ScalarMappable(scale, SPEED_COLOURS)
         bar = figure.colorbar(
             mappable, ax=panels, location="right" if wide else "bottom", shrink=0.8, pad=0.02, aspect=30
@@ -125,8 +128,6 @@ def _trajectories(axes: Axes, episode: Shown, scale: Normalize) -> None:
             axes.add_collection(
                 LineCollection(list(segments[keep]), colors="#d7263d", linewidths=1.3, rasterized=True)
             )
-    axes.set_xlim(times[0], times[-1])
-    axes.set_ylim(0, episode.loop_length)
 
 
 def speed_and_gap(shown: Sequence[Shown], wide: bool = True) -> Figure:
@@ -166,7 +167,7 @@ def learning_curve(
     with rc_context(STYLE):
         figure = _figure(10.5 if wide else 4.4, 3.8)
         axes = figure.subplots()
-        for (label, rows), colour in zip(runs.items(), LINES[2:], strict=False):
+        for (label, rows), colour in zip(runs.items(), cycle(LINES[2:]), strict=False):
             steps = np.array([row["actual_steps"] for row in rows]) / 1000
             prefix = f"{label}: " if len(runs) > 1 else ""
             training = [row["return_mean"] for row in rows]
@@ -184,11 +185,13 @@ def learning_curve(
                 ms=3.5,
                 label=f"{prefix}validation, deterministic",
             )
-        for (label, value), style in zip(references.items(), ("--", ":", "-.", (0, (1, 3))), strict=False):
+        for (label, value), style in zip(
+            references.items(), cycle(("--", ":", "-.", (0, (1, 3)))), strict=False
+        ):
             axes.axhline(value, color=INK, lw=1.1, ls=style, label=label)
         axes.set_xlabel("actual simulator steps [thousands]")
         axes.set_ylabel("return of an episode")
-        axes.margins(x=0.01)
+        axes.margins(x=0.01, y=0.06)
         figure.legend(loc="outside upper left", ncols=3 if wide else 1, fontsize=9)
         return figure
 

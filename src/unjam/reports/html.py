@@ -13,7 +13,7 @@ from markupsafe import Markup, escape
 from matplotlib.figure import Figure
 
 from unjam import __version__
-from unjam.files import write_whole
+from unjam.files import check_folder, write_whole
 from unjam.reports.figures import (
     colour_table,
     data_uri,
@@ -25,7 +25,7 @@ from unjam.reports.figures import (
 )
 from unjam.reports.results import Results, Shown, command_to_repeat, read_results
 from unjam.reports.statistics import estimate
-from unjam.reports.story import Column, cards_of, columns_of, lead_of, notes_of, table_of, title_of
+from unjam.reports.story import Column, cards_of, columns_of, lead_of, names_of, notes_of, table_of, title_of
 from unjam.scenarios.scenario import VEHICLE_LENGTH
 
 REPLAY_SECONDS = 0.5
@@ -38,8 +38,9 @@ def write_report(folders: Sequence[Path], target: Path) -> Path:
 
     Raises:
         InputError: a folder holds no results.
-        DiskError: the page cannot be written.
+        DiskError: the page cannot be written, or there is no folder for it.
     """
+    check_folder(target)
     results = [read_results(folder) for folder in folders]
     write_whole(target, render(results))
     return target
@@ -56,17 +57,22 @@ def render(results: Sequence[Results]) -> str:
     )
     template = environment.from_string((page / "report.html").read_text(encoding="utf-8"))
     single = results[0] if len(results) == 1 else None
+    names = names_of(results)
     return template.render(
         version=__version__,
         title=title_of(results),
         lead=lead_of(single)
         if single
-        else " ".join(f"{result.folder.name}: {lead_of(result)}" for result in results),
-        notes=[note for result in results for note in notes_of(result)],
+        else " ".join(f"{name}: {lead_of(result)}" for name, result in zip(names, results, strict=True)),
+        notes=[
+            note if single else f"{name}: {note}"
+            for name, result in zip(names, results, strict=True)
+            for note in notes_of(result)
+        ],
         cards=cards_of(single) if single else [],
         pictures=pictures,
         picture=lambda name, text: _picture(pictures[name], text),
-        shown_drawn=", ".join(f"{key} {value:g}" for key, value in panels[0].drawn.items()) if panels else "",
+        panels_note=_panels_note(panels, len(columns)),
         learning_note="Validation uses fixed seeds and chooses the controller; the table uses other seeds.",
         columns=[column.name for column in columns],
         table=table_of(columns),
@@ -77,10 +83,10 @@ def render(results: Sequence[Results]) -> str:
             for row in column.rows
             if row["status"] == "failed"
         ),
-        sources=[_source(result) for result in results],
+        sources=[_source(result, name) for result, name in zip(results, names, strict=True)],
         style=Markup((page / "report.css").read_text(encoding="utf-8")),
         script=Markup((page / "replay.js").read_text(encoding="utf-8")),
-        replay_data=Markup(json.dumps(replay_data(panels)).replace("</", "<\\/")),
+        replay_data=Markup(json.dumps(replay_data(panels)).replace("<", "\\u003c")),
     )
 
 
@@ -89,12 +95,22 @@ def _renamed(column: Column) -> Shown:
     return Shown(**{**vars(column.shown), "driver": column.name})
 
 
+def _panels_note(panels: Sequence[Shown], drivers: int) -> str:
+    """Return what the panels have in common, and whether all drivers are among them."""
+    drawn = [", ".join(f"{key} {value:g} m" for key, value in episode.drawn.items()) for episode in panels]
+    if len(set(drawn)) == 1:
+        note = "the same traffic and seed in each panel" + (f" ({drawn[0]})" if drawn[0] else "")
+    else:
+        note = "different roads or traffic in the panels"
+    return note + (f"; the first {len(panels)} of {drivers} drivers" if len(panels) < drivers else "")
+
+
 def _table_note(columns: Sequence[Column]) -> str:
     counts = sorted({len(column.rows) for column in columns})
     episodes = " to ".join(str(count) for count in dict.fromkeys((counts[0], counts[-1])))
     return (
         f"Mean over {episodes} episodes, deterministic drivers, fixed seeds; in brackets the 95 % bootstrap "
-        "interval. Hold the pointer over a metric for its definition."
+        "interval."
     )
 
 
@@ -108,7 +124,8 @@ def _pictures(results: Sequence[Results], panels: Sequence[Shown]) -> dict[str, 
     if panels:
         add("space_time", "png", lambda wide: space_time(panels, wide))
         add("speed_and_gap", "svg", lambda wide: speed_and_gap(panels, wide))
-    runs = {result.folder.name: result.progress for result in results if result.progress}
+    named = zip(names_of(results), results, strict=True)
+    runs = {name: result.progress for name, result in named if result.progress}
     if runs:
         references = _references(results)
         add("learning_curve", "svg", lambda wide: learning_curve(runs, references, wide))
@@ -118,12 +135,19 @@ def _pictures(results: Sequence[Results], panels: Sequence[Shown]) -> dict[str, 
 
 
 def _references(results: Sequence[Results]) -> dict[str, float]:
-    """Return the returns of the drivers that do not learn."""
+    """Return the returns of drivers that do not learn.
+
+    The expert's is that on the validation seeds, from which the curve starts; the others were never driven
+    there, and have those of the held-out seeds.
+    """
     found: dict[str, float] = {}
     for result in results:
+        expert = result.about.get("expert", "none")
+        if result.progress and expert != "none":
+            found.setdefault(f"{expert}, validation", result.progress[0]["return_expert"])
         for label, rows in result.rows.items():
-            if label != result.trained:
-                found.setdefault(label, estimate([row["return"] for row in rows]).mean)
+            if label not in (result.trained, expert):
+                found.setdefault(f"{label}, held-out", estimate([row["return"] for row in rows]).mean)
     return found
 
 
@@ -133,7 +157,7 @@ def _picture(both: tuple[str, str], text: str) -> Markup:
     return Markup(f'<picture>{small}<img src="{wide}" alt="{escape(text)}"></picture>')
 
 
-def _source(result: Results) -> dict[str, Any]:
+def _source(result: Results, name: str) -> dict[str, Any]:
     about = result.about.get("manifest", {})
     packages = ", ".join(
         f"{name} {version}" for name, version in about.get("packages", {}).items() if version
@@ -142,7 +166,7 @@ def _source(result: Results) -> dict[str, Any]:
     made_with = f"unjam {about.get('unjam')}{commit}, Python {about.get('python')}, {packages}"
     facts = f"{made_with}; {about.get('started', '')}."
     return {
-        "name": result.folder.name,
+        "name": name,
         "command": command_to_repeat(result),
         "facts": facts,
         "config": result.config,
@@ -153,10 +177,11 @@ def replay_data(panels: Sequence[Shown]) -> dict[str, Any]:
     """Return what the page's replay needs: positions and speeds at a few frames a second."""
     if not panels:
         return {"drivers": []}
-    every = max(1, round(REPLAY_SECONDS / panels[0].step))
+    step = max(REPLAY_SECONDS, *(episode.step for episode in panels))
+    frames = 1 + int(max(episode.times[-1] for episode in panels) / step + 1e-9)
     return {
-        "step": panels[0].step * every,
-        "frames": min(len(episode.times[::every]) for episode in panels),
+        "step": step,
+        "frames": frames,
         "start": 0,
         "fastest": speed_scale(panels).vmax,
         "colours": colour_table(),
@@ -168,12 +193,18 @@ def replay_data(panels: Sequence[Shown]) -> dict[str, Any]:
                 "cavs": episode.cavs,
                 "loop_length": episode.loop_length,
                 "outline": np.round(episode.outline, 2).tolist(),
-                "positions": _base64(episode.positions[::every]),
-                "speeds": _base64(episode.speeds[::every]),
+                "positions": _base64(_frames(episode, episode.positions, step, frames)),
+                "speeds": _base64(_frames(episode, episode.speeds, step, frames)),
             }
             for episode in panels
         ],
     }
+
+
+def _frames(episode: Shown, values: np.ndarray, step: float, frames: int) -> np.ndarray:
+    """Return `values` at the moments of the replay; an episode that ended before stays as at its end."""
+    moments = np.round(np.arange(frames) * step / episode.step).astype(int)
+    return values[moments.clip(max=len(values) - 1)]
 
 
 def _base64(array: np.ndarray) -> str:

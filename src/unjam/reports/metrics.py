@@ -103,7 +103,8 @@ def mean_abs_accel(episode: Episode) -> float:
 def mean_abs_jerk(episode: Episode) -> float:
     """Mean absolute change of the CAV's actual acceleration per second [m/s3]."""
     speeds = [trajectory.states.speed for trajectory in episode.trajectories]
-    return float(np.mean([np.abs(np.diff(speed, 2)).mean() for speed in speeds]) / episode.step**2)
+    jerks = [np.abs(np.diff(speed, 2)).mean() for speed in speeds if len(speed) > 2]
+    return float(np.mean(jerks) / episode.step**2) if jerks else float("nan")
 
 
 def share_standing(episode: Episode) -> float:
@@ -203,8 +204,8 @@ class Metric:
 METRICS: dict[str, Metric] = {
     "mean_speed": Metric(mean_speed, "mean speed", "m/s"),
     "mean_speed_steady": Metric(mean_speed_steady, "mean speed, steady", "m/s"),
-    "speed_limit_ratio": Metric(speed_limit_ratio, "of the limit", "", 3),
-    "speed_limit_ratio_steady": Metric(speed_limit_ratio_steady, "of the limit, steady", "", 3),
+    "speed_limit_ratio": Metric(speed_limit_ratio, "mean speed / limit", "", 3),
+    "speed_limit_ratio_steady": Metric(speed_limit_ratio_steady, "mean speed / limit, steady", "", 3),
     "speed_std_fleet": Metric(speed_std_fleet, "speed std across vehicles", "m/s"),
     "speed_std_fleet_steady": Metric(speed_std_fleet_steady, "speed std across vehicles, steady", "m/s"),
     "share_standing": Metric(share_standing, "share of time standing", "", 3),

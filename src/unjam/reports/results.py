@@ -1,6 +1,7 @@
 """What a folder of results says: reports read folders, and nothing else."""
 
 import json
+import shlex
 import tomllib
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -8,6 +9,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from safetensors import SafetensorError
 from safetensors.numpy import load_file
 
 from unjam.errors import InputError
@@ -80,10 +82,12 @@ def read_results(folder: Path) -> Results:
         hint = "; go on with: unjam train --resume" if (folder / "config.toml").exists() else ""
         raise InputError(f"report: {str(folder)!r} has no evaluation.json{hint}")
     try:
-        about = json.loads(path.read_text())
-        arrays = load_file(folder / "shown.safetensors")
-    except (OSError, ValueError) as error:
-        raise InputError(f"report: {str(folder)!r} cannot be read: {error}") from None
+        return _results(folder, json.loads(path.read_text()), load_file(folder / "shown.safetensors"))
+    except (OSError, ValueError, LookupError, TypeError, AttributeError, SafetensorError) as error:
+        raise InputError(f"report: {str(folder)!r} cannot be read: {type(error).__name__}: {error}") from None
+
+
+def _results(folder: Path, about: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> Results:
     rows: dict[str, list[dict[str, Any]]] = {}
     for row in about.pop("rows"):
         rows.setdefault(row["driver"], []).append({key: _nan(value) for key, value in row.items()})
@@ -118,11 +122,7 @@ def _nan(value: Any) -> Any:
 def command_to_repeat(results: Results) -> str:
     """Return the command line that made a folder."""
     command = results.about.get("manifest", {}).get("command", [])
-    return " ".join(_quoted(str(word)) for word in command)
-
-
-def _quoted(word: str) -> str:
-    return f"'{word}'" if any(letter in word for letter in ' []*?$&|;<>(){}"') else word
+    return shlex.join(str(word) for word in command)
 
 
 def steps_of(config: str) -> int:

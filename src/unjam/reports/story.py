@@ -32,12 +32,29 @@ def columns_of(results: Sequence[Results]) -> list[Column]:
         only = results[0]
         return [Column(label, rows, only.shown.get(label)) for label, rows in only.rows.items()]
     columns: dict[str, Column] = {}
-    for result in results:
+    for result, folder in zip(results, names_of(results), strict=True):
         for label, rows in result.rows.items():
             mine = label == result.trained or result.trained is None
-            name = f"{result.folder.name}: {label}" if mine else label
+            name = f"{folder}: {label}" if mine else label
+            if name in columns and _episodes(columns[name].rows) != _episodes(rows):
+                name = f"{folder}: {label}"
             columns.setdefault(name, Column(name, rows, result.shown.get(label)))
     return list(columns.values())
+
+
+def _episodes(rows: Sequence[dict[str, Any]]) -> list[tuple[str, str]]:
+    """Return what tells the episodes of one driver from those on another road."""
+    return [(str(row["seed"]), str(row["return"])) for row in rows]
+
+
+def names_of(results: Sequence[Results]) -> list[str]:
+    """Return a name for each folder: as much of the end of its path as tells it from the others."""
+    paths = [result.folder.resolve().parts for result in results]
+    for length in range(1, max(map(len, paths)) + 1):
+        names = ["/".join(parts[-length:]) for parts in paths]
+        if len(set(names)) == len(names):
+            return names
+    return [str(result.folder) for result in results]
 
 
 def title_of(results: Sequence[Results]) -> str:
@@ -46,23 +63,26 @@ def title_of(results: Sequence[Results]) -> str:
     if len(results) > 1:
         return f"{names}: {len(results)} results compared"
     only = results[0]
-    return (
-        f"{names}: a trained residual on {only.about['expert']}"
-        if only.trained
-        else f"{names}: {', '.join(only.rows)}"
-    )
+    if only.trained is None:
+        return f"{names}: {', '.join(only.rows)}"
+    expert = only.about["expert"]
+    return f"{names}: a trained " + ("network" if expert == "none" else f"residual on {expert}")
 
 
 def lead_of(result: Results) -> str:
     """Return the main finding of a folder in a sentence or two, whichever way it went."""
     if result.trained is None:
+        if len(result.rows) > 1:
+            return _lead_of_several(result)
         label, rows = next(iter(result.rows.items()))
         speed, ratio = (
             estimate([row[name] for row in rows]) for name in ("mean_speed", "speed_limit_ratio_steady")
         )
+        if speed.count == 0:
+            return f"{label} on {result.about['scenario']}: all {len(rows)} episodes failed."
         return (
             f"{label} on {result.about['scenario']}, {len(rows)} episodes: all vehicles drive "
-            f"{speed.mean:.2f} m/s on average, and in steady state {100 * ratio.mean:.0f} % of the limit."
+            f"{speed.mean:.2f} m/s on average, and in steady state {100 * ratio.mean:.0f} % of the limit."
         )
     trained, expert = result.rows[result.trained], result.rows.get(result.about["expert"])
     if expert is None:
@@ -70,7 +90,9 @@ def lead_of(result: Results) -> str:
         return f"On {len(trained)} held-out seeds the trained controller earns {earned.mean:.0f} an episode."
     gain = paired_difference(trained, expert, "return")
     means = [estimate([row["return"] for row in rows]).mean for rows in (trained, expert)]
-    if gain.low > 0:
+    if np.isnan(gain.low):
+        verdict = "One seed has no interval: it shows nothing."
+    elif gain.low > 0:
         verdict = "The residual pays."
     elif gain.high < 0:
         verdict = "The residual makes it worse."
@@ -82,14 +104,33 @@ def lead_of(result: Results) -> str:
     )
 
 
+def _lead_of_several(result: Results) -> str:
+    """Return how fast all vehicles drive with each driver."""
+    found = {
+        label: estimate([row["speed_limit_ratio_steady"] for row in rows])
+        for label, rows in result.rows.items()
+    }
+    words = ", ".join(
+        f"{label} {100 * ratio.mean:.0f}\u00a0%" if ratio.count else f"{label} failed"
+        for label, ratio in found.items()
+    )
+    return f"Mean speed of all vehicles in steady state on {result.about['scenario']}, of the limit: {words}."
+
+
 def signed(gain: Estimate) -> str:
-    """Return a difference with its sign and interval."""
+    """Return a difference with its sign and, where it has one, its interval."""
+    if np.isnan(gain.low):
+        return f"{gain.mean:+.0f}"
     return f"{gain.mean:+.0f} [{gain.low:+.0f}, {gain.high:+.0f}]"
 
 
 def notes_of(result: Results) -> list[str]:
     """Return what a reader should know before trusting the main finding."""
-    label = result.trained or next(iter(result.rows))
+    labels = [result.trained] if result.trained else list(result.rows)
+    return [note for label in labels for note in _notes_of(result, label)]
+
+
+def _notes_of(result: Results, label: str) -> list[str]:
     rows = [row for row in result.rows[label] if row["status"] != "failed"]
     notes = []
     crashes = sum(row["status"] == "collision" for row in rows)
@@ -106,14 +147,14 @@ def notes_of(result: Results) -> list[str]:
     ratio = estimate([row["speed_limit_ratio_steady"] for row in rows]).mean
     if ratio > BEYOND_LIMIT:
         notes.append(
-            f"With {label} all vehicles drive at {100 * ratio:.0f} % of the limit, which is how fast people "
+            f"With {label} all vehicles drive at {100 * ratio:.0f} % of the limit, which is how fast people "
             "alone could drive alike: the CAV keeps a smaller gap than they would."
         )
     leaning = estimate([row["shield_override_share"] for row in rows]).mean
     if leaning > 0.01:
         hardest = max(row["shield_max_braking"] for row in rows)
         notes.append(
-            f"{label} leans on the simulator's safety check: it overrides {100 * leaning:.1f} % of commands, "
+            f"{label} leans on the simulator's safety check: it overrides {100 * leaning:.1f} % of commands, "
             f"braking up to {hardest:.1f} m/s² harder than asked."
         )
     return notes
@@ -124,28 +165,24 @@ def cards_of(result: Results) -> list[dict[str, str]]:
     label = result.trained or next(iter(result.rows))
     rows = result.rows[label]
 
-    def mean(name: str, of: list[dict[str, Any]] = rows) -> float:
-        return estimate([row[name] for row in of]).mean
-
     human = [] if label == "human" else result.rows.get("human", [])
 
-    def beside(name: str, form: str) -> str:
-        return f"all-human: {format(mean(name, human), form)}" if human else label
+    def card(title: str, name: str, digits: int, unit: str, scale: float = 1.0) -> dict[str, str]:
+        def mean(of: list[dict[str, Any]]) -> str:
+            found = estimate([row[name] for row in of])
+            return f"{scale * found.mean:.{digits}f} {unit}" if found.count else "–"
 
-    ratio = "speed_limit_ratio_steady"
+        return _card(title, mean(rows), f"all-human: {mean(human)}" if human else label)
+
     cards = [
-        _card("Mean speed of the limit, steady", f"{100 * mean(ratio):.0f} %", beside(ratio, ".0%")),
-        _card(
-            "Speed std across vehicles, steady",
-            f"{mean('speed_std_fleet_steady'):.2f} m/s",
-            beside("speed_std_fleet_steady", ".2f"),
-        ),
-        _card("Fuel", f"{mean('fuel_ml_per_km'):.0f} ml/km", beside("fuel_ml_per_km", ".0f")),
+        card("Mean speed / limit, steady", "speed_limit_ratio_steady", 0, "%", 100.0),
+        card("Speed std across vehicles, steady", "speed_std_fleet_steady", 2, "m/s"),
+        card("Fuel", "fuel_ml_per_km", 0, "ml/km"),
     ]
     expert = result.rows.get(result.about.get("expert", ""))
     if result.trained and expert is not None:
         gain = paired_difference(rows, expert, "return")
-        detail = f"95 % interval {gain.low:+.0f} to {gain.high:+.0f}"
+        detail = "of one seed" if np.isnan(gain.low) else f"95 % interval {gain.low:+.0f} to {gain.high:+.0f}"
         cards.insert(0, _card("Return beyond the expert", f"{gain.mean:+.0f}", detail))
     return cards
 

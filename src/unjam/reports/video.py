@@ -7,6 +7,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from unjam.errors import InputError, MissingPartError
+from unjam.files import check_folder
 from unjam.reports.figures import colour_table
 from unjam.scenarios.scenario import VEHICLE_LENGTH
 from unjam.traffic.record import Episode
@@ -27,15 +28,21 @@ def write_video(episode: Episode, path: Path, title: str, pace: float = 10.0) ->
 
     Raises:
         InputError: another kind of file.
+        DiskError: there is no folder for it.
         MissingPartError: .mp4 without the extra `video`.
     """
     check_format(path)
-    frames = _frames(episode, title, pace)
+    check_folder(path)
+    every = max(1, round(pace / FRAMES_PER_SECOND / episode.step))
+    frames = _frames(episode, title, every)
+    seconds = every * episode.step / pace
     if path.suffix.lower() == ".mp4":
-        _write_mp4(frames, path)
+        _write_mp4(frames, path, 1 / seconds)
         return
-    first, *rest = frames
-    first.save(path, save_all=True, append_images=rest, duration=1000 // FRAMES_PER_SECOND, loop=0)
+    # A .gif counts in hundredths of a second: rounded one by one they would not add up to the whole.
+    ends = np.round(100 * seconds * np.arange(1, 2 + (len(episode.speeds) - 1) // every))
+    durations = (10 * np.diff(ends, prepend=0)).astype(int).tolist()
+    next(frames).save(path, save_all=True, append_images=frames, duration=durations, loop=0)
 
 
 def check_format(path: Path) -> None:
@@ -46,13 +53,16 @@ def check_format(path: Path) -> None:
         )
 
 
-def _write_mp4(frames: Iterator[Image.Image], path: Path) -> None:
+def _write_mp4(frames: Iterator[Image.Image], path: Path, rate: float) -> None:
     try:
         import imageio_ffmpeg
     except ImportError:
         raise MissingPartError("video: .mp4 needs imageio-ffmpeg: pip install 'unjam[video]'") from None
     writer = imageio_ffmpeg.write_frames(
-        str(path), (SIZE, SIZE), fps=FRAMES_PER_SECOND, ffmpeg_log_level="error"
+        str(path),
+        (SIZE, SIZE),
+        fps=rate,  # pyright: ignore[reportArgumentType]  ffmpeg takes fractions too
+        ffmpeg_log_level="error",
     )
     writer.send(None)
     for frame in frames:
@@ -60,7 +70,7 @@ def _write_mp4(frames: Iterator[Image.Image], path: Path) -> None:
     writer.close()
 
 
-def _frames(episode: Episode, title: str, pace: float) -> Iterator[Image.Image]:
+def _frames(episode: Episode, title: str, every: int) -> Iterator[Image.Image]:
     """Yield the pictures, one after the other."""
     outline = episode.outline
     low, high = outline[:, 1:].min(0), outline[:, 1:].max(0)
@@ -75,8 +85,7 @@ def _frames(episode: Episode, title: str, pace: float) -> Iterator[Image.Image]:
     fastest = max(1.0, float(np.nanmax(episode.speeds)))
     font = ImageFont.load_default(22 * OVERSAMPLING)
     road = [tuple(point) for point in to_pixels(outline[:, 1:])]
-    steps = np.arange(0, len(episode.speeds), max(1, round(pace / FRAMES_PER_SECOND / episode.step)))
-    for step in steps:
+    for step in range(0, len(episode.speeds), every):
         image = Image.new("RGB", (pixels, pixels), "white")
         pen = ImageDraw.Draw(image)
         pen.line(road, fill="#dfe3e8", width=round(4 * scale), joint="curve")

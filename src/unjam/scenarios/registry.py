@@ -5,6 +5,7 @@ from typing import Any
 
 from unjam.errors import wrong
 from unjam.parameters import build
+from unjam.scenarios.figure_eight import FigureEight
 from unjam.scenarios.ring import Ring
 from unjam.scenarios.scenario import Scenario
 
@@ -12,10 +13,12 @@ SCENARIOS: dict[str, Scenario] = {
     "ring": Ring(),
     "ring-warm": Ring(warmup=750),
     "ring-jammed": Ring(warmup=6000),
+    "figure-eight": FigureEight(),
+    "figure-eight-30": FigureEight(radius=(30, 30)),
 }
 
 
-KINDS: dict[str, type[Scenario]] = {"ring": Ring}
+KINDS: dict[str, type[Scenario]] = {"ring": Ring, "figure-eight": FigureEight}
 """All kinds of road, by their title."""
 
 

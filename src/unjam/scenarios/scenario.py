@@ -15,6 +15,9 @@ from unjam.physics.idm import IDMParameters
 VEHICLE_LENGTH = 5.0
 """[m], of every vehicle"""
 
+SMALLEST_CAV_GAP = 0.5
+"""gap that SUMO keeps for a CAV [m]"""
+
 Actuation = Literal["shielded", "raw", "flow"]
 """How SUMO carries out a CAV's command.
 
@@ -161,41 +164,48 @@ def human_type(scenario: Scenario) -> str:
 
     Under commanded people lies Flow's layer: quick, and with no gap of its own.
     """
+    return vehicle_type("human", scenario, **_human_layer(scenario))
+
+
+def _human_layer(scenario: Scenario) -> dict[str, Any]:
     humans = scenario.humans
     layer = {
+        "carFollowModel": "IDM",
         "accel": humans.max_acceleration,
         "decel": humans.comfortable_deceleration,
         "tau": humans.time_headway,
+        "delta": humans.exponent,
         "minGap": humans.minimum_gap,
+        "maxSpeed": humans.desired_speed,
     }
     if scenario.people == "commanded":
-        layer = {"accel": 2.6, "decel": 4.5, "tau": 1.0, "minGap": 0.0}
-    return vehicle_type(
-        "human",
-        scenario,
-        carFollowModel="IDM",
-        delta=humans.exponent,
-        maxSpeed=humans.desired_speed,
-        **layer,
-    )
+        layer |= {"accel": 2.6, "decel": 4.5, "tau": 1.0, "minGap": 0.0}
+    return layer
 
 
 def cav_type(scenario: Scenario) -> str:
     """Return the XML of the CAVs: a type that executes any safe command exactly.
 
     With SUMO's safe-speed check on, a Krauss vehicle with a reaction time of one step and a small minimum
-    gap is the one that stays out of the way until the command would lead to a crash.
+    gap is the one that stays out of the way until the command would lead to a crash. Where the actuation is
+    Flow's, it is the human type instead; with a gap, or it would creep up until it touches.
     """
+    colour = "215,38,61"  # red, in SUMO's window
+    if scenario.actuation == "flow":
+        layer = _human_layer(scenario)
+        smallest = max(layer["minGap"], SMALLEST_CAV_GAP)
+        return vehicle_type("cav", scenario, color=colour, **{**layer, "minGap": smallest})
     limits = 20.0  # [m/s2] far beyond what a CAV asks for, so that only safety clips a command
     return vehicle_type(
         "cav",
         scenario,
+        color=colour,
         carFollowModel="Krauss",
         accel=limits,
         decel=limits,
         emergencyDecel=limits,
         apparentDecel=limits,
         tau=scenario.simulation_step,
-        minGap=0.5,
+        minGap=SMALLEST_CAV_GAP,
         maxSpeed=scenario.humans.desired_speed,
     )

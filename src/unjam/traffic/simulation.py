@@ -125,11 +125,15 @@ class Simulation:
         """Give `ids` other current speeds [m/s], plain floats: how noise enters."""
         _exhaust(map(self._set_previous_speed, ids, speeds))
 
+    def obey_right_of_way(self, ids: Sequence[str]) -> None:
+        """Let SUMO keep `ids` safe and to the right of way, but not to limits of acceleration."""
+        for name in ids:
+            self._sumo.vehicle.setSpeedMode(name, SPEED_MODES["flow"])
+
     def take_control(self, ids: Sequence[str], actuation: Literal["shielded", "raw", "flow"]) -> None:
         """Make `ids` CAVs: from now on they obey `command_speeds`."""
         for name in ids:
-            if actuation != "flow":  # Flow leaves its CAVs the human type
-                self._sumo.vehicle.setType(name, "cav")
+            self._sumo.vehicle.setType(name, "cav")
             self._sumo.vehicle.setSpeedMode(name, SPEED_MODES[actuation])
 
     def close(self) -> None:

@@ -13,14 +13,18 @@ from operator import add
 import numpy as np
 from numpy.typing import NDArray
 
+from unjam.drivers.idm import SMALLEST_GAP
 from unjam.drivers.local_state import LocalState
 from unjam.errors import EpisodeError, InputError
-from unjam.physics.arrays import Array, clip
-from unjam.physics.kinematics import next_position, next_speed
-from unjam.scenarios.scenario import Scenario
+from unjam.physics.arrays import Array, at_least, clip
+from unjam.physics.idm import idm_acceleration
+from unjam.physics.kinematics import gap_on_loop, next_position, next_speed
+from unjam.scenarios.scenario import VEHICLE_LENGTH, Scenario
 from unjam.traffic.neighbours import loop_neighbours, loop_state
 from unjam.traffic.simulation import Simulation
 
+LEAVE_TO_SUMO = -1.0
+"""the commanded speed that stands for none"""
 HISTORY = 60.0
 """seconds of the warm-up that a driver may remember"""
 WARMUP_PROGRESS_STEPS = 500
@@ -62,12 +66,16 @@ class Traffic:
         self.single = plain_numbers and len(cavs) == 1
         self._cavs = cavs
         self._near = loop_neighbours(cavs[0] if self.single else np.array(cavs), len(road.vehicle_ids))
+        self._commanded = scenario.people == "commanded"
+        needed = [range(len(road.vehicle_ids))] if self._commanded else self._near
         self._near_positions: dict[int, float] = {
             int(place): float(road.start_positions[place])
-            for places in self._near
+            for places in needed
             for place in np.atleast_1d(places)
         }
         self._be_human(road.vehicle_ids)
+        if self._commanded:
+            simulation.obey_right_of_way(road.vehicle_ids)
         self._speeds = simulation.speeds(road.vehicle_ids)
         if simulation.vehicle_count() != len(road.vehicle_ids):
             self._miss()
@@ -163,6 +171,8 @@ class Traffic:
         Two formulas of `physics.kinematics` are written out here: calls would cost a tenth of the episode.
         """
         simulation, near, step = self._simulation, self._near_positions, self.scenario.simulation_step
+        if self._commanded:
+            self._command_people()
         simulation.step()
         moved = simulation.speeds(self.road.vehicle_ids)
         if simulation.vehicle_count() != len(moved):
@@ -171,13 +181,35 @@ class Traffic:
         for place in near:
             near[place] += moved[place] * step
         self._speeds = moved
-        if self.scenario.noise > 0:
+        if self.scenario.noise > 0 and not self._commanded:
             noise = self._noise_rows.pop() if self._noise_rows else self._draw_noise()
             self._speeds = [speed if speed > 0.0 else 0.0 for speed in map(add, moved, noise)]
             simulation.replace_speeds(self._human_ids, compress(self._speeds, self._human_mask))
         self._log_speeds.fromlist(self._speeds)
         self.collisions = simulation.colliding_count()
         self.crashed = self.collisions > 0
+
+    def _command_people(self) -> None:
+        """Ask for the speeds that people want: the IDM's with its noise; on a crossing SUMO's own."""
+        scenario, road, speeds, positions = self.scenario, self.road, self._speeds, self._near_positions
+        step, loop, humans, count = scenario.simulation_step, road.loop_length, scenario.humans, len(speeds)
+        if scenario.noise > 0:
+            noise = self._noise_rows.pop() if self._noise_rows else self._draw_noise()
+        else:
+            noise = [0.0] * count
+        wanted = []
+        for place in compress(range(count), self._human_mask):
+            position = positions[place]
+            on_road = position % loop
+            if any(start <= on_road < end for start, end in road.crossings):
+                wanted.append(LEAVE_TO_SUMO)
+                continue
+            ahead = place + 1 if place + 1 < count else 0
+            gap = gap_on_loop(position, positions[ahead], loop, VEHICLE_LENGTH)
+            speed = speeds[place]
+            acceleration = idm_acceleration(speed, speeds[ahead], at_least(gap, SMALLEST_GAP), humans)
+            wanted.append(at_least(speed + acceleration * step + noise[place], 0.0))
+        self._simulation.command_speeds(self._human_ids, wanted)
 
     def exploration_noise(self) -> Sequence[Array]:
         """Return standard normal noise for every decision of the episode: arrays (CAVs,), or floats."""

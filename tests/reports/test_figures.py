@@ -1,0 +1,289 @@
+import base64
+import io
+from collections.abc import Callable, Sequence
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.colors import to_hex
+from matplotlib.figure import Figure
+from PIL import Image
+
+from unjam.reports.figures import (
+    LINES,
+    POINTS_IN_TIME,
+    colour_table,
+    data_uri,
+    learning_curve,
+    space_time,
+    speed_and_gap,
+    speed_scale,
+    time_split,
+)
+from unjam.reports.results import Shown
+
+LENGTH = 120.0
+CAV_COLOUR = "#d7263d"
+
+
+def shown_of(
+    driver: str = "pi", speed: float = 4.0, steps: int = 300, vehicles: int = 5, **changes: Any
+) -> Shown:
+    """Vehicles that drive around the ring at about `speed`: faster the later, and the further ahead."""
+    speeds = speed + np.linspace(0, 1, steps + 1)[:, None] + 0.1 * np.arange(vehicles)
+    positions = np.arange(vehicles) * LENGTH / vehicles + np.cumsum(speeds, axis=0) * 0.1
+    angles = np.linspace(0, 2 * np.pi, 41)
+    radius = LENGTH / (2 * np.pi)
+    values: dict[str, Any] = {
+        "step": 0.1,
+        "loop_length": LENGTH,
+        "limit_speed": 6.5,
+        "drawn": {"length": LENGTH},
+        "vehicle_ids": [f"human_{n}" for n in range(vehicles - 1)] + ["cav_0"],
+        "cav_ids": ["cav_0"],
+        "speeds": speeds.astype(np.float32),
+        "positions": positions.astype(np.float32),
+        "gaps": np.full_like(speeds, 7.5, np.float32) + np.arange(vehicles, dtype=np.float32),
+        "outline": np.column_stack([angles * radius, radius * np.cos(angles), radius * np.sin(angles)]),
+    }
+    return Shown(driver=driver, **{**values, **changes})
+
+
+def panels_of(figure: Figure) -> list[Axes]:
+    """The panels that can be seen, without the colour bar."""
+    return [axes for axes in figure.axes if axes.get_visible() and axes.get_label() != "<colorbar>"]
+
+
+def lines_of(axes: Axes) -> list[LineCollection]:
+    return [found for found in axes.collections if isinstance(found, LineCollection)]
+
+
+def drivers(count: int) -> list[Shown]:
+    return [shown_of(f"driver {number}", 2.0 + number) for number in range(count)]
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 4, 5, 6])
+@pytest.mark.parametrize("wide", [True, False])
+def test_space_time_has_a_panel_for_each_driver(count: int, wide: bool) -> None:
+    panels = panels_of(space_time(drivers(count), wide))
+    assert [axes.get_title(loc="left") for axes in panels] == [f"driver {number}" for number in range(count)]
+
+
+def test_space_time_on_a_phone_puts_one_panel_below_the_other() -> None:
+    figure = space_time(drivers(3), wide=False)
+    figure.draw_without_rendering()
+    places = [axes.get_position() for axes in panels_of(figure)]
+    assert len({round(place.x0, 3) for place in places}) == 1
+    assert places[0].y0 > places[1].y0 > places[2].y0
+    assert figure.get_figwidth() < 5
+
+
+def test_space_time_colours_all_panels_on_one_scale() -> None:
+    shown = drivers(3)
+    coloured = [
+        lines
+        for axes in panels_of(space_time(shown))
+        for lines in lines_of(axes)
+        if lines.get_array() is not None
+    ]
+    assert len(coloured) == 3 * 5
+    fastest = np.ceil(max(episode.speeds.max() for episode in shown))
+    assert {(lines.norm.vmin, lines.norm.vmax) for lines in coloured} == {(0.0, fastest)}
+
+
+def test_speed_scale_begins_at_zero_and_is_never_empty() -> None:
+    assert (speed_scale(drivers(2)).vmin, speed_scale(drivers(2)).vmax) == (0.0, 5.0)
+    standing = shown_of(speeds=np.zeros((10, 5), np.float32))
+    assert speed_scale([standing]).vmax == 1.0
+    absent = shown_of(speeds=np.array([[2.5, np.nan]], np.float32))
+    assert speed_scale([absent]).vmax == 3.0
+
+
+def test_space_time_colours_a_line_by_the_speed_that_it_shows() -> None:
+    shown = shown_of(steps=50)
+    [first, *_] = [
+        lines for lines in lines_of(panels_of(space_time([shown]))[0]) if lines.get_array() is not None
+    ]
+    segments, speeds = np.array(first.get_segments()), np.asarray(first.get_array())
+    for number, (start, end) in enumerate(segments):
+        slope = (end[1] - start[1]) / (end[0] - start[0])
+        assert speeds[number] == pytest.approx(slope, abs=0.05)
+
+
+@pytest.mark.parametrize("steps", [300, 5000])
+def test_space_time_draws_no_line_across_the_seam_of_the_ring(steps: int) -> None:
+    [panel] = panels_of(space_time([shown_of(steps=steps, speed=6.0)]))
+    for lines in lines_of(panel):
+        segments = np.array(lines.get_segments())
+        assert np.abs(np.diff(segments[:, :, 1], axis=1)).max() < LENGTH / 2
+        assert segments[:, :, 1].min() >= 0
+        assert segments[:, :, 1].max() <= LENGTH
+        assert len(segments) < min(steps, len(shown_of(steps=steps).times)), "the ring was gone around"
+
+
+def test_space_time_marks_the_cav_and_nobody_else() -> None:
+    shown = shown_of(vehicles=6)
+    [panel] = panels_of(space_time([shown]))
+    marked = [lines for lines in lines_of(panel) if lines.get_array() is None]
+    assert len(lines_of(panel)) == 6 + 1
+    assert [to_hex(np.asarray(lines.get_color())[0]) for lines in marked] == [CAV_COLOUR]
+    first = np.array(marked[0].get_segments())[0, 0]
+    assert first[1] == pytest.approx(shown.positions[0, 5] % LENGTH, abs=1e-3)
+
+
+def test_space_time_marks_every_cav() -> None:
+    shown = shown_of(cav_ids=["human_0", "cav_0"])
+    [panel] = panels_of(space_time([shown]))
+    assert sum(lines.get_array() is None for lines in lines_of(panel)) == 2
+
+
+def test_a_long_episode_is_thinned_out_and_a_short_one_is_not() -> None:
+    def points(steps: int) -> int:
+        [panel] = panels_of(space_time([shown_of(steps=steps, speed=0.0, vehicles=2)]))
+        return len(lines_of(panel)[0].get_segments())
+
+    assert points(50) == 50
+    assert POINTS_IN_TIME * 0.9 < points(6000) < POINTS_IN_TIME * 2
+
+
+def test_space_time_spans_the_episode_and_the_ring() -> None:
+    [panel] = panels_of(space_time([shown_of(steps=300)]))
+    assert panel.get_xlim() == pytest.approx((0, 30))
+    assert panel.get_ylim() == pytest.approx((0, LENGTH))
+
+
+def test_space_time_of_episodes_of_different_length_shows_all_of_each() -> None:
+    for shown in ([shown_of(), shown_of("crashed", steps=50)], [shown_of("crashed", steps=50), shown_of()]):
+        panels = panels_of(space_time(shown))
+        assert all(panel.get_xlim() == pytest.approx((0, 30)) for panel in panels)
+
+
+def test_space_time_of_rings_of_different_length_shows_all_of_each() -> None:
+    for shown in ([shown_of(), shown_of(loop_length=90.0)], [shown_of(loop_length=90.0), shown_of()]):
+        panels = panels_of(space_time(shown))
+        assert all(panel.get_ylim() == pytest.approx((0, LENGTH)) for panel in panels)
+
+
+def test_speed_and_gap_has_a_line_of_each_driver_in_each_panel() -> None:
+    shown = drivers(3)
+    speed, gap, wave = panels_of(speed_and_gap(shown))
+    for number, episode in enumerate(shown):
+        cav = episode.cavs[0]
+        for axes, values in ((speed, episode.speeds[:, cav]), (gap, episode.gaps[:, cav])):
+            np.testing.assert_allclose(np.asarray(axes.lines[number].get_ydata()), values)
+        np.testing.assert_allclose(
+            np.asarray(wave.lines[number].get_ydata()), episode.speeds.std(axis=1), rtol=1e-4
+        )
+        assert {axes.lines[number].get_color() for axes in (speed, gap, wave)} == {LINES[number]}
+
+
+def test_speed_and_gap_names_the_drivers_and_the_limit() -> None:
+    figure = speed_and_gap(drivers(2))
+    [legend] = figure.legends
+    assert [text.get_text() for text in legend.get_texts()] == ["driver 0", "driver 1", "limit"]
+    limit = panels_of(figure)[0].lines[-1]
+    assert set(np.asarray(limit.get_ydata())) == {6.5}
+
+
+def row(number: int, validation: float | None = None, **changes: Any) -> dict[str, Any]:
+    usual = {"iteration": number, "actual_steps": 12_000 * number, "return_mean": 90.0 + number}
+    usual |= {"return_expert": 100.0, "return_validation": validation}
+    return {**usual, "seconds": {"actual": 2.0, "update": 0.5}, **changes}
+
+
+RUN = [row(1), row(2, 104.0), row(3), row(4, 108.0)]
+
+
+def test_learning_starts_at_step_zero_with_the_expert() -> None:
+    [axes] = panels_of(learning_curve({"ring-001": RUN}, {"pi": 100.0}))
+    training, validation, expert = axes.lines
+    assert np.asarray(validation.get_xydata()).tolist() == [[0.0, 100.0], [24.0, 104.0], [48.0, 108.0]]
+    assert np.asarray(training.get_xydata()).tolist() == [
+        [12.0, 91.0],
+        [24.0, 92.0],
+        [36.0, 93.0],
+        [48.0, 94.0],
+    ]
+    assert expert.get_label() == "pi"
+    assert set(np.asarray(expert.get_ydata())) == {100.0}
+
+
+def test_a_run_without_validation_still_shows_training() -> None:
+    rows = [row(number, return_expert=None) for number in (1, 2)]
+    [axes] = panels_of(learning_curve({"ring-001": rows}, {}))
+    assert len(np.asarray(axes.lines[0].get_xydata())) == 2
+    assert len(np.asarray(axes.lines[1].get_xydata())) == 0
+
+
+def test_several_runs_are_told_apart() -> None:
+    figure = learning_curve({"a": RUN, "b": RUN}, {"pi": 100.0})
+    labels = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert [label.split(":")[0] for label in labels] == ["a", "a", "b", "b", "pi"]
+    lines = panels_of(figure)[0].lines
+    assert lines[1].get_color() != lines[3].get_color()
+
+
+def test_no_run_is_left_out_however_many_there_are() -> None:
+    [axes] = panels_of(learning_curve({f"run-{number}": RUN for number in range(9)}, {}))
+    assert len(axes.lines) == 2 * 9
+
+
+def test_no_reference_is_left_out_however_many_there_are() -> None:
+    references = {f"driver {number}": float(number) for number in range(7)}
+    [axes] = panels_of(learning_curve({"ring-001": RUN}, references))
+    assert [line.get_label() for line in axes.lines[2:]] == list(references)
+
+
+def test_wall_time_is_divided_among_its_parts() -> None:
+    [axes] = panels_of(time_split(RUN))
+    bars = [(bar.get_x(), bar.get_width()) for bar in axes.patches]  # pyright: ignore[reportAttributeAccessIssue]
+    assert bars == [(0.0, 8.0), (8.0, 2.0)]
+    labels = [text.get_text() for text in axes.figure.legends[0].get_texts()]
+    assert labels == ["actual 8 s", "update 2 s"]
+
+
+def test_colours_of_the_table_get_brighter_with_speed() -> None:
+    table = colour_table()
+    assert len(table) == 32
+    light = [
+        0.299 * int(code[1:3], 16) + 0.587 * int(code[3:5], 16) + 0.114 * int(code[5:], 16) for code in table
+    ]
+    assert all(np.diff(light) > 0)
+
+
+def content(uri: str) -> tuple[str, bytes]:
+    head, _, data = uri.partition(",")
+    return head, base64.b64decode(data)
+
+
+FIGURES: Sequence[Callable[[bool], Figure]] = (
+    lambda wide: space_time(drivers(2), wide),
+    lambda wide: speed_and_gap(drivers(2), wide),
+    lambda wide: learning_curve({"ring-001": RUN}, {"pi": 100.0}, wide),
+    lambda wide: time_split(RUN, wide),
+)
+
+
+@pytest.mark.parametrize("draw", FIGURES)
+def test_the_same_figure_gives_the_same_bytes(draw: Callable[[bool], Figure]) -> None:
+    assert data_uri(draw(True), "svg") == data_uri(draw(True), "svg")
+    assert data_uri(draw(True), "svg") != data_uri(draw(False), "svg")
+
+
+def test_a_picture_is_a_png_with_the_cav_in_its_colour() -> None:
+    head, data = content(data_uri(space_time([shown_of()]), "png"))
+    assert head == "data:image/png;base64"
+    image = Image.open(io.BytesIO(data))
+    assert image.width > 1000
+    pixels = np.asarray(image.convert("RGB")).astype(int)
+    wanted = [int(CAV_COLOUR[start : start + 2], 16) for start in (1, 3, 5)]
+    assert (np.abs(pixels - wanted).max(axis=-1) < 30).sum() > 100
+
+
+def test_a_drawing_is_an_svg() -> None:
+    head, data = content(data_uri(time_split(RUN), "svg"))
+    assert head == "data:image/svg+xml;base64"
+    assert ElementTree.fromstring(data).tag == "{http://www.w3.org/2000/svg}svg"

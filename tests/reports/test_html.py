@@ -1,0 +1,328 @@
+import base64
+import json
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+from unjam import __version__
+from unjam.errors import DiskError, InputError
+from unjam.experiments.evaluate import Evaluation, save_evaluation
+from unjam.files import to_json
+from unjam.reports.figures import learning_curve
+from unjam.reports.html import REPLAY_SECONDS, write_report
+from unjam.reports.metrics import METRICS, measure
+from unjam.reports.results import read_results
+from unjam.traffic.record import Episode, failed_episode
+
+from .test_metrics import LENGTH, episode_of
+
+SPEEDS = {"human": 3.0, "pi": 4.0, "trained": 4.5, "follower-stopper": 3.5}
+
+
+def driven(speed: float, seed: int, steps: int = 60) -> Episode:
+    """Vehicles that drive alike but for a wave that grows with the seed."""
+    times, vehicles = np.arange(steps + 1)[:, None], np.arange(6)
+    speeds = speed + (0.5 + 0.1 * seed) * np.sin(times / 20 + vehicles)
+    return episode_of(speeds, seed=(seed,), fuel=np.full((steps, 6), 300.0))
+
+
+def results_in(folder: Path, *drivers: str, failing: int = 0, **about: Any) -> Path:
+    """A folder of results like `unjam drive` writes."""
+    episodes = {name: [driven(SPEEDS.get(name, 4.0), seed) for seed in range(3)] for name in drivers}
+    rows = {name: [measure(episode) for episode in found] for name, found in episodes.items()}
+    for seed in range(failing):
+        rows[drivers[-1]].append(measure(failed_episode((9, seed), "SUMO <cannot> start", "EpisodeError")))
+    evaluation = Evaluation(rows, {name: found[0] for name, found in episodes.items()})
+    manifest = {
+        "unjam": __version__,
+        "python": "3.11.2",
+        "packages": {},
+        "started": "2026-01-02T03:04:05+00:00",
+    }
+    manifest["command"] = ["unjam", "drive", "ring", "--driver", *drivers]
+    save_evaluation(
+        folder, evaluation, {"scenario": "ring", "reward": "released", "manifest": manifest, **about}
+    )
+    return folder
+
+
+def run_in(folder: Path, scenario: str = "ring") -> Path:
+    """A folder of results like `unjam train` writes."""
+    results_in(folder, "human", "pi", "trained", scenario=scenario, trained="trained", expert="pi")
+    rows = [
+        {
+            "iteration": number,
+            "actual_steps": 12_000 * number,
+            "return_mean": 90.0 + number,
+            "return_expert": 100.0,
+            "return_validation": 101.0 + number if number % 2 else None,
+            "seconds": {"actual": 2.0, "update": 0.5},
+        }
+        for number in range(1, 5)
+    ]
+    (folder / "progress.jsonl").write_text("".join(to_json(row) + "\n" for row in rows))
+    (folder / "config.toml").write_text(f'scenario = "{scenario}"\nsteps = 48000\n')
+    return folder
+
+
+class Page(HTMLParser):
+    """What a browser would make of a page: tags, texts, and what it would load."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.tags: list[tuple[str, dict[str, str]]] = []
+        self.texts: dict[str, list[str]] = {}
+        self._open = ""
+        self.feed(text)
+        self.close()
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append((tag, {name: value or "" for name, value in attrs}))
+        self._open = tag
+
+    def handle_data(self, data: str) -> None:
+        if data.strip():
+            self.texts.setdefault(self._open, []).append(data.strip())
+
+    def of(self, tag: str) -> list[dict[str, str]]:
+        return [attributes for name, attributes in self.tags if name == tag]
+
+    @property
+    def replay(self) -> dict[str, Any]:
+        [data] = [text for text in self.texts["script"] if text.startswith("{")]
+        return json.loads(data)
+
+
+def page_of(*folders: Path) -> tuple[str, Page]:
+    target = folders[0].parent / "page.html"
+    assert write_report(folders, target) == target
+    text = target.read_text(encoding="utf-8")
+    return text, Page(text)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return run_in(tmp_path_factory.mktemp("html") / "ring-001")
+
+
+@pytest.fixture(scope="module")
+def written(run: Path) -> tuple[str, Page]:
+    return page_of(run)
+
+
+def test_a_page_loads_nothing_from_anywhere_else(written: tuple[str, Page]) -> None:
+    text, page = written
+    loading = {"src", "srcset", "data", "poster", "action", "formaction", "background"}
+    for tag, attributes in page.tags:
+        for name in loading & attributes.keys():
+            assert attributes[name].startswith("data:"), (tag, name)
+    assert not page.of("link")
+    assert not page.of("iframe")
+    assert not any("src" in attributes for attributes in page.of("script"))
+    for style in page.texts["style"]:
+        assert not re.search(r"@import|url\(", style)
+    for script in page.texts["script"]:
+        assert not re.search(r"fetch\(|XMLHttpRequest|WebSocket|importScripts|\bimport\b", script)
+    assert not re.search(r"https?://", re.sub(r'title="[^"]*"|<dd>.*?</dd>', "", text)), (
+        "only definitions name their sources"
+    )
+
+
+def test_pictures_inside_the_page_load_nothing_either(written: tuple[str, Page]) -> None:
+    _, page = written
+    addresses = [tag.get("src", tag.get("srcset", "")) for tag in page.of("img") + page.of("source")]
+    drawings = [base64.b64decode(address.partition(",")[2]) for address in addresses if "svg" in address[:20]]
+    assert drawings
+    for drawing in drawings:
+        assert not re.search(rb'(href|src)="(?!#|data:)', drawing)
+
+
+def test_a_run_has_all_its_pictures_for_both_screens(written: tuple[str, Page]) -> None:
+    _, page = written
+    assert len(page.of("img")) == len(page.of("source")) == 4
+    assert all(len(image["alt"]) > 20 for image in page.of("img"))
+    assert all("max-width" in source["media"] for source in page.of("source"))
+    for image, source in zip(page.of("img"), page.of("source"), strict=True):
+        assert image["src"] != source["srcset"]
+
+
+def test_drives_have_no_learning_curve(tmp_path: Path) -> None:
+    _, page = page_of(results_in(tmp_path / "drive", "human", "pi"))
+    assert len(page.of("img")) == 2
+    assert "Learning" not in page.texts["h2"]
+
+
+def test_lines_of_the_learning_curve_are_the_drivers_that_do_not_learn(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drawn = []
+
+    def spy(runs: dict[str, Any], references: dict[str, float], wide: bool) -> Figure:
+        drawn.append((list(runs), references))
+        return learning_curve(runs, references, wide)
+
+    monkeypatch.setattr("unjam.reports.html.learning_curve", spy)
+    write_report([run], tmp_path / "page.html")
+    found = read_results(run)
+    held_out = np.mean([row["return"] for row in found.rows["human"]])
+    # The expert's line is where the curve starts: on the seeds of the validation.
+    expected = {"pi, validation": found.progress[0]["return_expert"], "human, held-out": held_out}
+    assert drawn[0] == (["ring-001"], pytest.approx(expected))
+
+
+def test_the_page_says_who_made_it_and_how_to_repeat_it(written: tuple[str, Page]) -> None:
+    text, page = written
+    assert f"unjam {__version__}" in text
+    assert any("unjam drive ring --driver human pi trained" in code for code in page.texts["code"])
+    assert any("steps = 48000" in code for code in page.texts["code"])
+    assert "2026-01-02" in text
+
+
+def test_the_table_holds_the_means_of_the_rows(written: tuple[str, Page], run: Path) -> None:
+    _, page = written
+    assert page.texts["th"][1:4] == ["human", "pi", "trained"]
+    rows = read_results(run).rows
+    for name in ("mean_speed", "speed_std_fleet", "fuel_ml_per_km"):
+        metric = METRICS[name]
+        for driver in ("human", "pi", "trained"):
+            mean = np.mean([row[name] for row in rows[driver]])
+            assert f"{mean:.{metric.digits}f}" in page.texts["b"]
+
+
+def test_names_of_drivers_are_text_whatever_they_hold(tmp_path: Path) -> None:
+    names = [
+        "<b>x",
+        "a&b",
+        '"quoted"',
+        "</script><script>document.title='x'</script>",
+        "<!--<script>",
+        "ünïcode",
+    ]
+    text, page = page_of(results_in(tmp_path / "drive", *names))
+    assert len(page.of("script")) == 2
+    assert len(page.of("b")) == len(names) * len(METRICS)
+    assert page.texts["th"][1:7] == names
+    assert [driver["name"] for driver in page.replay["drivers"]] == names
+    data = text.partition('type="application/json">')[2].partition("</script>")[0]
+    assert json.loads(data) == page.replay
+    assert "<!--" not in data, "a browser would look for the end of the script elsewhere"
+
+
+def test_texts_of_a_folder_are_text_whatever_they_hold(tmp_path: Path) -> None:
+    folder = results_in(tmp_path / "a <i>b", "pi", failing=1, scenario="<u>ring")
+    (folder / "config.toml").write_text('expert = "<s>"\n')
+    text, page = page_of(folder, results_in(tmp_path / "c", "pi"))
+    assert not page.of("i")[1:]  # the page's own one shows the scale
+    for tag in ("u", "s", "cannot"):
+        assert not page.of(tag)
+    assert "SUMO &lt;cannot&gt; start" in text
+
+
+def test_failed_episodes_are_listed_with_their_reason(tmp_path: Path) -> None:
+    text, _ = page_of(results_in(tmp_path / "drive", "human", "pi", failing=2))
+    assert "Episodes that failed" in text
+    assert "pi seed [9, 0]" in text
+    assert "pi seed [9, 1]" in text
+    assert "3 of 5" in text, "a cell says how many episodes it stands for"
+
+
+def numbers(data: str, vehicles: int) -> np.ndarray:
+    return np.frombuffer(base64.b64decode(data), "<f4").reshape(-1, vehicles)
+
+
+def test_the_replay_holds_the_positions_and_speeds_that_were_driven(
+    written: tuple[str, Page], run: Path
+) -> None:
+    replay, shown = written[1].replay, read_results(run).shown
+    assert [driver["name"] for driver in replay["drivers"]] == list(shown)
+    every = round(REPLAY_SECONDS / 0.1)
+    assert replay["step"] == pytest.approx(REPLAY_SECONDS)
+    for driver in replay["drivers"]:
+        episode = shown[driver["name"]]
+        np.testing.assert_array_equal(numbers(driver["positions"], 6), episode.positions[::every])
+        np.testing.assert_array_equal(numbers(driver["speeds"], 6), episode.speeds[::every])
+        assert replay["frames"] == len(episode.positions[::every])
+        assert driver["cavs"] == episode.cavs == [0]
+        assert driver["loop_length"] == LENGTH
+        np.testing.assert_allclose(driver["outline"], episode.outline, atol=0.006)
+    fastest = max(episode.speeds.max() for episode in shown.values())
+    assert fastest <= replay["fastest"] < fastest + 1
+
+
+def save_driven(folder: Path, **episodes: Episode) -> Path:
+    """A folder of results of one episode each."""
+    evaluation = Evaluation({name: [measure(found)] for name, found in episodes.items()}, episodes)
+    save_evaluation(folder, evaluation, {"scenario": "ring", "reward": "released", "manifest": {}})
+    return folder
+
+
+def test_the_replay_is_not_cut_short_by_a_driver_that_crashed(tmp_path: Path) -> None:
+    crashed, whole = driven(3.0, 0, steps=20), driven(3.0, 0, steps=60)
+    for number, episodes in enumerate(({"a": crashed, "b": whole}, {"a": whole, "b": crashed})):
+        _, page = page_of(save_driven(tmp_path / str(number), **episodes))
+        assert (page.replay["frames"] - 1) * page.replay["step"] == pytest.approx(6.0)
+
+
+def test_the_replay_shows_roads_of_different_steps_at_the_same_times(tmp_path: Path) -> None:
+    coarse, fine = (
+        episode_of(np.full((round(4.0 / step) + 1, 3), 2.0), step=step, seed=(0,)) for step in (0.1, 0.05)
+    )
+    replay = page_of(save_driven(tmp_path / "a", one=coarse, other=fine))[1].replay
+    one, other = (numbers(driver["positions"], 3) for driver in replay["drivers"])
+    np.testing.assert_allclose(one, other, rtol=1e-6)
+
+
+def test_several_folders_are_compared_side_by_side(tmp_path: Path) -> None:
+    folders = run_in(tmp_path / "ring-001"), run_in(tmp_path / "ring-002")
+    text, page = page_of(*folders)
+    assert page.texts["h1"] == ["ring: 2 results compared"]
+    assert page.texts["th"][1:5] == ["human", "pi", "ring-001: trained", "ring-002: trained"]
+    assert [driver["name"] for driver in page.replay["drivers"]] == page.texts["th"][1:5]
+    [lead] = [text for text in page.texts["p"] if "held-out seeds" in text]
+    assert "ring-001: On 3" in lead
+    assert "ring-002: On 3" in lead
+    assert page.texts["h3"] == ["ring-001", "ring-002"], "how to repeat each"
+    assert text.count('alt="Return against') == 1, "both learn in one picture"
+
+
+def test_a_comparison_of_drives_has_a_column_of_each(tmp_path: Path) -> None:
+    _, page = page_of(results_in(tmp_path / "a", "pi"), results_in(tmp_path / "b", "pi"))
+    assert page.texts["th"][1:3] == ["a: pi", "b: pi"]
+
+
+def test_episodes_of_a_comparison_are_counted_from_fewest_to_most(tmp_path: Path) -> None:
+    text, _ = page_of(results_in(tmp_path / "drive", "human", "pi", failing=2))
+    assert "Mean over 3 to 5 episodes" in text
+
+
+def test_results_in_which_every_episode_failed_still_have_a_page(tmp_path: Path) -> None:
+    folder = tmp_path / "drive"
+    rows = {"pi": [measure(failed_episode((0,), "no road", "EpisodeError"))]}
+    save_evaluation(folder, Evaluation(rows, {}), {"scenario": "ring", "reward": "released", "manifest": {}})
+    text, page = page_of(folder)
+    assert "no road" in text
+    assert not page.of("img")
+    assert not re.search(r"\bnan\b", text)
+
+
+def test_the_same_results_give_the_same_page(tmp_path: Path, written: tuple[str, Page], run: Path) -> None:
+    write_report([run], tmp_path / "again.html")
+    assert (tmp_path / "again.html").read_text(encoding="utf-8") == written[0]
+
+
+def test_a_folder_without_results_leaves_no_page(tmp_path: Path) -> None:
+    good = results_in(tmp_path / "drive", "pi")
+    with pytest.raises(InputError):
+        write_report([good, tmp_path], tmp_path / "page.html")
+    assert not (tmp_path / "page.html").exists()
+
+
+def test_a_page_that_cannot_be_written_gets_one_clear_line(tmp_path: Path) -> None:
+    good = results_in(tmp_path / "drive", "pi")
+    with pytest.raises(DiskError, match="cannot write"):
+        write_report([good], tmp_path / "nowhere" / "page.html")

@@ -1,0 +1,348 @@
+import shutil
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import pytest
+from playwright.sync_api import Browser, ConsoleMessage, Page, Request, Route, sync_playwright
+
+import unjam
+from unjam.reports.metrics import METRICS
+
+CHROMIUM = shutil.which("chromium")
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium found: apt-get install chromium")
+
+ROAD = {"length": (120, 120), "vehicles": 8, "horizon": 150}
+LAPTOP = (1280, 800)
+PHONE = (390, 844)
+SECONDS = 15.0
+"""length of the shown episodes"""
+
+
+@pytest.fixture(scope="module")
+def driven(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The report of `unjam drive`."""
+    folder = tmp_path_factory.mktemp("drive") / "results"
+    report = unjam.drive(driver=["human", "pi"], episodes=2, road=ROAD, workers=1, out=folder).report
+    assert report is not None
+    return report
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The report of `unjam train`."""
+    changes = {
+        "road": ROAD,
+        "steps": 900,
+        "workers": 1,
+        "policy.hidden": (8,),
+        "trpo.batch_steps": 300,
+        "evaluation.every": 1,
+        "evaluation.validation_episodes": 1,
+        "evaluation.episodes": 2,
+        "evaluation.baselines": ("human",),
+    }
+    return unjam.train(
+        unjam.load_config(changes=changes), tmp_path_factory.mktemp("train") / "ring-001"
+    ).report
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    switches = ["no-sandbox", "disable-gpu", "disable-background-networking", "disable-component-update"]
+    with sync_playwright() as playwright:
+        opened = playwright.chromium.launch(
+            executable_path=CHROMIUM, args=[f"--{switch}" for switch in (*switches, "disable-sync")]
+        )
+        yield opened
+        opened.close()
+
+
+@dataclass
+class Visit:
+    """A page in the browser, and what went wrong on it."""
+
+    page: Page
+    requests: list[str] = field(default_factory=list)
+    """everything that it asked for but itself and what it holds"""
+    errors: list[str] = field(default_factory=list)
+
+    def time(self) -> float:
+        """The moment that the replay says it shows [s]."""
+        return float(self.page.locator(".clock").inner_text().removesuffix(" s"))
+
+    def canvases(self) -> list[str]:
+        return self.page.eval_on_selector_all("canvas", "all => all.map(canvas => canvas.toDataURL())")
+
+
+@pytest.fixture
+def open_page(browser: Browser) -> Iterator["Opener"]:
+    opener = Opener(browser)
+    yield opener
+    for context in browser.contexts:
+        context.close()
+    assert [error for visit in opener.visits for error in visit.errors] == []
+    assert [address for visit in opener.visits for address in visit.requests] == []
+
+
+class Opener:
+    """Opens reports from their files, without a network; what they miss or complain about fails the test."""
+
+    def __init__(self, browser: Browser) -> None:
+        self._browser = browser
+        self.visits: list[Visit] = []
+
+    def __call__(self, report: Path, size: tuple[int, int] = LAPTOP) -> Visit:
+        context = self._browser.new_context(viewport={"width": size[0], "height": size[1]}, offline=True)
+        visit = Visit(context.new_page())
+        self.visits.append(visit)
+
+        def refuse(route: Route) -> None:
+            visit.requests.append(route.request.url)
+            route.abort()
+
+        def watch(request: Request) -> None:
+            if not request.url.startswith("data:") and request.url != report.as_uri():
+                visit.requests.append(request.url)
+
+        def listen(message: ConsoleMessage) -> None:
+            if message.type in ("error", "warning"):
+                visit.errors.append(message.text)
+
+        context.route(
+            "**/*", lambda route: route.continue_() if route.request.url[:4] != "http" else refuse(route)
+        )
+        visit.page.on("request", watch)
+        visit.page.on("console", listen)
+        visit.page.on("pageerror", lambda error: visit.errors.append(str(error)))
+        visit.page.goto(report.as_uri())
+        return visit
+
+
+@pytest.mark.parametrize("size", [LAPTOP, PHONE], ids=["laptop", "phone"])
+@pytest.mark.parametrize(("report", "pictures"), [("driven", 2), ("trained", 4)])
+def test_every_picture_is_there(
+    open_page: Opener, request: pytest.FixtureRequest, report: str, pictures: int, size: tuple[int, int]
+) -> None:
+    page = open_page(request.getfixturevalue(report), size).page
+    widths = page.eval_on_selector_all("img", "all => all.map(image => image.complete && image.naturalWidth)")
+    assert len(widths) == pictures
+    assert all(width > 200 for width in widths)
+
+
+@pytest.mark.parametrize("size", [LAPTOP, PHONE, (320, 640), (820, 1180)], ids=lambda size: str(size[0]))
+@pytest.mark.parametrize("report", ["driven", "trained"])
+def test_nothing_is_wider_than_the_screen(
+    open_page: Opener, request: pytest.FixtureRequest, report: str, size: tuple[int, int]
+) -> None:
+    page = open_page(request.getfixturevalue(report), size).page
+    page.eval_on_selector_all("details", "all => all.forEach(each => each.open = true)")
+    assert page.evaluate("document.documentElement.scrollWidth") <= size[0]
+    too_wide = page.evaluate(
+        """width => [...document.querySelectorAll("body *")].filter(found =>
+             !found.parentElement.closest(".scroll, pre") && found.getBoundingClientRect().right > width + 0.5
+           ).map(found => found.outerHTML.slice(0, 80))""",
+        size[0],
+    )
+    assert too_wide == []
+
+
+def test_a_phone_gets_pictures_of_its_own(open_page: Opener, driven: Path) -> None:
+    shape = "all => all.map(image => image.naturalHeight / image.naturalWidth)"
+    wide = open_page(driven, LAPTOP).page.eval_on_selector_all("img", shape)
+    narrow = open_page(driven, PHONE).page.eval_on_selector_all("img", shape)
+    assert all(high > low * 1.3 for high, low in zip(narrow, wide, strict=True))
+
+
+def test_the_replay_shows_the_vehicles_of_every_driver(open_page: Opener, driven: Path) -> None:
+    visit = open_page(driven)
+    captions = visit.page.locator("figcaption").all_inner_texts()
+    assert [caption.split("\n")[0] for caption in captions] == ["human", "pi"]
+    assert all("mean" in caption for caption in captions)
+    found = visit.page.eval_on_selector_all(
+        "canvas",
+        """all => all.map(canvas => {
+             const data = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height).data;
+             const off = (at, ...rgba) => rgba.reduce((sum, one, k) => sum + Math.abs(data[at + k] - one), 0);
+             let drawn = 0, red = 0;
+             for (let at = 0; at < data.length; at += 4) {
+               drawn += data[at + 3] > 0;
+               red += off(at, 0xd7, 0x26, 0x3d, 255) < 30;
+             }
+             return [canvas.width, drawn, red];
+           })""",
+    )
+    assert len(found) == 2
+    for width, drawn, red in found:
+        assert width >= 200
+        assert drawn > width * 10, "a road and vehicles"
+        assert red > 20, "the CAV has a red ring"
+
+
+def test_play_lets_time_pass_and_pause_stops_it(open_page: Opener, driven: Path) -> None:
+    visit = open_page(driven)
+    page, button = visit.page, visit.page.locator(".play")
+    before = visit.canvases()
+    assert (visit.time(), button.inner_text()) == (0.0, "Play")
+    page.locator(".pace").select_option("1")
+    button.click()
+    assert button.inner_text() == "Pause"
+    page.wait_for_function("parseFloat(document.querySelector('.clock').textContent) >= 1")
+    button.click()
+    assert button.inner_text() == "Play"
+    stopped, picture = visit.time(), visit.canvases()
+    assert 1 <= stopped < SECONDS
+    assert all(old != new for old, new in zip(before, picture, strict=True))
+    page.wait_for_timeout(150)
+    assert (visit.time(), visit.canvases()) == (stopped, picture)
+
+
+def test_the_replay_stops_at_its_end_and_starts_again_from_the_beginning(
+    open_page: Opener, driven: Path
+) -> None:
+    visit = open_page(driven)
+    page, button = visit.page, visit.page.locator(".play")
+    page.locator(".pace").select_option("30")
+    button.click()
+    page.wait_for_function("document.querySelector('.play').textContent === 'Play'")
+    assert visit.time() == SECONDS
+    assert (
+        page.locator(".time").input_value() == page.locator(".time").get_attribute("max") == str(int(SECONDS))
+    )
+    page.locator(".pace").select_option("1")
+    button.click()
+    page.wait_for_function(f"parseFloat(document.querySelector('.clock').textContent) < {SECONDS}")
+    assert visit.time() < SECONDS / 2
+
+
+def test_pace_is_how_many_times_as_fast_as_life_it_plays(open_page: Opener, driven: Path) -> None:
+    visit = open_page(driven)
+    visit.page.locator(".pace").select_option("5")
+    took = visit.page.evaluate(
+        """() => new Promise(done => {
+             const slider = document.querySelector(".time"), started = performance.now();
+             document.querySelector(".play").click();
+             const look = () => {
+               const shown = Number(slider.value);
+               if (shown < 5) requestAnimationFrame(look);
+               else done((performance.now() - started) / 1000 / shown);
+             };
+             look();
+           })"""
+    )
+    assert took == pytest.approx(1 / 5, rel=0.2)
+
+
+def test_the_slider_shows_any_moment(open_page: Opener, driven: Path) -> None:
+    visit = open_page(driven)
+    pictures = []
+    for moment in ("4", "9.5", "15", "4"):
+        visit.page.locator(".time").fill(moment)
+        assert visit.time() == pytest.approx(float(moment), abs=0.51)
+        pictures.append(visit.canvases())
+    assert pictures[0] == pictures[3]
+    assert len({picture[0] for picture in pictures}) == 3
+
+
+def test_the_mean_speed_under_the_replay_is_that_of_the_moment(open_page: Opener, driven: Path) -> None:
+    visit = open_page(driven)
+    means = visit.page.locator("figcaption small")
+    assert means.all_inner_texts() == ["mean 0.0 m/s"] * 2
+    visit.page.locator(".time").fill("12")
+    assert all(float(text.split()[1]) > 1 for text in means.all_inner_texts())
+
+
+@pytest.mark.parametrize("key", ["Enter", " "])
+def test_the_keyboard_plays_and_pauses(open_page: Opener, driven: Path, key: str) -> None:
+    visit = open_page(driven)
+    visit.page.locator(".pace").select_option("1")
+    visit.page.locator(".play").focus()
+    visit.page.keyboard.press(key)
+    visit.page.wait_for_function("parseFloat(document.querySelector('.clock').textContent) >= 1")
+    visit.page.keyboard.press(key)
+    assert visit.page.locator(".play").get_attribute("aria-label") == "Play"
+
+
+def test_the_keyboard_moves_through_time(open_page: Opener, driven: Path) -> None:
+    visit = open_page(driven)
+    slider = visit.page.locator(".time")
+    slider.focus()
+    moments = []
+    for key in ("End", "Home", "ArrowRight", "ArrowRight", "ArrowLeft"):
+        visit.page.keyboard.press(key)
+        moments.append(float(slider.input_value()))
+    end, home, once, twice, back = moments
+    assert (end, home) == (SECONDS, 0.0)
+    assert 0.1 <= once < twice <= SECONDS / 5, "a key moves by a step that the eye can follow"
+    assert back == pytest.approx(once)
+
+
+def test_all_controls_can_be_reached_by_tab_and_have_names(open_page: Opener, driven: Path) -> None:
+    page = open_page(driven).page
+    page.locator(".play").focus()
+    reached = []
+    for _ in range(3):
+        reached.append(page.evaluate("document.activeElement.className"))
+        page.keyboard.press("Tab")
+    assert reached == ["play", "time", "pace"]
+    for name, role in (("Play", "button"), ("Time", "slider"), ("Pace", "combobox")):
+        assert page.get_by_role(role, name=name).count() == 1  # pyright: ignore[reportArgumentType]
+
+
+def test_the_table_has_all_metrics_of_all_drivers(open_page: Opener, trained: Path) -> None:
+    page = open_page(trained).page
+    assert page.locator("thead th").all_inner_texts() == ["metric", "human", "pi", "trained"]
+    rows = page.locator("tbody tr")
+    assert rows.count() == len(METRICS)
+    for row, metric in zip(rows.all(), METRICS.values(), strict=True):
+        assert row.locator("th").inner_text().replace("\n", " ") == f"{metric.label} {metric.unit}".strip()
+        assert row.locator("td").count() == 3
+        assert all(row.locator("td b").all_inner_texts())
+
+
+def test_a_metric_shows_its_definition_when_pointed_at(open_page: Opener, driven: Path) -> None:
+    page = open_page(driven).page
+    for head, metric in zip(page.locator("tbody th").all(), METRICS.values(), strict=True):
+        assert head.get_attribute("title") == " ".join((metric.function.__doc__ or "").split())
+
+
+def test_metric_names_stay_in_sight_when_a_phone_scrolls_the_table(open_page: Opener, trained: Path) -> None:
+    page = open_page(trained, PHONE).page
+    page.eval_on_selector(".scroll", "scrolled => scrolled.scrollLeft = 1000")
+    assert page.eval_on_selector(".scroll", "scrolled => scrolled.scrollLeft") > 0
+    box = page.locator("tbody th").first.bounding_box()
+    assert box is not None
+    assert 0 <= box["x"] < 40
+
+
+def test_a_run_leads_with_its_gain_and_keeps_its_configuration_at_hand(
+    open_page: Opener, trained: Path
+) -> None:
+    page = open_page(trained).page
+    assert page.title() == page.locator("h1").inner_text() == "ring: a trained residual on pi"
+    assert "On 2 held-out seeds the trained controller earns" in page.locator(".lead").inner_text()
+    assert page.locator(".card").first.inner_text().startswith("Return beyond the expert")
+    code = page.locator("details code")
+    assert not code.is_visible()
+    page.locator("summary", has_text="Configuration").click()
+    assert "steps = 900" in code.inner_text()
+
+
+def test_the_replay_stays_sharp_when_the_window_changes(open_page: Opener, driven: Path) -> None:
+    page = open_page(driven).page
+    for width in (1280, 500):
+        page.set_viewport_size({"width": width, "height": 800})
+        page.wait_for_function(
+            """[...document.querySelectorAll("canvas")].every(
+                 canvas => Math.abs(canvas.width - canvas.clientWidth) <= 1)"""
+        )
+    assert all(len(picture) > 2000 for picture in open_page.visits[0].canvases())
+
+
+@pytest.mark.parametrize("size", [LAPTOP, PHONE], ids=["laptop", "phone"])
+def test_the_page_can_be_photographed_whole(
+    open_page: Opener, driven: Path, tmp_path: Path, size: tuple[int, int]
+) -> None:
+    path = tmp_path / "page.png"
+    open_page(driven, size).page.screenshot(path=path, full_page=True)
+    assert path.stat().st_size > 20_000

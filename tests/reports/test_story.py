@@ -1,0 +1,231 @@
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from unjam.reports.metrics import METRICS
+from unjam.reports.results import Results
+from unjam.reports.statistics import Estimate, estimate
+from unjam.reports.story import (
+    cards_of,
+    cell_of,
+    columns_of,
+    lead_of,
+    notes_of,
+    signed,
+    table_of,
+    title_of,
+)
+
+USUAL: dict[str, Any] = {
+    "status": "completed",
+    "reason": "",
+    **dict.fromkeys(METRICS, 1.0),
+    "min_headway": 2.0,
+}
+USUAL |= {"shield_override_share": 0.0, "collisions": 0.0}
+
+
+def rows_of(returns: list[float], **changes: Any) -> list[dict[str, Any]]:
+    """A row per return, with seeds from zero."""
+    return [{**USUAL, "seed": seed, "return": value, **changes} for seed, value in enumerate(returns)]
+
+
+def failed_rows(count: int) -> list[dict[str, Any]]:
+    nothing = dict.fromkeys(METRICS, float("nan"))
+    return [
+        {**USUAL, **nothing, "seed": seed, "status": "failed", "reason": "no road"} for seed in range(count)
+    ]
+
+
+def trained_on_pi(trained: list[float], pi: list[float], reward: str = "released", **changes: Any) -> Results:
+    rows = {"human": rows_of([0.0] * len(pi)), "pi": rows_of(pi), "trained": rows_of(trained, **changes)}
+    about = {"scenario": "ring", "reward": reward, "trained": "trained", "expert": "pi"}
+    return Results(Path("runs/ring-001"), about, rows, {})
+
+
+def driven(folder: str = "runs/drive-001", scenario: str = "ring", **rows: list[dict[str, Any]]) -> Results:
+    return Results(Path(folder), {"scenario": scenario, "reward": "released"}, rows, {})
+
+
+EXPERT = [100.0, 140.0, 180.0, 120.0]
+
+
+def test_a_gain_above_zero_is_said_to_pay() -> None:
+    lead = lead_of(trained_on_pi([112.0, 148.0, 190.0, 130.0], EXPERT))
+    assert lead.startswith("On 4 held-out seeds the trained controller earns 145 an episode")
+    assert f"its expert pi alone 135: {signed(estimate([12.0, 8.0, 10.0, 10.0]))}." in lead
+    assert lead.endswith("The residual pays.")
+
+
+def test_a_gain_below_zero_is_said_to_make_it_worse() -> None:
+    lead = lead_of(trained_on_pi([90.0, 120.0, 170.0, 100.0], EXPERT))
+    assert "-15 [" in lead
+    assert lead.endswith("The residual makes it worse.")
+
+
+@pytest.mark.parametrize("trained", [[125.0, 125.0, 205.0, 110.0], [90.0, 150.0, 155.0, 125.0], EXPERT])
+def test_a_gain_that_may_be_zero_is_not_claimed(trained: list[float]) -> None:
+    assert lead_of(trained_on_pi(trained, EXPERT)).endswith("No gain is shown: the interval holds zero.")
+
+
+def test_one_seed_shows_no_gain_and_makes_up_no_interval() -> None:
+    result = trained_on_pi([150.0], [100.0])
+    lead = lead_of(result)
+    assert "+50" in lead
+    assert "pays" not in lead
+    assert "holds zero" not in lead
+    assert not any("nan" in text for text in (lead, *(card["detail"] for card in cards_of(result))))
+
+
+def test_a_network_without_an_expert_is_told_by_its_return() -> None:
+    about = {"scenario": "ring", "reward": "released", "trained": "trained", "expert": "none"}
+    lead = lead_of(Results(Path("x"), about, {"trained": rows_of([10.0, 20.0])}, {}))
+    assert lead == "On 2 held-out seeds the trained controller earns 15 an episode."
+
+
+def test_drives_are_told_by_speed_and_share_of_the_limit() -> None:
+    lead = lead_of(driven(pi=rows_of([1.0, 2.0], mean_speed=4.0, speed_limit_ratio_steady=0.83)))
+    assert "pi on ring, 2 episodes" in lead
+    assert "4.00 m/s on average" in lead
+    assert "83 % of the limit" in lead
+
+
+def test_where_every_episode_failed_it_says_so_and_shows_no_nan() -> None:
+    result = driven(pi=failed_rows(2))
+    said = [lead_of(result), *notes_of(result), *(card["value"] for card in cards_of(result))]
+    assert not any("nan" in text for text in said)
+
+
+def test_a_plain_result_has_no_notes() -> None:
+    assert notes_of(trained_on_pi([1.0, 2.0], [1.0, 2.0])) == []
+
+
+def test_collisions_are_noted() -> None:
+    rows = [*rows_of([1.0] * 3), *rows_of([1.0], status="collision"), *failed_rows(1)]
+    assert notes_of(driven(pi=rows)) == ["pi ended in a collision in 1 of 4 episodes."]
+
+
+def test_close_driving_is_noted_with_the_reward_that_does_not_mind() -> None:
+    [note] = notes_of(trained_on_pi([1.0], [1.0], min_headway=0.42))
+    assert "smallest time headway is 0.42 s" in note
+    assert "(released) does not ask for distance" in note
+
+
+def test_close_driving_is_not_blamed_on_a_reward_that_asks_for_distance() -> None:
+    [note] = notes_of(trained_on_pi([1.0], [1.0], reward="eq16", min_headway=0.42))
+    assert note == "trained drives close: its smallest time headway is 0.42 s."
+
+
+@pytest.mark.parametrize("headway", [1.0, float("inf"), float("nan")])
+def test_no_note_where_nobody_drove_close(headway: float) -> None:
+    assert notes_of(trained_on_pi([1.0], [1.0], min_headway=headway)) == []
+
+
+def test_leaning_on_the_safety_check_is_noted() -> None:
+    [note] = notes_of(trained_on_pi([1.0], [1.0], shield_override_share=0.034, shield_max_braking=5.25))
+    assert "overrides 3.4 % of commands" in note
+    assert "5.2 m/s² harder" in note
+    assert notes_of(trained_on_pi([1.0], [1.0], shield_override_share=0.009)) == []
+
+
+def test_traffic_beyond_the_limit_is_explained() -> None:
+    [note] = notes_of(trained_on_pi([1.0], [1.0], speed_limit_ratio_steady=1.034))
+    assert "With trained all vehicles drive at 103 % of the limit" in note
+    assert notes_of(trained_on_pi([1.0], [1.0], speed_limit_ratio_steady=1.005)) == []
+
+
+def test_a_comparison_of_drivers_warns_about_each() -> None:
+    found = driven(human=rows_of([1.0]), pi=rows_of([1.0], min_headway=0.3, status="collision"))
+    assert [note.split()[0] for note in notes_of(found)] == ["pi", "pi"]
+
+
+def test_notes_are_about_the_trained_controller_and_not_its_expert() -> None:
+    result = trained_on_pi([1.0], [1.0])
+    result.rows["pi"][0]["status"] = "collision"
+    assert notes_of(result) == []
+
+
+def test_cards_show_the_gain_first_and_the_humans_beside() -> None:
+    result = trained_on_pi([112.0, 148.0, 190.0, 130.0], EXPERT, speed_limit_ratio_steady=0.914)
+    cards = cards_of(result)
+    assert [card["label"] for card in cards][:2] == [
+        "Return beyond the expert",
+        "Mean speed / limit, steady",
+    ]
+    assert cards[0]["value"] == "+10"
+    assert cards[1]["value"] == "91 %"
+    assert cards[1]["detail"] == "all-human: 100 %"
+
+
+def test_cards_of_a_drive_without_humans_compare_with_nothing() -> None:
+    cards = cards_of(driven(pi=rows_of([1.0, 2.0])))
+    assert len(cards) == 3
+    assert all(card["detail"] == "pi" for card in cards)
+
+
+def test_title_says_what_was_compared() -> None:
+    assert title_of([driven(human=rows_of([1.0]), pi=rows_of([1.0]))]) == "ring: human, pi"
+    assert title_of([trained_on_pi([1.0], [1.0])]) == "ring: a trained residual on pi"
+    both = [driven(pi=rows_of([1.0])), driven(scenario="ring-warm", pi=rows_of([1.0]))]
+    assert title_of(both) == "ring, ring-warm: 2 results compared"
+
+
+def test_a_network_without_an_expert_is_not_titled_a_residual_on_none() -> None:
+    about = {"scenario": "ring", "reward": "released", "trained": "trained", "expert": "none"}
+    assert "none" not in title_of([Results(Path("x"), about, {"trained": rows_of([1.0])}, {})])
+
+
+def test_columns_of_one_folder_are_its_drivers() -> None:
+    assert [column.name for column in columns_of([trained_on_pi([1.0], [1.0])])] == ["human", "pi", "trained"]
+
+
+def test_columns_of_several_folders_say_whose_they_are() -> None:
+    names = [
+        column.name for column in columns_of([driven("a", pi=rows_of([1.0])), driven("b", pi=rows_of([2.0]))])
+    ]
+    assert names == ["a: pi", "b: pi"]
+
+
+def test_drivers_that_runs_have_in_common_are_shown_once() -> None:
+    first, second = trained_on_pi([1.0], [5.0]), trained_on_pi([2.0], [5.0])
+    second = Results(Path("runs/ring-002"), second.about, second.rows, {})
+    names = [column.name for column in columns_of([first, second])]
+    assert names == ["human", "pi", "ring-001: trained", "ring-002: trained"]
+
+
+def test_folders_of_the_same_name_are_both_shown() -> None:
+    columns = columns_of([driven("old/ring", pi=rows_of([1.0])), driven("new/ring", pi=rows_of([2.0]))])
+    assert [column.rows[0]["return"] for column in columns] == [1.0, 2.0]
+    assert len({column.name for column in columns}) == 2
+
+
+def test_the_same_driver_on_another_road_is_not_taken_for_the_same() -> None:
+    ring, warm = trained_on_pi([1.0], [5.0]), trained_on_pi([2.0], [9.0])
+    warm = Results(Path("runs/warm-001"), {**warm.about, "scenario": "ring-warm"}, warm.rows, {})
+    returns = [column.rows[0]["return"] for column in columns_of([ring, warm]) if "pi" in column.name]
+    assert returns == [5.0, 9.0]
+
+
+def test_the_table_has_every_metric_of_every_driver_with_its_definition() -> None:
+    table = table_of(columns_of([trained_on_pi([10.0, 20.0], [5.0, 5.0])]))
+    assert [row["label"] for row in table] == [metric.label for metric in METRICS.values()]
+    assert all(len(row["cells"]) == 3 for row in table)
+    for row, metric in zip(table, METRICS.values(), strict=True):
+        assert row["about"] == " ".join((metric.function.__doc__ or "").split())
+        assert row["unit"] == metric.unit
+    returns = next(row for row in table if row["label"] == "return")["cells"]
+    assert returns[1] == {"mean": "5", "interval": "[5, 5]"}
+    assert returns[2]["mean"] == "15"
+
+
+def test_a_cell_says_how_many_values_it_stands_for() -> None:
+    assert cell_of(estimate([1.0, 1.0]), 2, 2) == {"mean": "1.00", "interval": "[1.00, 1.00]"}
+    assert cell_of(estimate([1.0, 1.0, np.nan]), 1, 3) == {"mean": "1.0", "interval": "[1.0, 1.0] 2 of 3"}
+    assert cell_of(estimate([1.0, np.nan]), 0, 2) == {"mean": "1", "interval": "1 of 2"}
+    assert cell_of(estimate([np.nan]), 0, 1) == {"mean": "–", "interval": ""}
+
+
+def test_a_difference_shows_its_sign() -> None:
+    assert signed(Estimate(3.4, -0.6, 7.0, 5)) == "+3 [-1, +7]"
