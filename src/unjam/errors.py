@@ -35,7 +35,10 @@ class EpisodeError(UnjamError):
     """An episode failed again and again: the message holds what is needed to repeat it."""
 
 
-DISK_ERRNOS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EIO, errno.ENOTDIR)
+DISK_ERRNOS = (
+    *(errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS),
+    *(errno.EACCES, errno.EPERM, errno.EIO, errno.ENOTDIR),
+)
 
 
 def disk_error(error: OSError, path: object) -> DiskError:

@@ -14,7 +14,7 @@ def test_lacc_gives_the_reference_values_of_flow() -> None:
 
 def test_lacc_comes_near_its_command_with_the_lag() -> None:
     driver = LACC(lag=1.0)
-    memory = driver.initial_memory(1)
+    memory, acceleration = driver.initial_memory(1), np.zeros(1)
     for _ in range(10):
         acceleration, memory = driver.act(state_of([0], [0], [15]), memory)
     assert acceleration[0] == pytest.approx(3.0 * (1 - 0.9**10))

@@ -43,7 +43,7 @@ WRONG: dict[str, tuple[str, list[str]]] = {
     "driver file with an error in it": ("SyntaxError", ["drive ring --driver torn.py:gentle"]),
     "driver that cannot be made": ("no battery", ["drive ring --driver mine.py:Raises"]),
     "driver that answers NaN": ("step 0: acceleration", ["drive ring --driver mine.py:broken"]),
-    "driver that answers too many": ("allowed: one for each", ["drive ring --driver mine.py:short"]),
+    "driver that answers too many": ("one for each CAV", ["drive ring --driver mine.py:short"]),
     "driver that raises": (
         "mine.py:raises: ValueError: lost the map (line",
         ["drive ring --driver mine.py:raises"],

@@ -213,10 +213,18 @@ def _outline(radius: float, edges: list[Edge]) -> np.ndarray:
     rows = [
         (bottom.start, 0.0, -radius),
         (top.start + top.length, 0.0, radius),
-        *zip(np.linspace(upper.start, upper.start + upper.length, ARC_POINTS), *_upper_arc(radius).T, strict=True),
+        *zip(
+            np.linspace(upper.start, upper.start + upper.length, ARC_POINTS),
+            *_upper_arc(radius).T,
+            strict=True,
+        ),
         (right.start, radius, 0.0),
         (left.start + left.length, -radius, 0.0),
-        *zip(np.linspace(lower.start, lower.start + lower.length, ARC_POINTS), *_lower_arc(radius).T, strict=True),
+        *zip(
+            np.linspace(lower.start, lower.start + lower.length, ARC_POINTS),
+            *_lower_arc(radius).T,
+            strict=True,
+        ),
         (loop_length(radius), 0.0, -radius),
     ]
     return np.array(rows, dtype=np.float64)

@@ -16,7 +16,7 @@ from unjam.traffic.reward import Outcome, Reward, make_reward, time_headway
 from unjam.traffic.simulation import Simulation
 from unjam.traffic.stepping import Traffic
 
-PROGRESS_STEPS = 500
+PROGRESS_STEPS = 10
 """decisions between two reports of progress"""
 
 Progress = Callable[[int], None]

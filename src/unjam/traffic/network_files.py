@@ -11,7 +11,7 @@ from pathlib import Path
 
 import platformdirs
 
-from unjam.errors import DISK_ERRNOS, MissingPartError, UnjamError, disk_error
+from unjam.errors import DISK_ERRNOS, EpisodeError, MissingPartError, disk_error
 from unjam.scenarios.scenario import Road
 
 
@@ -96,5 +96,7 @@ def _netconvert(road: Road, folder: Path) -> Path:
     ]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode != 0 or not made.exists():
-        raise UnjamError(f"netconvert failed: {(done.stderr or done.stdout).strip().splitlines()[-1:]}")
+        lines = (line.strip() for line in (done.stderr or done.stdout).splitlines())
+        words = "; ".join(line for line in lines if line and line != "Quitting (on error).")
+        raise EpisodeError(f"netconvert cannot make the road: {words}")
     return made

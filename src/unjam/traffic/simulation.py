@@ -5,8 +5,9 @@ import io
 import tempfile
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
-from contextlib import redirect_stdout
+from contextlib import redirect_stdout, suppress
 from functools import partial
+from itertools import dropwhile
 from pathlib import Path
 from types import ModuleType, TracebackType
 from typing import Any, Literal, Self
@@ -77,7 +78,9 @@ class Simulation:
                 self._running = True
             self.step()  # the first step inserts the vehicles and moves none
         except Exception as error:
-            raise EpisodeError(f"SUMO cannot start: {self._reason() or error}") from error
+            self._end()  # only then are SUMO's words in its log, and can the next episode start afresh
+            words = self._reason() or " ".join(str(error).split())
+            raise EpisodeError(f"SUMO cannot start: {words}") from error
 
     def _options(self, network: Path, traffic: Path, step: float, seed: int) -> list[str]:
         return [
@@ -102,7 +105,8 @@ class Simulation:
             lines = [line.strip() for line in self._error_log.read_text().splitlines() if line.strip()]
         except OSError:
             return ""
-        return "; ".join(lines[:3])
+        errors = dropwhile(lambda line: not line.startswith("Error"), lines)  # warnings may come before
+        return "; ".join(line for line in errors if line != "Quitting (on error).")
 
     def speeds(self, ids: Sequence[str]) -> list[float]:
         """Return the speeds of `ids` [m/s]."""
@@ -140,11 +144,16 @@ class Simulation:
         """End the simulation and remove its files; may be called twice."""
         global _open
         if self._running:
-            self._running = False
-            self._sumo.close()
+            self._end()
         self._folder.cleanup()
         if _open is self:
             _open = None
+
+    def _end(self) -> None:
+        """End SUMO; one that is gone already is no error."""
+        self._running = False
+        with suppress(Exception):
+            self._sumo.close()
 
     def __enter__(self) -> Self:
         return self

@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from itertools import compress
 from math import isfinite
 from operator import add
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,6 +57,7 @@ class Traffic:
         self.crashed = False
         self.collisions = 0
         """vehicles in contact with another"""
+        self._controlled = False
         self._noise_generator = np.random.default_rng(noise_seed)
         self._simulation = simulation
         self._record_fuel = record_fuel
@@ -119,6 +121,7 @@ class Traffic:
             ]
             states = self.states(*self.speeds_and_positions(), np.array(self._cavs))
             history = LocalState(*(values[:, moments[::-1]] for values in states))
+        self._controlled = controlled
         if controlled:
             self._simulation.take_control(self.road.cav_ids, scenario.actuation)
             self._be_human([name for name in self.road.vehicle_ids if name not in self.road.cav_ids])
@@ -143,13 +146,11 @@ class Traffic:
             InputError: an acceleration is not finite, or there are not as many as CAVs.
         """
         scenario, cavs = self.scenario, self._cavs
-        if acceleration is None:
+        if not self._controlled:
             for _ in range(scenario.steps_per_decision):
                 self._simulate()
         else:
-            values = [acceleration] if self.single else acceleration.tolist()
-            if len(values) != len(cavs) or not all(map(isfinite, values)):
-                self._refuse(values)
+            values = self._checked(acceleration)
             limit, step = scenario.action_limit, scenario.simulation_step
             applied = [clip(value, -limit, limit) for value in values]
             self._log_applied.fromlist(applied)
@@ -174,9 +175,9 @@ class Traffic:
         if self._commanded:
             self._command_people()
         simulation.step()
-        moved = simulation.speeds(self.road.vehicle_ids)
-        if simulation.vehicle_count() != len(moved):
+        if simulation.vehicle_count() != len(self.road.vehicle_ids):
             self._miss()
+        moved = simulation.speeds(self.road.vehicle_ids)
         self._log_moved.fromlist(moved)
         for place in near:
             near[place] += moved[place] * step
@@ -186,7 +187,7 @@ class Traffic:
             self._speeds = [speed if speed > 0.0 else 0.0 for speed in map(add, moved, noise)]
             simulation.replace_speeds(self._human_ids, compress(self._speeds, self._human_mask))
         self._log_speeds.fromlist(self._speeds)
-        self.collisions = simulation.colliding_count()
+        self.collisions = max(self.collisions, simulation.colliding_count())  # SUMO tells of each only once
         self.crashed = self.collisions > 0
 
     def _command_people(self) -> None:
@@ -264,16 +265,26 @@ class Traffic:
         added = (commanded - moved) / self.scenario.simulation_step
         return added.reshape(-1, self.scenario.steps_per_decision, len(self._cavs)).max(1).clip(0.0, None)
 
-    def _refuse(self, values: list[float]) -> None:
-        """Raise the error for accelerations that cannot be commanded."""
-        where = f"driver: step {len(self._log_applied) // len(self._cavs)}"
-        if len(values) != len(self._cavs):
-            wanted = f"one for each of the {len(self._cavs)} CAVs"
-            raise InputError(f"{where}: {len(values)} accelerations are not allowed; allowed: {wanted}")
-        name, value = next(
-            pair for pair in zip(self.road.cav_ids, values, strict=True) if not isfinite(pair[1])
-        )
-        raise InputError(f"{where}: acceleration of {name} is {value}; allowed: finite")
+    def _checked(self, acceleration: Any) -> list[float]:
+        """Return a driver's answer as plain floats; raise `InputError` where it cannot be commanded."""
+        try:
+            if self.single:
+                values, shape = [float(acceleration)], (1,)
+            else:
+                wanted = np.asarray(acceleration, np.float64)
+                values, shape = wanted.tolist(), wanted.shape
+        except (TypeError, ValueError):
+            raise InputError(f"{self._where()}: acceleration is not numbers: {acceleration!r}") from None
+        if shape != (len(self._cavs),):
+            allowed = f"({len(self._cavs)},), one for each CAV"
+            raise InputError(f"{self._where()}: acceleration has shape {shape}; allowed: {allowed}")
+        for name, value in zip(self.road.cav_ids, values, strict=True):
+            if not isfinite(value):
+                raise InputError(f"{self._where()}: acceleration of {name} is {value}; allowed: finite")
+        return values
+
+    def _where(self) -> str:
+        return f"driver: step {len(self._log_applied) // len(self._cavs)}"
 
     def _miss(self) -> None:
         present, wanted = self._simulation.vehicle_count(), len(self.road.vehicle_ids)

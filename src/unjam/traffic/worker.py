@@ -33,8 +33,6 @@ def main() -> None:
             try:
                 simulation = simulation or Simulation()
                 episode = _run(facts, arrays, simulation, answers)
-            except (BrokenPipeError, EOFError):
-                raise
             except Exception as error:  # every requested episode has a row, also one that failed
                 known = _known(error)
                 episode = failed_episode(tuple(facts["seed"]), str(known), type(known).__name__)
@@ -61,7 +59,10 @@ def _run(facts: dict[str, Any], arrays: Arrays, simulation: Simulation, answers:
         nonlocal last
         if time.monotonic() - last > SIGN_OF_LIFE:
             last = time.monotonic()
-            write_message(answers, {"progress": steps})
+            try:
+                write_message(answers, {"progress": steps})
+            except BrokenPipeError:
+                sys.exit()  # the parent is gone
 
     return run_episode(
         scenario_from_recipe(facts["scenario"]),

@@ -144,6 +144,7 @@ class _Worker:
         self._temporary = temporary
         self._process: subprocess.Popen[bytes] | None = None
         self._stopped = False
+        self._starting = threading.Lock()
 
     def _start(self) -> subprocess.Popen[bytes]:
         # A BLAS with threads of its own would fight with the other workers for the cores.
@@ -164,12 +165,12 @@ class _Worker:
 
     def run(self, task: Message, progress: Callable[[int], object]) -> Episode:
         """Return the episode of a task; raise `_WorkerLost` where the process dies or falls silent."""
-        if self._stopped:
-            raise _WorkerLost("stopped")
-        process = self._process = self._process or self._start()
-        assert process.stdin is not None
+        with self._starting:
+            if self._stopped:
+                raise _WorkerLost("stopped")
+            process = self._process = self._process or self._start()
         try:
-            write_message(process.stdin, *task)
+            self._send(process, task)
             while True:
                 message = self._messages.get(timeout=self._silence)
                 if message is None:
@@ -184,8 +185,21 @@ class _Worker:
         except BrokenPipeError:
             raise _WorkerLost(self._why(process)) from None
 
+    def _send(self, process: subprocess.Popen[bytes], task: Message) -> None:
+        assert process.stdin is not None
+        guard = threading.Timer(self._silence, process.kill)  # a full pipe that nobody reads blocks for ever
+        guard.start()
+        try:
+            write_message(process.stdin, *task)
+        finally:
+            guard.cancel()
+
     def _why(self, process: subprocess.Popen[bytes]) -> str:
-        code = process.wait()
+        try:
+            code = process.wait(timeout=1.0)
+        except subprocess.TimeoutExpired:  # it lives, but what it says cannot be read
+            process.kill()
+            code = process.wait()
         self._process = None
         self._errors.seek(0)
         last = self._errors.read().decode(errors="replace").strip().splitlines()[-1:]
@@ -193,15 +207,16 @@ class _Worker:
         return ": ".join([how, *last])
 
     def _kill(self) -> None:
-        if self._process is not None:
-            self._process.kill()
-            self._process.wait()
-            self._process = None
+        process, self._process = self._process, None
+        if process is not None:
+            process.kill()
+            process.wait()
 
     def stop(self) -> None:
         """End the process, now and for good."""
-        self._stopped = True
-        self._kill()
+        with self._starting:
+            self._stopped = True
+            self._kill()
 
 
 def _read_all(process: subprocess.Popen[bytes], messages: "queue.SimpleQueue[Message | None]") -> None:

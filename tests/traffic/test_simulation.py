@@ -1,0 +1,160 @@
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from unjam.drivers import IDM, PISaturation
+from unjam.errors import EpisodeError, UnjamError
+from unjam.scenarios import Ring
+from unjam.scenarios.scenario import Road
+from unjam.traffic.episode import run_episode
+from unjam.traffic.simulation import Backend, Simulation
+
+from .test_record import fingerprint
+
+RING = Ring(horizon=100, length=(230, 230))
+
+
+@pytest.fixture
+def road(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Road:
+    monkeypatch.setenv("UNJAM_CACHE", str(tmp_path))
+    return RING.draw(np.random.default_rng(0))
+
+
+def test_a_second_simulation_in_one_process_is_refused(simulation: Simulation) -> None:
+    with pytest.raises(UnjamError, match="already open in this process"):
+        Simulation()
+    assert run_episode(RING, IDM(), (0,), simulation=simulation).status == "completed"
+
+
+def test_a_refused_simulation_does_not_make_room_for_a_third(simulation: Simulation) -> None:
+    for _ in range(2):
+        with pytest.raises(UnjamError):
+            Simulation("traci")
+
+
+def test_closing_twice_is_fine_and_makes_room_for_a_new_one(road: Road) -> None:
+    first = Simulation()
+    first.load(road, 0.1, 0)
+    first.close()
+    first.close()
+    with Simulation() as second:
+        first.close()
+        second.load(road, 0.1, 0)
+        assert second.vehicle_count() == 22
+        with pytest.raises(UnjamError, match="already open"):
+            Simulation()
+
+
+def test_one_that_never_ran_can_be_closed() -> None:
+    Simulation().close()
+    Simulation().close()
+
+
+def test_closing_removes_its_files(road: Road, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    with Simulation() as simulation:
+        simulation.load(road, 0.1, 0)
+        assert list(tmp_path.glob("unjam-*/traffic.rou.xml"))
+    assert not list(tmp_path.glob("unjam-*"))
+
+
+def test_an_error_inside_the_block_closes_it(road: Road) -> None:
+    def fail() -> None:
+        with Simulation() as simulation:
+            simulation.load(road, 0.1, 0)
+            raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        fail()
+    Simulation().close()
+
+
+def test_loading_puts_every_vehicle_in_its_place_at_rest(road: Road, simulation: Simulation) -> None:
+    simulation.load(road, 0.1, 0)
+    assert simulation.vehicle_count() == 22
+    assert simulation.speeds(road.vehicle_ids) == [0.0] * 22
+    assert simulation.distances(road.vehicle_ids) == [0.0] * 22
+    assert simulation.colliding_count() == 0
+
+
+BROKEN_TRAFFIC = {
+    '<routes><vehicle id="a" depart="0" route="nowhere"/></routes>': "The route 'nowhere' for vehicle 'a'",
+    '<routes><vehicle id="a" route="nowhere"/></routes>': "Attribute 'depart' is missing",
+    '<routes><vType id="x" carFollowModel="Magic"/></routes>': "Unknown car following model 'Magic'",
+    '<routes><route id="r" edges="elsewhere"/></routes>': "The edge 'elsewhere' within the route 'r'",
+    "<routes": "unexpected end of input",
+}
+
+
+@pytest.mark.parametrize("loaded_before", [False, True])
+@pytest.mark.parametrize(("traffic", "words"), BROKEN_TRAFFIC.items())
+def test_sumos_own_words_about_broken_traffic_reach_the_user_in_one_line(
+    loaded_before: bool, traffic: str, words: str, road: Road, simulation: Simulation
+) -> None:
+    if loaded_before:
+        simulation.load(road, 0.1, 0)
+    with pytest.raises(EpisodeError) as caught:
+        simulation.load(replace(road, traffic=traffic), 0.1, 0)
+    assert words in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_sumos_own_words_come_from_the_child_process_too(road: Road) -> None:
+    for traffic, words in list(BROKEN_TRAFFIC.items())[:2]:
+        with Simulation("traci") as simulation, pytest.raises(EpisodeError) as caught:
+            simulation.load(replace(road, traffic=traffic), 0.1, 0)
+        assert words in str(caught.value)
+
+
+BROKEN_ROADS = {
+    ("nodes", "<nodes"): "unexpected end of input",
+    ("edges", "<edges></edges>"): "No edges loaded",
+    ("netconvert_options", ("--no-such-option", "1")): "no-such-option",
+}
+
+
+@pytest.mark.parametrize(("change", "words"), BROKEN_ROADS.items())
+def test_netconverts_own_words_about_a_broken_road_reach_the_user_in_one_line(
+    change: tuple[str, str], words: str, road: Road, simulation: Simulation
+) -> None:
+    with pytest.raises(EpisodeError) as caught:
+        simulation.load(replace(road, **dict([change])), 0.1, 0)
+    assert words in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_an_error_names_its_own_reason_and_not_an_earlier_one(road: Road, simulation: Simulation) -> None:
+    for traffic, words in BROKEN_TRAFFIC.items():
+        with pytest.raises(EpisodeError) as caught:
+            simulation.load(replace(road, traffic=traffic), 0.1, 0)
+        others = [other for other in BROKEN_TRAFFIC.values() if other != words]
+        assert not any(other in str(caught.value) for other in others)
+
+
+@pytest.mark.parametrize("backend", ["libsumo", "traci"])
+def test_after_a_refused_road_the_next_one_runs_as_in_a_new_simulation(backend: Backend, road: Road) -> None:
+    expected = run_episode(RING, IDM(), (0,))
+    first, second, *_ = BROKEN_TRAFFIC
+    with Simulation(backend) as simulation:
+        with pytest.raises(EpisodeError):
+            simulation.load(replace(road, traffic=first), 0.1, 0)
+        simulation.load(road, 0.1, 0)
+        with pytest.raises(EpisodeError):
+            simulation.load(replace(road, traffic=second), 0.1, 0)
+        assert fingerprint(run_episode(RING, IDM(), (0,), simulation=simulation)) == fingerprint(expected)
+
+
+def test_an_unknown_emission_class_is_told_in_sumos_words(simulation: Simulation) -> None:
+    with pytest.raises(EpisodeError, match="emissionClass with name 'coal' doesn't exist"):
+        run_episode(replace(RING, emission_class="coal"), IDM(), (0,), simulation=simulation)
+
+
+def test_libsumo_and_traci_give_identical_episodes() -> None:
+    found = []
+    for backend in ("libsumo", "traci"):
+        with Simulation(backend) as simulation:
+            episode = run_episode(RING, PISaturation(), (5,), record_fuel=True, simulation=simulation)
+        found.append(fingerprint(episode))
+    assert found[0] == found[1]
