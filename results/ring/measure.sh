@@ -7,7 +7,6 @@ runs=$(mktemp -d)
 measure() {  # name of the file, then the arguments of unjam drive
     name=$1; shift
     unjam drive "$@" --out "$runs/$name" >/dev/null
-    cp "$runs/$name/evaluation.json" "results/ring/$name.json"
 }
 for length in 220 230 240 250 260 270; do
     measure "ring-warm-$length" ring-warm --length $length --episodes 10 \
@@ -18,4 +17,8 @@ measure ring-jammed ring-jammed --episodes 20 -d human -d idm -d pi:time_constan
 measure ring-5 ring-warm --vehicles 5 --length 55 --episodes 5 -d human -d pi
 measure ring-11 ring-warm --vehicles 11 --length 115 --episodes 5 -d human -d pi
 measure ring-44 ring-warm --vehicles 44 --length 520 --episodes 5 -d human -d pi
+# Copied at the end: until then the tree is as committed, and the manifests say so.
+for folder in "$runs"/*; do
+    cp "$folder/evaluation.json" "results/ring/$(basename "$folder").json"
+done
 rm -r "$runs"
