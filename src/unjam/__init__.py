@@ -4,17 +4,21 @@
     result = unjam.drive("ring-jammed", driver="pi", episodes=5, out="runs/first")
     print(result.mean["time_to_dissolve"], result.report)
 
+With it Gymnasium knows `unjam/Ring-v0` and `unjam/FigureEight-v0`.
 The same on the command line: `unjam --help`.
 """
 
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from unjam.environments import register_all
+
 __version__ = "0.1.0.dev0"
 
 if TYPE_CHECKING:
     from unjam.controller import load_controller
     from unjam.drivers import Driver, LocalState, check_driver
+    from unjam.environments.several import parallel_env
     from unjam.experiments.config import load_config
     from unjam.experiments.drive import drive
     from unjam.experiments.train import train
@@ -28,11 +32,14 @@ _PLACES = {
     "load_config": "unjam.experiments.config",
     "load_controller": "unjam.controller",
     "run_episode": "unjam.traffic.episode",
+    "parallel_env": "unjam.environments.several",
     "write_report": "unjam.reports.html",
     "Driver": "unjam.drivers",
     "LocalState": "unjam.drivers",
     "check_driver": "unjam.drivers",
 }
+
+register_all()
 
 __all__ = [
     "Driver",
@@ -41,6 +48,7 @@ __all__ = [
     "drive",
     "load_config",
     "load_controller",
+    "parallel_env",
     "run_episode",
     "train",
     "write_report",

@@ -40,6 +40,7 @@ def shown_of(
     values: dict[str, Any] = {
         "step": 0.1,
         "loop_length": LENGTH,
+        "crossings": [],
         "limit_speed": 6.5,
         "drawn": {"length": LENGTH},
         "vehicle_ids": [f"human_{n}" for n in range(vehicles - 1)] + ["cav_0"],

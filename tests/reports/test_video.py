@@ -7,7 +7,8 @@ import pytest
 from PIL import Image, ImageSequence
 
 from unjam.errors import DiskError, InputError
-from unjam.reports.video import CAV_COLOUR, FRAMES_PER_SECOND, SIZE, check_format, write_video
+from unjam.reports.road_picture import CAV_COLOUR, SIZE
+from unjam.reports.video import FRAMES_PER_SECOND, check_format, write_video
 from unjam.traffic.record import Episode
 
 from .test_metrics import episode_of

@@ -10,6 +10,7 @@ from unjam.scenarios import Ring
 from unjam.scenarios.scenario import Road
 from unjam.traffic.episode import run_episode
 from unjam.traffic.simulation import Backend, Simulation
+from unjam.traffic.stepping import Traffic
 
 from .test_record import fingerprint
 
@@ -31,7 +32,21 @@ def test_a_second_simulation_in_one_process_is_refused(simulation: Simulation) -
 def test_a_refused_simulation_does_not_make_room_for_a_third(simulation: Simulation) -> None:
     for _ in range(2):
         with pytest.raises(UnjamError):
-            Simulation("traci")
+            Simulation()
+
+
+def test_simulations_over_traci_run_beside_it_without_disturbing_it(simulation: Simulation) -> None:
+    expected = run_episode(RING, IDM(), (0,), simulation=simulation)
+    with Simulation("traci") as first, Simulation("traci") as second:
+        traffics = [Traffic(RING, (0,), each) for each in (simulation, first, second)]
+        for traffic in traffics:
+            traffic.start(controlled=False)
+        for _ in range(50):
+            for traffic in traffics:
+                traffic.advance(None)
+    assert traffics[0].speeds == traffics[1].speeds == traffics[2].speeds
+    again = run_episode(RING, IDM(), (0,), simulation=simulation)
+    np.testing.assert_array_equal(again.speeds, expected.speeds)
 
 
 def test_closing_twice_is_fine_and_makes_room_for_a_new_one(road: Road) -> None:

@@ -11,6 +11,7 @@ from unjam.cli.options import (
     JsonOption,
     LengthOption,
     OutOption,
+    RadiusOption,
     RewardOption,
     ScenarioArgument,
     SeedOption,
@@ -37,6 +38,7 @@ def drive(
     episodes: EpisodesOption = 5,
     seed: SeedOption = 0,
     length: LengthOption = None,
+    radius: RadiusOption = None,
     vehicles: VehiclesOption = None,
     cavs: CavsOption = None,
     warmup: WarmupOption = None,
@@ -66,7 +68,7 @@ def drive(
     from unjam.experiments.drive import raise_failures
     from unjam.scenarios.registry import make_scenario
 
-    road = {**road_changes(length, vehicles, cavs, warmup), **assignments(settings)}
+    road = {**road_changes(length, radius, vehicles, cavs, warmup), **assignments(settings)}
     total = make_scenario(scenario, road).horizon * episodes * len(driver)
     folder = new_folder(out, f"drive-{scenario}") if report else None
     with counting_steps(f"driving {scenario}", total) as steps:

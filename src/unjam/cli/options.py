@@ -28,6 +28,9 @@ JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON documen
 LengthOption = Annotated[
     str | None, typer.Option("--length", help="Length of the ring [m]: one, or a range like 220-270.")
 ]
+RadiusOption = Annotated[
+    str | None, typer.Option("--radius", help="Radius of the figure eight [m]: one, or a range like 32-35.")
+]
 VehiclesOption = Annotated[int | None, typer.Option("--vehicles", help="Number of vehicles.")]
 CavsOption = Annotated[int | None, typer.Option("--cavs", help="Number of CAVs among them.")]
 WarmupOption = Annotated[
@@ -38,20 +41,26 @@ DEFAULT_WORKERS = os.cpu_count() or 1
 
 
 def road_changes(
-    length: str | None, vehicles: int | None, cavs: int | None, warmup: int | None
+    length: str | None, radius: str | None, vehicles: int | None, cavs: int | None, warmup: int | None
 ) -> dict[str, Any]:
     """Return the changes to a scenario that the road options ask for."""
-    asked = {"length": parse_range(length), "vehicles": vehicles, "cavs": cavs, "warmup": warmup}
+    asked = {
+        "length": parse_range("length", length),
+        "radius": parse_range("radius", radius),
+        "vehicles": vehicles,
+        "cavs": cavs,
+        "warmup": warmup,
+    }
     return {name: value for name, value in asked.items() if value is not None}
 
 
-def parse_range(text: str | None) -> tuple[int, int] | None:
+def parse_range(name: str, text: str | None) -> tuple[int, int] | None:
     """Return (230, 230) for `230` and (220, 270) for `220-270`."""
     if text is None:
         return None
     parts = text.split("-")
     if len(parts) > 2 or not all(part.strip().isdigit() for part in parts):
-        raise InputError(f"length: {text!r} is not allowed; allowed: metres, like 230 or 220-270")
+        raise InputError(f"{name}: {text!r} is not allowed; allowed: metres, like 230 or 220-270")
     return int(parts[0]), int(parts[-1])
 
 

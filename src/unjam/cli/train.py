@@ -13,6 +13,7 @@ from unjam.cli.options import (
     JsonOption,
     LengthOption,
     OutOption,
+    RadiusOption,
     RewardOption,
     VehiclesOption,
     WarmupOption,
@@ -46,6 +47,7 @@ def train(
     ] = None,
     reward: RewardOption = "",
     length: LengthOption = None,
+    radius: RadiusOption = None,
     vehicles: VehiclesOption = None,
     cavs: CavsOption = None,
     warmup: WarmupOption = None,
@@ -78,7 +80,9 @@ def train(
     flags = {"scenario": scenario, "steps": steps, "seed": seed, "agent": agent, "expert": expert}
     changes: dict[str, Any] = {key: value for key, value in flags.items() if value is not None}
     changes |= {"reward": reward} if reward else {}
-    changes |= {f"road.{key}": value for key, value in road_changes(length, vehicles, cavs, warmup).items()}
+    changes |= {
+        f"road.{key}": value for key, value in road_changes(length, radius, vehicles, cavs, warmup).items()
+    }
     changes |= {"workers": workers}
     for key, value in assignments(settings).items():
         if key == "out":

@@ -9,6 +9,7 @@ from unjam.cli.options import (
     CavsOption,
     JsonOption,
     LengthOption,
+    RadiusOption,
     ScenarioArgument,
     SeedOption,
     VehiclesOption,
@@ -29,6 +30,7 @@ def watch(
     ] = None,
     pace: Annotated[float, typer.Option(min=0.1, max=1000.0, help="Times as fast as life.")] = 10.0,
     length: LengthOption = None,
+    radius: RadiusOption = None,
     vehicles: VehiclesOption = None,
     cavs: CavsOption = None,
     warmup: WarmupOption = None,
@@ -56,7 +58,9 @@ def watch(
     from unjam.scenarios.registry import make_scenario
     from unjam.traffic.workers import EpisodeTask, Workers
 
-    road = make_scenario(scenario, {**road_changes(length, vehicles, cavs, warmup), **assignments(settings)})
+    road = make_scenario(
+        scenario, {**road_changes(length, radius, vehicles, cavs, warmup), **assignments(settings)}
+    )
     driven = make_driver(driver, road.decision_step)
     if video is None:
         episode = watch_in_window(road, driven, (seed,), pace)

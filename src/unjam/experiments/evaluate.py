@@ -108,6 +108,7 @@ def save_evaluation(folder: Path, evaluation: Evaluation, about: dict[str, Any])
             "seed": list(episode.seed),
             "drawn": episode.drawn,
             "loop_length": episode.loop_length,
+            "crossings": episode.crossings,
             "limit_speed": episode.limit_speed,
             "vehicle_ids": episode.vehicle_ids,
             "cav_ids": episode.cav_ids,

@@ -74,7 +74,8 @@ def speed_scale(shown: Sequence[Shown]) -> Normalize:
 def space_time(shown: Sequence[Shown], wide: bool = True) -> Figure:
     """Draw where every vehicle is at every time, coloured by speed; a panel per driver, all on one scale.
 
-    A stop-and-go wave is a dark band that runs against the direction of travel.
+    A stop-and-go wave is a dark band that runs against the direction of travel. Where the road crosses itself
+    is shaded.
     """
     count = len(shown)
     with rc_context(STYLE):
@@ -90,7 +91,7 @@ def space_time(shown: Sequence[Shown], wide: bool = True) -> Figure:
             _trajectories(axes, shown[number], scale)
             axes.set_title(shown[number].driver, loc="left", fontsize=10, color=INK)
             if number % columns == 0:
-                axes.set_ylabel("position on the ring [m]")
+                axes.set_ylabel("position along the road [m]")
             if number + columns >= count:
                 axes.set_xlabel("time [s]")
                 axes.tick_params(labelbottom=True)
@@ -109,11 +110,13 @@ def _trajectories(axes: Axes, episode: Shown, scale: Normalize) -> None:
     every = max(1, len(episode.times) // POINTS_IN_TIME)
     times = episode.times[::every]
     axes.grid(False)
+    for start, end in episode.crossings:
+        axes.axhspan(start, end, color=GRID, lw=0)
     for column in range(episode.speeds.shape[1]):
         position = episode.positions[::every, column] % episode.loop_length
         points = np.column_stack([times, position])
         segments = np.stack([points[:-1], points[1:]], axis=1)
-        keep = np.abs(np.diff(position)) < episode.loop_length / 2  # not across the seam of the ring
+        keep = np.abs(np.diff(position)) < episode.loop_length / 2  # not across the seam of the road
         is_cav = column in episode.cavs
         lines = LineCollection(
             list(segments[keep]),

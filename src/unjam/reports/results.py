@@ -25,6 +25,8 @@ class Shown:
     step: float
     """time between two decisions [s]"""
     loop_length: float
+    crossings: list[list[float]]
+    """where along the road it crosses itself [m]"""
     limit_speed: float
     drawn: dict[str, float]
     vehicle_ids: list[str]

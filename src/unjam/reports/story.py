@@ -161,7 +161,9 @@ def _notes_of(result: Results, label: str) -> list[str]:
 
 
 def cards_of(result: Results) -> list[dict[str, str]]:
-    """Return the key figures of a folder, for its trained controller or its only driver."""
+    """Return the key figures of a folder, for its trained controller or its only driver; of several none."""
+    if result.trained is None and len(result.rows) > 1:
+        return []
     label = result.trained or next(iter(result.rows))
     rows = result.rows[label]
 

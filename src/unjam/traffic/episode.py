@@ -116,6 +116,7 @@ def _episode(traffic: Traffic, seed: Sequence[int], reward: Reward, log: Residua
         warmup=traffic.scenario.warmup,
         drawn=road.drawn,
         loop_length=road.loop_length,
+        crossings=road.crossings,
         limit_speed=road.limit_speed,
         vehicle_ids=road.vehicle_ids,
         cav_ids=road.cav_ids,

@@ -69,6 +69,8 @@ class Episode:
     """what the seed has drawn, by name"""
     loop_length: float = float("nan")
     """[m]"""
+    crossings: tuple[tuple[float, float], ...] = ()
+    """where along the road it crosses itself [m]"""
     limit_speed: float = float("nan")
     """the scenario's own limit of speed [m/s]"""
     vehicle_ids: tuple[str, ...] = ()
@@ -150,5 +152,6 @@ def unpack_episode(facts: dict[str, Any], arrays: dict[str, Floats]) -> Episode:
     values: dict[str, Any] = {**facts, **{name: arrays[name] for name in _ARRAYS}}
     for name in ("seed", "vehicle_ids", "cav_ids"):
         values[name] = tuple(values[name])
+    values["crossings"] = tuple((start, end) for start, end in values["crossings"])
     values["trajectories"] = tuple(trajectories)
     return Episode(**values)

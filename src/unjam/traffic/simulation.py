@@ -7,7 +7,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import redirect_stdout, suppress
 from functools import partial
-from itertools import dropwhile
+from itertools import count, dropwhile
 from pathlib import Path
 from types import ModuleType, TracebackType
 from typing import Any, Literal, Self
@@ -26,25 +26,37 @@ _exhaust = deque(maxlen=0).extend
 """runs through an iterator, in C: a loop would cost as much as the calls"""
 
 _open: "Simulation | None" = None
+"""the one simulation that libsumo runs in this process"""
+_labels = count()
+"""of connections over TraCI, of which a process may have many"""
 
 
 class Simulation:
     """One SUMO simulation, loaded anew for each episode.
 
     libsumo holds one simulation per process and silently replaces the first by a second, so this class
-    refuses to open another while one is open.
+    refuses to open another while one is open. Over TraCI there may be several, each a process of its own.
     """
 
     def __init__(self, backend: Backend = "libsumo", gui_options: Sequence[str] = ()) -> None:
         """Open a simulation; nothing runs before `load`. `gui_options` go to SUMO's window."""
         global _open
-        if _open is not None:
-            raise UnjamError("a simulation is already open in this process; close it, or use another process")
+        if backend == "libsumo":
+            if _open is not None:
+                raise UnjamError(
+                    "a simulation is already open in this process; close it, or use another process"
+                )
+            _open = self
         self.backend = backend
         self._gui_options = gui_options
-        self._sumo = _import(backend)
+        self._sumo: Any = _import(backend)
         self._folder = tempfile.TemporaryDirectory(prefix="unjam-")
         self._running = False
+        if backend == "libsumo":
+            self._bind()
+
+    def _bind(self) -> None:
+        """Look up the functions that are called often."""
         call = partial(_function, self._sumo)
         self._get_speed = call("vehicle", "getSpeed")
         self._get_distance = call("vehicle", "getDistance")
@@ -57,7 +69,6 @@ class Simulation:
         """how many vehicles touched another in the last step"""
         self.step: Callable[[], object] = call("simulation", "step")
         """simulates one time step"""
-        _open = self
 
     def load(self, road: Road, step: float, seed: int) -> None:
         """Start an episode: load network and traffic, and put the vehicles on the road.
@@ -73,14 +84,24 @@ class Simulation:
                 self._sumo.load(options)
             else:
                 program = "sumo-gui" if self.backend == "gui" else "sumo"
-                with redirect_stdout(io.StringIO()):  # traci announces each of its attempts to connect
-                    self._sumo.start([sumo_program(program), *options, *self._gui_options])
+                self._start([sumo_program(program), *options, *self._gui_options])
                 self._running = True
             self.step()  # the first step inserts the vehicles and moves none
         except Exception as error:
             self._end()  # only then are SUMO's words in its log, and can the next episode start afresh
             words = self._reason() or " ".join(str(error).split())
             raise EpisodeError(f"SUMO cannot start: {words}") from error
+
+    def _start(self, command: list[str]) -> None:
+        if self.backend == "libsumo":
+            self._sumo.start(command)
+            return
+        label = f"unjam-{next(_labels)}"
+        traci = _import("traci")
+        with redirect_stdout(io.StringIO()):  # traci announces each of its attempts to connect
+            traci.start(command, label=label)
+        self._sumo = traci.getConnection(label)
+        self._bind()
 
     def _options(self, network: Path, traffic: Path, step: float, seed: int) -> list[str]:
         return [
@@ -164,7 +185,12 @@ class Simulation:
         self.close()
 
 
-def _function(sumo: ModuleType, domain: str, name: str) -> Callable[..., Any]:
+def libsumo_is_taken() -> bool:
+    """Return whether a simulation is open in this process."""
+    return _open is not None
+
+
+def _function(sumo: Any, domain: str, name: str) -> Callable[..., Any]:
     """Return a function of libsumo or traci; of libsumo the compiled one, without its Python wrapper.
 
     The wrapper only passes its arguments on, and is a third of the cost of a call.

@@ -128,6 +128,15 @@ class Traffic:
         self._forget()
         return history
 
+    @property
+    def speeds(self) -> list[float]:
+        """Speeds of all vehicles now [m/s], in road order."""
+        return self._speeds
+
+    def positions(self) -> NDArray[np.float64]:
+        """Return where the front bumpers of all vehicles are now along the road, not wrapped [m]."""
+        return self.road.start_positions + np.array(self._simulation.distances(self.road.vehicle_ids))
+
     def local_state(self) -> LocalState:
         """Return what the CAVs perceive now: arrays of shape (CAVs,), or plain numbers of a single one."""
         near = self._near_positions
@@ -236,8 +245,7 @@ class Traffic:
         moved = np.array(self._log_moved).reshape(-1, len(start)).T
         speeds = np.array(self._log_speeds).reshape(-1, len(start)).T
         positions = np.column_stack([start, next_position(start[:, None], moved.cumsum(1), step)])
-        odometer = road.start_positions + np.array(self._simulation.distances(road.vehicle_ids))
-        error = float(np.abs(positions[:, -1] - odometer).max())
+        error = float(np.abs(positions[:, -1] - self.positions()).max())
         if error > ODOMETER_TOLERANCE:
             raise EpisodeError(f"positions differ from SUMO's odometer by {error:.2g} m")
         return speeds, positions

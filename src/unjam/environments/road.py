@@ -1,0 +1,150 @@
+"""One road, stepped from outside: what the views for Gymnasium and PettingZoo have in common."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from unjam.controller import make_driver
+from unjam.drivers.constant import Constant
+from unjam.drivers.local_state import ObservationPart
+from unjam.drivers.residual import observation_size, observe
+from unjam.errors import UnjamError
+from unjam.physics.arrays import clip
+from unjam.scenarios.registry import make_scenario
+from unjam.traffic.reward import Outcome, make_reward, time_headway
+from unjam.traffic.simulation import Backend, Simulation, libsumo_is_taken
+from unjam.traffic.stepping import Traffic
+
+Observations = NDArray[np.float32]
+
+LARGEST_OBSERVATION = 50.0
+"""bound of every number of an observation; larger ones are cut"""
+
+
+@dataclass(frozen=True)
+class Step:
+    """What one decision led to."""
+
+    observations: Observations
+    """shape (CAVs, numbers)"""
+    reward: float
+    terms: dict[str, float]
+    """the reward's terms by name"""
+    terminated: bool
+    """whether there was a collision"""
+    truncated: bool
+    """whether the horizon is reached"""
+
+
+class SteppedRoad:
+    """A road whose CAVs get their accelerations from outside, one decision at a time."""
+
+    def __init__(
+        self,
+        scenario: str,
+        changes: dict[str, Any],
+        reward: str = "",
+        expert: str = "",
+        observe_parts: Sequence[ObservationPart] = ("local",),
+        backend: Backend = "libsumo",
+    ) -> None:
+        """Prepare a road; SUMO is opened by the first `reset`.
+
+        Args:
+            scenario: its name.
+            changes: to its parameters.
+            reward: a name or `path.py:name`; empty: the scenario's own.
+            expert: a driver to whose acceleration actions are added; empty: actions are all there is.
+            observe_parts: of the observation.
+            backend: how SUMO runs.
+
+        Raises:
+            InputError: something of it is wrong.
+        """
+        self.scenario = make_scenario(scenario, changes)
+        self._reward = make_reward(reward or self.scenario.reward)
+        self._expert = make_driver(expert, self.scenario.decision_step) if expert else Constant()
+        self._parts = tuple(observe_parts)
+        self._backend: Backend = backend
+        self._simulation: Simulation | None = None
+        self._traffic: Traffic | None = None
+        self._numbers = observation_size(self._parts, self._expert)
+
+    @property
+    def observation_space(self) -> spaces.Box:
+        """Of one CAV."""
+        bound = np.full(self._numbers, LARGEST_OBSERVATION, np.float32)
+        return spaces.Box(-bound, bound, dtype=np.float32)
+
+    @property
+    def action_space(self) -> spaces.Box:
+        """Of one CAV: acceleration [m/s2]."""
+        limit = np.full(1, self.scenario.action_limit, np.float32)
+        return spaces.Box(-limit, limit, dtype=np.float32)
+
+    def reset(self, seed: Sequence[int]) -> Observations:
+        """Start the episode of `seed`, run its warm-up, and return the first observations."""
+        self._traffic = traffic = Traffic(self.scenario, seed, self._open())
+        history = traffic.start(controlled=True)
+        self._memory = self._expert.initial_memory(len(traffic.road.cav_ids))
+        if history is not None and self.scenario.recall_warmup:
+            self._memory = self._expert.recall(self._memory, history)
+        self._decisions = 0
+        return self._look()
+
+    def step(self, actions: Any) -> Step:
+        """Make one decision: `actions`, shape (CAVs,), added to the expert's accelerations [m/s2]."""
+        traffic = self.traffic
+        limit = self.scenario.action_limit
+        applied = clip(self._wanted + np.asarray(actions, np.float64), -limit, limit)
+        traffic.advance(applied)
+        self._memory = self._after
+        self._decisions += 1
+        speeds, state = np.array(traffic.speeds), traffic.local_state()
+        headways = time_headway(state.leader_gap, state.speed)
+        outcome = Outcome(speeds[None], applied[None], headways[None], np.array([traffic.crashed]))
+        terms = {name: float(values[0]) for name, values in self._reward(outcome).items()}
+        ended = self._decisions >= self.scenario.horizon
+        truncated = ended and not traffic.crashed
+        return Step(self._look(), sum(terms.values()), terms, traffic.crashed, truncated)
+
+    @property
+    def traffic(self) -> Traffic:
+        """The traffic of the running episode.
+
+        Raises:
+            UnjamError: there is none.
+        """
+        if self._traffic is None:
+            raise UnjamError("no episode is running: call reset first")
+        return self._traffic
+
+    def _look(self) -> Observations:
+        """Return what each CAV observes now, and keep what its expert wants."""
+        state = self.traffic.local_state()
+        limit = self.scenario.action_limit
+        wanted, self._after = self._expert.act(state, self._memory)
+        self._wanted = clip(wanted, -limit, limit)
+        seen = observe(self._parts, state, self._wanted, self._expert, self._after)
+        return seen.clip(-LARGEST_OBSERVATION, LARGEST_OBSERVATION).astype(np.float32)
+
+    def _open(self) -> Simulation:
+        """Return the simulation, opened when first needed.
+
+        libsumo runs one in a process; where it is taken, this road runs over TraCI: the same, but slower.
+        """
+        if self._simulation is None:
+            taken = self._backend == "libsumo" and libsumo_is_taken()
+            self._simulation = Simulation("traci" if taken else self._backend)
+        return self._simulation
+
+    def close(self) -> None:
+        """End SUMO; may be called twice."""
+        self._traffic = None
+        if self._simulation is not None:
+            self._simulation.close()
+            self._simulation = None

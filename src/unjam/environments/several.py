@@ -1,0 +1,93 @@
+"""A road with several CAVs as a PettingZoo environment."""
+
+from collections.abc import Sequence
+from typing import Any, ClassVar
+
+import numpy as np
+from gymnasium import spaces
+from pettingzoo import ParallelEnv
+
+from unjam.drivers.local_state import ObservationPart
+from unjam.environments.road import Observations, SteppedRoad
+
+
+class ParallelRoad(ParallelEnv[str, Any, Any]):
+    """Several CAVs among people; all earn the same reward, that of the road.
+
+    Action and observation of each are those of `RoadEnv`.
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {"name": "unjam_road_v0", "render_modes": []}  # pyright: ignore
+
+    def __init__(
+        self,
+        scenario: str = "ring",
+        reward: str = "",
+        expert: str = "",
+        observe: Sequence[ObservationPart] = ("local",),
+        **changes: Any,
+    ) -> None:
+        """Prepare the environment; the arguments are those of `RoadEnv`."""
+        self._road = SteppedRoad(scenario, changes, reward, expert, observe)
+        road = self._road.scenario.draw(np.random.default_rng(0))
+        self.possible_agents = list(road.cav_ids)
+        self.agents: list[str] = []
+        self.render_mode = None
+        self.observation_spaces = dict.fromkeys(self.possible_agents, self._road.observation_space)
+        self.action_spaces = dict.fromkeys(self.possible_agents, self._road.action_space)
+        self._seed: int | None = None
+        self._episodes = 0
+
+    def observation_space(self, agent: str) -> spaces.Box:
+        """Return the observation space of one CAV."""
+        return self.observation_spaces[agent]  # pyright: ignore[reportReturnType]
+
+    def action_space(self, agent: str) -> spaces.Box:
+        """Return the action space of one CAV."""
+        return self.action_spaces[agent]  # pyright: ignore[reportReturnType]
+
+    def reset(
+        self, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Start an episode: that of `seed`; without one, the next after the last seed's."""
+        if seed is not None:
+            self._seed, self._episodes = seed, 0
+        if self._seed is None:
+            self._seed = int(np.random.default_rng().integers(2**31))
+        numbers = (self._seed, self._episodes) if self._episodes else (self._seed,)
+        self._episodes += 1
+        observations = self._road.reset(numbers)
+        self.agents = list(self._road.traffic.road.cav_ids)
+        return self._by_agent(observations), {agent: {} for agent in self.agents}
+
+    def step(self, actions: dict[str, Any]) -> tuple[dict[str, Any], ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """Make one decision of every CAV."""
+        if not self.agents:
+            return {}, {}, {}, {}, {}
+        agents = self.agents
+        done = self._road.step([float(np.asarray(actions[agent]).reshape(())) for agent in agents])
+        answer = (
+            self._by_agent(done.observations),
+            dict.fromkeys(agents, done.reward),
+            dict.fromkeys(agents, done.terminated),
+            dict.fromkeys(agents, done.truncated),
+            {agent: {"terms": done.terms} for agent in agents},
+        )
+        if done.terminated or done.truncated:
+            self.agents = []
+        return answer
+
+    def _by_agent(self, observations: Observations) -> dict[str, Any]:
+        return dict(zip(self.agents, observations, strict=True))
+
+    def render(self) -> None:
+        """Draw nothing."""
+
+    def close(self) -> None:
+        """End SUMO; may be called twice."""
+        self._road.close()
+
+
+def parallel_env(scenario: str = "ring", **arguments: Any) -> ParallelRoad:
+    """Return a road with several CAVs as a PettingZoo environment; arguments are those of `RoadEnv`."""
+    return ParallelRoad(scenario, **arguments)

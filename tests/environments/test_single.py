@@ -1,0 +1,169 @@
+import re
+import subprocess
+import sys
+import warnings
+from collections.abc import Iterator
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from stable_baselines3.common.env_checker import check_env as check_env_of_sb3
+
+import unjam
+from unjam.drivers import Constant
+from unjam.drivers.registry import named_driver
+from unjam.environments.single import RoadEnv
+from unjam.errors import InputError, UnjamError
+from unjam.scenarios import make_scenario
+from unjam.traffic.episode import run_episode
+
+NAMES = {"unjam/Ring-v0": "ring", "unjam/FigureEight-v0": "figure-eight"}
+SHORT: Any = {"horizon": 60}
+
+
+@pytest.fixture(params=NAMES)
+def environment(request: pytest.FixtureRequest) -> Iterator[gymnasium.Env]:
+    made = gymnasium.make(request.param, **SHORT)
+    yield made
+    made.close()
+
+
+def test_passes_the_checks_of_gymnasium_and_stable_baselines3_without_warnings(
+    environment: gymnasium.Env,
+) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_env(environment.unwrapped, skip_render_check=True)
+        check_env_of_sb3(environment.unwrapped)
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("warmup", [0, 50])
+def test_steps_the_very_episode_that_run_episode_runs(name: str, warmup: int) -> None:
+    changes: Any = {"horizon": 120, "warmup": warmup}
+    scenario = make_scenario(NAMES[name], changes)
+    expected = run_episode(scenario, Constant(acceleration=0.3), (7,))
+    environment = gymnasium.make(name, **changes)
+    environment.reset(seed=7)
+    speeds, rewards = [], []
+    done = False
+    while not done:
+        _, reward, terminated, truncated, info = environment.step(np.array([0.3]))
+        done = terminated or truncated
+        speeds.append(environment.unwrapped._road.traffic.speeds)  # pyright: ignore[reportAttributeAccessIssue]
+        rewards.append(reward)
+        assert sum(info["terms"].values()) == reward
+    environment.close()
+    np.testing.assert_array_equal(speeds, expected.speeds[1:])
+    np.testing.assert_allclose(rewards, expected.trajectories[0].reward, atol=1e-12)
+
+
+def test_actions_are_added_to_an_expert(environment: gymnasium.Env) -> None:
+    environment.close()
+    made = RoadEnv("ring", expert="pi", observe=("local", "expert_acceleration", "expert_memory"), **SHORT)
+    assert made.observation_space.shape == (8,)
+    made.reset(seed=3)
+    speeds = []
+    for _ in range(60):
+        made.step(np.zeros(1))
+        speeds.append(made._road.traffic.speeds)
+    made.close()
+    expected = run_episode(make_scenario("ring", SHORT), named_driver("pi", 0.1), (3,))
+    np.testing.assert_array_equal(speeds, expected.speeds[1:])
+
+
+def test_the_horizon_truncates_and_does_not_terminate(environment: gymnasium.Env) -> None:
+    environment.reset(seed=1)
+    ends = [environment.step(np.zeros(1))[2:4] for _ in range(60)]
+    assert ends[:-1] == [(False, False)] * 59
+    assert ends[-1] == (False, True)
+
+
+def test_a_collision_terminates_and_does_not_truncate() -> None:
+    environment = RoadEnv("ring", actuation="raw", length=(160, 160))
+    environment.reset(seed=0)
+    terminated = truncated = False
+    while not (terminated or truncated):
+        *_, terminated, truncated, _ = environment.step(np.ones(1))
+    environment.close()
+    assert terminated
+    assert not truncated
+
+
+def test_the_same_seed_starts_the_same_episode_and_later_ones_differ() -> None:
+    environment = RoadEnv(**SHORT)
+    first = environment.reset(seed=5)[1]["drawn"]
+    following = [environment.reset()[1]["drawn"] for _ in range(6)]
+    assert environment.reset(seed=5)[1]["drawn"] == first
+    assert [environment.reset()[1]["drawn"] for _ in range(6)] == following
+    assert len({entry["length"] for entry in following}) > 1
+    environment.close()
+
+
+def test_environments_of_one_process_do_not_disturb_each_other() -> None:
+    alone, seen = RoadEnv(**SHORT), []
+    alone.reset(seed=0)
+    expected = [alone.step(np.full(1, 0.5))[0] for _ in range(40)]
+    other, third = RoadEnv(**SHORT), RoadEnv("figure-eight", **SHORT)
+    for environment in (alone, other, third):
+        environment.reset(seed=0)
+    for _ in range(40):
+        third.step(np.zeros(1))
+        seen.append((alone.step(np.full(1, 0.5))[0], other.step(np.full(1, 0.5))[0]))
+    for environment in (alone, other, third):
+        environment.close()
+        environment.close()
+    np.testing.assert_array_equal([first for first, _ in seen], expected)
+    np.testing.assert_array_equal([second for _, second in seen], expected)
+
+
+def test_stepping_before_a_reset_is_told() -> None:
+    with pytest.raises(UnjamError, match="call reset first"):
+        RoadEnv().step(np.zeros(1))
+
+
+def test_several_at_once_in_processes() -> None:
+    environments = gymnasium.make_vec("unjam/Ring-v0", num_envs=2, vectorization_mode="async", **SHORT)
+    observations, _ = environments.reset(seed=[1, 2])  # pyright: ignore[reportArgumentType]
+    assert observations.shape == (2, 5)
+    observations, rewards, *_ = environments.step(np.zeros((2, 1), np.float32))
+    assert observations.shape == (2, 5)
+    assert rewards.shape == (2,)
+    environments.close()
+
+
+@pytest.mark.parametrize("scenario", ["ring", "figure-eight"])
+def test_renders_the_road_with_its_cav(scenario: str) -> None:
+    environment = RoadEnv(scenario, render_mode="rgb_array", **SHORT)
+    environment.reset(seed=0)
+    picture = environment.render()
+    assert picture.shape == (640, 640, 3)
+    assert picture.dtype == np.uint8
+    red = (picture[..., 0] > 180) & (picture[..., 1] < 90) & (picture[..., 2] < 120)
+    assert red.sum() > 20
+    environment.step(np.ones(1))
+    environment.close()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ({"cavs": 2}, "use unjam.parallel_env"),
+        ({"render_mode": "cinema"}, "human, rgb_array"),
+        ({"scenario": "moon"}, "ring, ring-warm"),
+        ({"lenght": (230, 230)}, "lenght: unknown name"),
+        ({"expert": "nobody"}, "nobody"),
+    ],
+)
+def test_wrong_arguments_get_one_clear_line(arguments: Any, words: str) -> None:
+    with pytest.raises(InputError, match=re.escape(words)):
+        RoadEnv(**arguments)
+
+
+def test_gymnasium_knows_the_environments_after_importing_unjam() -> None:
+    code = "import unjam, gymnasium; print(sorted(n for n in gymnasium.registry if n.startswith('unjam/')))"
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert ran.stdout.strip() == str(sorted(NAMES))
+    assert unjam.__version__
