@@ -3,7 +3,8 @@
 # Each JSON file here is the evaluation.json of one `unjam drive`, its manifest included. About five minutes.
 set -eu
 cd "$(dirname "$0")/../.."
-runs=$(mktemp -d)
+runs=runs/for-the-docs
+rm -rf "$runs"
 measure() {  # name of the file, then the arguments of unjam drive
     name=$1; shift
     unjam drive "$@" --out "$runs/$name" >/dev/null

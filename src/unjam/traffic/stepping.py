@@ -14,18 +14,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from unjam.drivers.idm import SMALLEST_GAP
 from unjam.drivers.local_state import LocalState
 from unjam.errors import EpisodeError, InputError
-from unjam.physics.arrays import Array, at_least, clip
-from unjam.physics.idm import idm_acceleration
-from unjam.physics.kinematics import gap_on_loop, next_position, next_speed
-from unjam.scenarios.scenario import VEHICLE_LENGTH, Scenario
+from unjam.physics.arrays import Array, clip
+from unjam.physics.kinematics import next_position, next_speed
+from unjam.scenarios.scenario import Scenario
 from unjam.traffic.neighbours import loop_neighbours, loop_state
+from unjam.traffic.people import wanted_speeds
 from unjam.traffic.simulation import Simulation
 
-LEAVE_TO_SUMO = -1.0
-"""the commanded speed that stands for none"""
 HISTORY = 60.0
 """seconds of the warm-up that a driver may remember"""
 WARMUP_PROGRESS_STEPS = 500
@@ -200,25 +197,12 @@ class Traffic:
         self.crashed = self.collisions > 0
 
     def _command_people(self) -> None:
-        """Ask for the speeds that people want: the IDM's with its noise; on a crossing SUMO's own."""
-        scenario, road, speeds, positions = self.scenario, self.road, self._speeds, self._near_positions
-        step, loop, humans, count = scenario.simulation_step, road.loop_length, scenario.humans, len(speeds)
-        if scenario.noise > 0:
+        """Ask for the speeds that people want."""
+        people = list(compress(range(len(self._speeds)), self._human_mask))
+        noise = [0.0] * len(self._speeds)
+        if self.scenario.noise > 0:
             noise = self._noise_rows.pop() if self._noise_rows else self._draw_noise()
-        else:
-            noise = [0.0] * count
-        wanted = []
-        for place in compress(range(count), self._human_mask):
-            position = positions[place]
-            on_road = position % loop
-            if any(start <= on_road < end for start, end in road.crossings):
-                wanted.append(LEAVE_TO_SUMO)
-                continue
-            ahead = place + 1 if place + 1 < count else 0
-            gap = gap_on_loop(position, positions[ahead], loop, VEHICLE_LENGTH)
-            speed = speeds[place]
-            acceleration = idm_acceleration(speed, speeds[ahead], at_least(gap, SMALLEST_GAP), humans)
-            wanted.append(at_least(speed + acceleration * step + noise[place], 0.0))
+        wanted = wanted_speeds(self.scenario, self.road, people, self._speeds, self._near_positions, noise)
         self._simulation.command_speeds(self._human_ids, wanted)
 
     def exploration_noise(self) -> Sequence[Array]:
