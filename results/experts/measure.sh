@@ -1,0 +1,26 @@
+#!/usr/bin/env bash
+# Measures what the docs say of experts on the figure eight. Each JSON file here is the evaluation.json of one
+# `unjam drive`, its manifest included. A few minutes.
+set -eu
+cd "$(dirname "$0")/../.."
+runs=runs/for-the-docs
+rm -rf "$runs"
+for radius in 32 35; do
+    unjam drive figure-eight --radius $radius --episodes 10 --out "$runs/figure-eight-$radius" \
+        -d human -d pi:time_constant=0 >/dev/null
+done
+for radius in 32 33 34 35; do
+    unjam drive figure-eight --radius $radius --set horizon=3000 --episodes 10 \
+        --out "$runs/figure-eight-steady-$radius" \
+        -d human -d pi:time_constant=0 -d pi -d pacer -d pacer:varying=true >/dev/null
+done
+for road in ring ring-warm ring-jammed figure-eight; do
+    unjam drive $road --episodes 10 --out "$runs/all-on-$road" \
+        -d human -d idm -d pi:time_constant=0 -d pi -d follower-stopper -d acc -d lacc -d bcm -d ovm -d pacer \
+        -d constant -d constant:acceleration=0.1 >/dev/null
+done
+# Copied at the end: until then the tree is as committed, and the manifests say so.
+for folder in "$runs"/*; do
+    cp "$folder/evaluation.json" "results/experts/$(basename "$folder").json"
+done
+rm -r "$runs"
