@@ -26,6 +26,7 @@ nb_execution_raise_on_error = True
 nb_merge_streams = True
 myst_heading_anchors = 3
 
+autoclass_content = "both"
 autodoc_member_order = "bysource"
 autodoc_typehints = "description"
 autodoc_default_options = {"members": True, "show-inheritance": True}

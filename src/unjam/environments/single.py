@@ -18,22 +18,26 @@ Observation = NDArray[Any]
 class RoadEnv(gymnasium.Env[Observation, Observation]):
     """One CAV among people, on the actual simulator.
 
-    `gymnasium.make("unjam/Ring-v0")`, `gymnasium.make("unjam/FigureEight-v0")`; every parameter of the
-    scenario can be given: `gymnasium.make("unjam/Ring-v0", scenario="ring-jammed", length=(230, 230))`.
+    ``gymnasium.make("unjam/Ring-v0")``, ``gymnasium.make("unjam/FigureEight-v0")``; every parameter of the
+    scenario can be given: ``gymnasium.make("unjam/Ring-v0", scenario="ring-jammed", length=(230, 230))``.
 
-    | | |
-    |---|---|
-    | Action | `Box(-limit, limit, (1,), float32)`: acceleration [m/s2], limit 1 by default; with `expert`, what is added to the expert's |
-    | Observation | `Box(-50, 50, (5,), float32)`: own speed / 10 m/s; leader's speed - own / 5 m/s; gap to the leader / 20 m; follower's speed - own / 5 m/s; gap to the follower / 20 m; more with `observe` |
-    | Reward | the scenario's, or `reward`; its terms are in `info["terms"]` |
-    | Start | `reset(seed=s)` starts the very episode that `unjam drive --seed s` runs, warm-up included |
-    | Terminated | at a collision |
-    | Truncated | at the horizon |
-    | Time step | one decision, 0.1 s |
+    ===========  ===================================================================================
+    Action       ``Box(-limit, limit, (1,), float32)``: acceleration [m/s2], limit 1 by default; with
+                 ``expert``, what is added to the expert's
+    Observation  ``Box(-50, 50, (5,), float32)``: own speed / 10 m/s; leader's speed - own / 5 m/s; gap
+                 to the leader / 20 m; follower's speed - own / 5 m/s; gap to the follower / 20 m; more
+                 with ``observe``
+    Reward       the scenario's, or ``reward``; its terms are in ``info["terms"]``
+    Start        ``reset(seed=s)`` starts the very episode that ``unjam drive --seed s`` runs, warm-up
+                 included
+    Terminated   at a collision
+    Truncated    at the horizon
+    Time step    one decision, 0.1 s
+    ===========  ===================================================================================
 
     libsumo runs one simulation in a process: a second environment there runs over TraCI, twenty times slower.
-    For several at once use `gymnasium.make_vec("unjam/Ring-v0", num_envs=4, vectorization_mode="async")`.
-    """  # noqa: E501
+    For several at once use ``gymnasium.make_vec("unjam/Ring-v0", num_envs=4, vectorization_mode="async")``.
+    """
 
     metadata: ClassVar[dict[str, Any]] = {  # pyright: ignore[reportIncompatibleVariableOverride]
         "render_modes": ["human", "rgb_array"],
