@@ -49,6 +49,8 @@ def test_measures_rates_and_their_ratios() -> None:
         found["every_step_steps_per_s"] / found["bare_steps_per_s"]
     )
     assert found["over_traci"] > 2.0
+    for road in found["roads"].values():
+        assert road["over_bare"] == pytest.approx(road["episode_steps_per_s"] / road["bare_steps_per_s"])
     costs = [entry["us_per_vehicle_step"] for entry in found["scaling"]]
     assert [entry["vehicles"] for entry in found["scaling"]] == [22, 66]
     assert found["growth"] == max(costs) / costs[0]

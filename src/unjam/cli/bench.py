@@ -48,6 +48,10 @@ def bench(
         f"{found['traci_steps_per_s']:,.0f}",
         f"{found['over_traci']:.1f} times slower",
     )
+    for name, road in found["roads"].items():
+        table.add_row(f"{name}: bare SUMO", f"{road['bare_steps_per_s']:,.0f}", "1")
+        speed, ratio = road["episode_steps_per_s"], road["over_bare"]
+        table.add_row(f"{name}: run_episode", f"{speed:,.0f}", f"{ratio:.2f} of bare")
     console.print(table)
     for entry in found["scaling"]:
         console.print(

@@ -30,6 +30,8 @@ TRACI_STEPS = 200
 SIZES = {22: 3000, 220: 800, 2200: 200}
 """vehicles on the ring, one CAV in 22, and decisions driven"""
 METRES_PER_VEHICLE = 245 / 22
+OTHER_ROADS = ("figure-eight",)
+"""roads beside the ring on which `run_episode` is compared with SUMO alone"""
 
 
 def neural_driver(hold: int) -> ResidualDriver:
@@ -50,6 +52,7 @@ def measure_speed(rounds: int = ROUNDS, told: Callable[[str], None] | None = Non
     residual driver that training makes by default, whose network looks once a second.
     `over_bare_every_step`: the same with a network that looks in every step.
     `over_traci`: steps/s of the same driving loop with libsumo over those through TraCI.
+    `roads`: `over_bare` on other roads.
     `growth`: the largest cost of a vehicle-step over that of the smallest road.
     """
     say = told or (lambda _: None)
@@ -67,8 +70,10 @@ def _measure(rounds: int, say: Callable[[str], None]) -> dict[str, Any]:
     ring, driver = SCENARIOS["ring"], neural_driver(PolicySettings().hold)
     every_step = neural_driver(1)
     found: dict[str, list[float]] = {"bare": [], "episode": [], "every_step": [], "loop": [], "traci": []}
+    others: dict[str, dict[str, list[float]]] = {name: {"bare": [], "episode": []} for name in OTHER_ROADS}
     with Simulation() as simulation:
-        run_episode(ring, driver, (0,), explore=True, simulation=simulation)  # networks made, caches warm
+        for name in ("ring", *OTHER_ROADS):  # networks made, caches warm
+            run_episode(SCENARIOS[name], driver, (0,), explore=True, simulation=simulation)
     for number in range(1, rounds + 1):
         say(f"round {number} of {rounds}")
         with Simulation() as simulation:
@@ -78,6 +83,12 @@ def _measure(rounds: int, say: Callable[[str], None]) -> dict[str, Any]:
                 run = partial(run_episode, ring, driven, (number,), explore=True, simulation=simulation)
                 found[name].append(_rate(run, ring.horizon))
             found["loop"].append(_loop_rate(ring, driver, simulation))
+            for name, rates in others.items():
+                road = SCENARIOS[name]
+                Traffic(road, (number,), simulation)
+                rates["bare"].append(_rate(partial(_step, simulation, road.horizon), road.horizon))
+                run = partial(run_episode, road, driver, (number,), explore=True, simulation=simulation)
+                rates["episode"].append(_rate(run, road.horizon))
         with Simulation("traci") as simulation:
             found["traci"].append(_loop_rate(replace(ring, horizon=TRACI_STEPS), driver, simulation))
     say("larger roads")
@@ -91,6 +102,14 @@ def _measure(rounds: int, say: Callable[[str], None]) -> dict[str, Any]:
         "over_bare": _median_ratio(found["episode"], found["bare"]),
         "over_bare_every_step": _median_ratio(found["every_step"], found["bare"]),
         "over_traci": _median_ratio(found["loop"], found["traci"]),
+        "roads": {
+            name: {
+                "bare_steps_per_s": median(rates["bare"]),
+                "episode_steps_per_s": median(rates["episode"]),
+                "over_bare": _median_ratio(rates["episode"], rates["bare"]),
+            }
+            for name, rates in others.items()
+        },
         "scaling": scaling,
         "growth": max(costs) / costs[0],
         "rounds": rounds,
