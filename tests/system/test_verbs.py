@@ -7,7 +7,9 @@ import time
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from PIL import Image
 
 from tests.system.conftest import UNJAM, Run
 
@@ -107,6 +109,16 @@ def test_scenarios_and_drivers_list_what_there_is(unjam: Run) -> None:
     drivers = document(unjam("drivers", "--json"))
     assert set(drivers) >= {"human", "idm", "pi", "follower-stopper", "constant"}
     assert all(row["about"] for driver in drivers.values() for row in driver["parameters"])
+
+
+@pytest.mark.parametrize("name", ["ring", "figure-eight"])
+def test_a_scenario_is_drawn_with_its_vehicles(name: str, unjam: Run, tmp_path: Path) -> None:
+    assert unjam("scenarios", name, "--picture", "road.png").returncode == 0
+    picture = np.asarray(Image.open(tmp_path / "road.png"))
+    red = (picture[..., 0] > 180) & (picture[..., 1] < 90)
+    assert picture.shape == (640, 640, 3)
+    assert red.sum() > 20
+    assert unjam("scenarios", name, "--picture", "road.bmp").returncode == 2
 
 
 def test_doctor_finds_everything_here(unjam: Run) -> None:

@@ -1,15 +1,20 @@
 """`unjam scenarios` and `unjam drivers`: what there is."""
 
 from dataclasses import fields, is_dataclass
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
 from unjam.cli.options import JsonOption
+from unjam.errors import InputError
 
 
 def scenarios(
     name: Annotated[str | None, typer.Argument(help="One scenario, in full.")] = None,
+    picture: Annotated[
+        Path | None, typer.Option(help="Draw its road with the vehicles at the start: a .png file.")
+    ] = None,
     json: JsonOption = False,
 ) -> None:
     """List the scenarios; of one, its road, observation, reward, limit and every parameter.
@@ -19,6 +24,8 @@ def scenarios(
       unjam scenarios
 
       unjam scenarios ring
+
+      unjam scenarios figure-eight --picture eight.png
     """
     from rich.markup import escape
     from rich.table import Table
@@ -26,6 +33,10 @@ def scenarios(
     from unjam.cli.output import console, print_json
     from unjam.scenarios.registry import SCENARIOS, make_scenario, scenario_recipe
 
+    if picture is not None:
+        if name is None or picture.suffix.lower() != ".png":
+            raise InputError("picture: wants the name of a scenario, and a file that ends in .png")
+        _draw(make_scenario(name), name, picture)
     if name is None:
         if json:
             print_json({key: scenario_recipe(scenario) for key, scenario in SCENARIOS.items()})
@@ -55,6 +66,26 @@ def scenarios(
     console.print(_parameter_table(parameters, "parameter (--set key=value)"))
 
 
+def _draw(scenario: Any, name: str, path: Path) -> None:
+    """Write a picture of the road that seed 0 draws, with all vehicles at their start."""
+    from io import BytesIO
+
+    import numpy as np
+
+    from unjam.files import check_folder, write_whole
+    from unjam.reports.road_picture import draw_road
+
+    check_folder(path)
+    road = scenario.draw(np.random.default_rng(0))
+    cavs = {road.vehicle_ids.index(cav) for cav in road.cav_ids}
+    standing = np.zeros(len(road.vehicle_ids))
+    words = "\n".join([name, *(f"{key} {value:g} m" for key, value in road.drawn.items())])
+    content = BytesIO()
+    image = draw_road(road.outline, road.loop_length, standing, road.start_positions, cavs, 1.0, words)
+    image.save(content, "PNG")
+    write_whole(path, content.getvalue())
+
+
 def _common_facts(scenario: Any) -> list[tuple[str, str]]:
     from unjam.drivers.local_state import OBSERVATION_NAMES
 
@@ -69,7 +100,6 @@ def _common_facts(scenario: Any) -> list[tuple[str, str]]:
         ("action", f"acceleration within ±{scenario.action_limit:g} m/s2, {scenario.actuation}"),
         ("observation", "; ".join(OBSERVATION_NAMES["local"])),
         ("reward", scenario.reward),
-        ("limit is", "the IDM's equilibrium speed, at which all vehicles could drive alike for ever"),
     ]
 
 

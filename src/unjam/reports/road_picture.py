@@ -60,7 +60,9 @@ def draw_road(
             outline=CAV_COLOUR if place in cavs else None,
             width=3 * OVERSAMPLING if place in cavs else 1,
         )
-    inside = np.linalg.norm(outline[:, 1:] - centre, axis=1).min() > EMPTY_CENTRE * size
+    along = np.linspace(outline[0, 0], outline[-1, 0], 400)
+    line = np.column_stack([np.interp(along, outline[:, 0], outline[:, axis]) for axis in (1, 2)])
+    inside = np.linalg.norm(line - centre, axis=1).min() > EMPTY_CENTRE * size
     corner = 0.03 * pixels
     pen.multiline_text(
         (pixels / 2, pixels / 2) if inside else (corner, corner),

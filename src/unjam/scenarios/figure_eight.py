@@ -123,6 +123,10 @@ class FigureEight(Scenario):
             ("road", f"figure eight with radius {words_of_range(self.radius)} m"),
             ("vehicles", f"{self.vehicles} ({self.cavs} CAV)"),
             ("limit", f"{limits} m/s"),
+            (
+                "limit is",
+                "the speed at which the queue of all vehicles just clears the crossing in half a lap",
+            ),
         ]
 
 

@@ -88,6 +88,7 @@ class Ring(Scenario):
             ("road", f"ring of {words_of_range(self.length)} m"),
             ("vehicles", f"{self.vehicles} ({self.cavs} CAV)"),
             ("limit", f"{self._limits()} m/s"),
+            ("limit is", "the IDM's equilibrium speed, at which all vehicles could drive alike for ever"),
         ]
 
     def _limits(self) -> str:
