@@ -19,7 +19,7 @@ TUNED: dict[float, Harmonics] = {
     449.0: (8.22, -0.81, 2.37, -1.75, 1.46),
     462.5: (8.51, -1.8, 1.96, -1.31, 0.86),
     475.9: (8.72, -1.7, 1.93, -1.34, 1.12),
-    489.3: (9.25, -1.31, 2.09, -1.74, 2.14),
+    489.3: (8.93, -1.86, 1.96, -1.4, 1.05),
 }
 """pace over the lap for each length of a lap [m]: mean and harmonics as in `Pacer.harmonics` [m/s].
 
