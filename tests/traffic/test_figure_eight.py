@@ -93,6 +93,8 @@ def test_on_the_crossing_people_are_left_to_sumo(
         (Pacer(), 35, 6.2),
         (Pacer(varying=True), 32, 6.8),
         (Pacer(varying=True), 33, 6.8),
+        (Pacer(varying=True), 34, 6.9),
+        (Pacer(varying=True), 35, 7.2),
     ],
 )
 def test_pacers_hold_a_queue_that_never_meets_itself(driver: Pacer, radius: int, speed: float) -> None:
