@@ -72,6 +72,9 @@ class SteppedRoad:
         self._backend: Backend = backend
         self._simulation: Simulation | None = None
         self._traffic: Traffic | None = None
+        self._seed: int | None = None
+        self._episodes = 0
+        """started since that seed was given"""
         self._numbers = observation_size(self._parts, self._expert)
 
     @property
@@ -86,9 +89,18 @@ class SteppedRoad:
         limit = np.full(1, self.scenario.action_limit, np.float32)
         return spaces.Box(-limit, limit, dtype=np.float32)
 
-    def reset(self, seed: Sequence[int]) -> Observations:
-        """Start the episode of `seed`, run its warm-up, and return the first observations."""
-        self._traffic = traffic = Traffic(self.scenario, seed, self._open())
+    def reset(self, seed: int | None, generator: np.random.Generator) -> Observations:
+        """Start an episode, run its warm-up, and return the first observations.
+
+        It is that of `seed`; without one, the next after the last seed's, the first of all from `generator`.
+        """
+        if seed is not None:
+            self._seed, self._episodes = seed, 0
+        if self._seed is None:
+            self._seed = int(generator.integers(2**31))
+        numbers = (self._seed, self._episodes) if self._episodes else (self._seed,)
+        self._episodes += 1
+        self._traffic = traffic = Traffic(self.scenario, numbers, self._open())
         history = traffic.start(controlled=True)
         self._memory = self._expert.initial_memory(len(traffic.road.cav_ids))
         if history is not None and self.scenario.recall_warmup:

@@ -35,8 +35,6 @@ class ParallelRoad(ParallelEnv[str, Any, Any]):
         self.render_mode = None
         self.observation_spaces = dict.fromkeys(self.possible_agents, self._road.observation_space)
         self.action_spaces = dict.fromkeys(self.possible_agents, self._road.action_space)
-        self._seed: int | None = None
-        self._episodes = 0
 
     def observation_space(self, agent: str) -> spaces.Box:
         """Return the observation space of one CAV."""
@@ -50,13 +48,7 @@ class ParallelRoad(ParallelEnv[str, Any, Any]):
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
         """Start an episode: that of `seed`; without one, the next after the last seed's."""
-        if seed is not None:
-            self._seed, self._episodes = seed, 0
-        if self._seed is None:
-            self._seed = int(np.random.default_rng().integers(2**31))
-        numbers = (self._seed, self._episodes) if self._episodes else (self._seed,)
-        self._episodes += 1
-        observations = self._road.reset(numbers)
+        observations = self._road.reset(seed, np.random.default_rng())
         self.agents = list(self._road.traffic.road.cav_ids)
         return self._by_agent(observations), {agent: {} for agent in self.agents}
 

@@ -75,21 +75,13 @@ class RoadEnv(gymnasium.Env[Observation, Observation]):
             raise InputError("cavs: several are not allowed here; allowed: 1; use unjam.parallel_env")
         self.observation_space = self._road.observation_space
         self.action_space = self._road.action_space
-        self._seed: int | None = None
-        self._episodes = 0
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
         """Start an episode: that of `seed`; without one, the next after the last seed's."""
         super().reset(seed=seed)
-        if seed is not None:
-            self._seed, self._episodes = seed, 0
-        if self._seed is None:
-            self._seed = int(self.np_random.integers(2**31))
-        numbers = (self._seed, self._episodes) if self._episodes else (self._seed,)
-        self._episodes += 1
-        observations = self._road.reset(numbers)
+        observations = self._road.reset(seed, self.np_random)
         return observations[0], {"drawn": dict(self._road.traffic.road.drawn)}
 
     def step(self, action: Any) -> tuple[Observation, float, bool, bool, dict[str, Any]]:

@@ -189,7 +189,7 @@ class Traffic:
             near[place] += moved[place] * step
         self._speeds = moved
         if self.scenario.noise > 0 and not self._commanded:
-            noise = self._noise_rows.pop() if self._noise_rows else self._draw_noise()
+            noise = self._next_noise()
             self._speeds = [speed if speed > 0.0 else 0.0 for speed in map(add, moved, noise)]
             simulation.replace_speeds(self._human_ids, compress(self._speeds, self._human_mask))
         self._log_speeds.fromlist(self._speeds)
@@ -201,7 +201,7 @@ class Traffic:
         people = list(compress(range(len(self._speeds)), self._human_mask))
         noise = [0.0] * len(self._speeds)
         if self.scenario.noise > 0:
-            noise = self._noise_rows.pop() if self._noise_rows else self._draw_noise()
+            noise = self._next_noise()
         wanted = wanted_speeds(self.scenario, self.road, people, self._speeds, self._near_positions, noise)
         self._simulation.command_speeds(self._human_ids, wanted)
 
@@ -210,12 +210,16 @@ class Traffic:
         noise = self._exploration_generator.standard_normal((self.scenario.horizon, len(self._cavs)))
         return noise[:, 0].tolist() if self.single else list(noise)
 
-    def _draw_noise(self) -> list[float]:
+    def _next_noise(self) -> list[float]:
         """Return by how much noise changes each speed in this step, not at all for CAVs [m/s]."""
+        if not self._noise_rows:
+            self._draw_noise()
+        return self._noise_rows.pop()
+
+    def _draw_noise(self) -> None:
         draws = self._noise_generator.standard_normal((NOISE_BLOCK, len(self._human_mask)))
         scale = self.scenario.noise_per_step * self.scenario.simulation_step
         self._noise_rows = (draws * np.where(self._human_mask, scale, 0.0)).tolist()[::-1]
-        return self._noise_rows.pop()
 
     def speeds_and_positions(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return speeds [m/s] and positions [m] in every simulation step since the log began.
