@@ -50,6 +50,7 @@ def episode_of(network: Network, seed: tuple[int, ...], hold: int, target: Targe
         applied=residual,
         shield=nothing,
         terms={"near": -((residual - wanted) ** 2)},
+        memory={},
         hold=hold,
         terminated=False,
     )

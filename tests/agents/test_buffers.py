@@ -30,6 +30,7 @@ def make_trajectory(seed: int, decisions: int, hold: int = 1, terminated: bool =
         applied=nothing,
         shield=nothing,
         terms={"one": generator.normal(size=decisions), "other": generator.uniform(size=decisions)},
+        memory={},
         hold=hold,
         terminated=terminated,
     )

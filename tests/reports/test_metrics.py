@@ -31,6 +31,7 @@ def trajectory_of(states: LocalState, applied: ArrayLike = 0.0, **changes: Any) 
         "applied": np.zeros(steps) + np.asarray(applied),
         "shield": np.zeros(steps),
         "terms": {"reward": np.zeros(steps)},
+        "memory": {},
         "hold": 1,
         "terminated": False,
     }

@@ -351,3 +351,16 @@ def test_progress_is_told_during_warm_up_and_episode(simulation: Simulation) -> 
     assert told.count(0) >= 2
     assert 2000 < told[-1] <= 2600
     assert len(set(told)) >= 4
+
+
+def test_a_trajectory_begins_with_what_its_expert_remembered_of_the_warmup(simulation: Simulation) -> None:
+    warm = Ring(length=(230, 230), vehicles=8, horizon=20, warmup=30)
+    driver = ResidualDriver(PISaturation(), random_network(), 1.0, hold=5)
+    trajectory = run_episode(warm, driver, (3,), simulation=simulation).trajectories[0]
+    assert set(trajectory.memory) == {"window", "total", "seen", "command"}
+    assert trajectory.memory["seen"] == 30
+    memory = {name: values[None] for name, values in trajectory.memory.items()}
+    for step in range(20):
+        seen = LocalState(*(values[step : step + 1] for values in trajectory.states))
+        expert, memory = driver.expert.act(seen, memory)
+        assert np.clip(expert[0], -1.0, 1.0) == pytest.approx(trajectory.expert[step], abs=1e-12)

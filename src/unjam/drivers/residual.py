@@ -101,6 +101,10 @@ class ResidualDriver(Driver):
         """Return what the expert makes of the warm-up."""
         return {**memory, **self.expert.recall(memory, history)}
 
+    def expert_memory(self, memory: Memory) -> Memory:
+        """Return what of `memory` is the expert's."""
+        return {key: value for key, value in memory.items() if key not in self._keys}
+
     def decide(self, state: LocalState, memory: Memory, noise: Array | None = None) -> Decision:
         """Return the decision taken apart; with standard normal `noise`, shape (n,), it explores."""
         wanted, after = self.expert.act(state, memory)

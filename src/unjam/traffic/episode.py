@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from unjam.drivers.driver import Driver, single_row
+from unjam.drivers.driver import Driver, Memory, single_row
 from unjam.drivers.local_state import LocalState
 from unjam.drivers.residual import ResidualDriver
 from unjam.errors import InputError
@@ -67,6 +67,8 @@ class ResidualLog:
     decisions: list[tuple[Array, Array, Array, Array]]
     """each `Decision` but its memory, which is large"""
     last_observation: Array
+    memory: Memory
+    """of the expert before the first decision, a row per CAV"""
     hold: int
 
 
@@ -78,9 +80,10 @@ def drive_traffic(
     memory = driver.initial_memory(len(traffic.road.cav_ids))
     if history is not None and traffic.scenario.recall_warmup:
         memory = driver.recall(memory, history)
+    residual = driver if isinstance(driver, ResidualDriver) else None
+    remembered = {} if residual is None else residual.expert_memory(memory)
     if traffic.single:
         memory = single_row(memory)
-    residual = driver if isinstance(driver, ResidualDriver) else None
     noise = traffic.exploration_noise() if explore else [None] * traffic.scenario.horizon
     decisions = []
     for step in range(1, traffic.scenario.horizon + 1):
@@ -100,7 +103,8 @@ def drive_traffic(
             break
     if residual is None:
         return None
-    return ResidualLog(decisions, residual.observation(traffic.local_state(), memory), residual.hold)
+    last = residual.observation(traffic.local_state(), memory)
+    return ResidualLog(decisions, last, remembered, residual.hold)
 
 
 def _episode(traffic: Traffic, seed: Sequence[int], reward: Reward, log: ResidualLog | None) -> Episode:
@@ -143,9 +147,9 @@ def _trajectories(
     headways = time_headway(states.leader_gap[places, 1:], states.speed[places, 1:]).T
     terms = _checked(reward(Outcome(states.speed[:, 1:].T, applied, headways, crashed)), steps)
     expert, residual = applied, np.zeros_like(applied)
-    observations, hold = np.zeros((1, cavs, 0)), 1
+    observations, memory, hold = np.zeros((1, cavs, 0)), {}, 1
     if log is not None:
-        hold = log.hold
+        memory, hold = log.memory, log.hold
         _, experts, residuals, seen = zip(*log.decisions, strict=True)
         expert = np.array(experts).reshape(steps, cavs)
         residual = np.array(residuals).reshape(steps, cavs)
@@ -162,6 +166,7 @@ def _trajectories(
             applied=np.ascontiguousarray(applied[:, row]),
             shield=np.ascontiguousarray(shield[:, row]),
             terms=terms,
+            memory={name: np.array(values[row], np.float64) for name, values in memory.items()},
             hold=hold,
             terminated=traffic.crashed,
         )

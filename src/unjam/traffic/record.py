@@ -33,6 +33,9 @@ class Trajectory:
     """braking that SUMO's safety check added to the command [m/s2]; zero where it let it pass"""
     terms: dict[str, Floats]
     """terms of the reward by name"""
+    memory: dict[str, Floats]
+    """what the expert remembered before the first decision, without the axis of rows; empty without a
+    network"""
     hold: int
     """decisions for which one residual was held"""
     terminated: bool
@@ -122,6 +125,7 @@ def pack_episode(episode: Episode) -> tuple[dict[str, Any], dict[str, Floats]]:
         arrays |= {f"{index}.{name}": getattr(trajectory, name) for name in _TRAJECTORY_ARRAYS}
         arrays |= {f"{index}.states.{name}": array for name, array in trajectory.states._asdict().items()}
         arrays |= {f"{index}.terms.{name}": array for name, array in trajectory.terms.items()}
+        arrays |= {f"{index}.memory.{name}": array for name, array in trajectory.memory.items()}
         facts["trajectories"].append(
             {
                 "vehicle": trajectory.vehicle,
@@ -129,6 +133,7 @@ def pack_episode(episode: Episode) -> tuple[dict[str, Any], dict[str, Floats]]:
                 "terminated": trajectory.terminated,
                 "hold": trajectory.hold,
                 "terms": list(trajectory.terms),
+                "memory": list(trajectory.memory),
             }
         )
     return facts, arrays
@@ -146,6 +151,7 @@ def unpack_episode(facts: dict[str, Any], arrays: dict[str, Floats]) -> Episode:
                 hold=about["hold"],
                 states=LocalState(*(arrays[f"{index}.states.{name}"] for name in LocalState._fields)),
                 terms={name: arrays[f"{index}.terms.{name}"] for name in about["terms"]},
+                memory={name: arrays[f"{index}.memory.{name}"] for name in about["memory"]},
                 **{name: arrays[f"{index}.{name}"] for name in _TRAJECTORY_ARRAYS},
             )
         )
