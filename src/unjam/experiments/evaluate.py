@@ -59,10 +59,7 @@ def evaluate(
     `progress` is called with (the driver's label, the index of its episode), and the decisions made so far.
     """
     pairs = [(label, index) for index in range(len(seeds)) for label in drivers]
-    tasks = [
-        EpisodeTask(scenario, drivers[label], seeds[index], reward, record_fuel=True)
-        for label, index in pairs
-    ]
+    tasks = [EpisodeTask(scenario, drivers[label], seeds[index], reward, full=True) for label, index in pairs]
 
     def told(task: int, steps: int) -> None:
         if progress is not None:

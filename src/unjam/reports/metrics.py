@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from unjam.traffic.record import Episode, Floats
-from unjam.traffic.reward import Outcome, eq16, time_headway
+from unjam.traffic.record import Episode, Floats, outcome_of
+from unjam.traffic.reward import eq16
 
 STEADY_STEPS = 1000
 """decisions at the end of an episode that count as steady state"""
@@ -21,21 +21,6 @@ PETROL_DENSITY = 742.0
 """[mg/ml], as in SUMO's PollutantsInterface"""
 MOVING_SPEED = 1.0
 """speed above which a time headway is a matter of safety [m/s]"""
-
-
-def outcome_of(episode: Episode) -> Outcome:
-    """Return what a reward function sees of a whole episode."""
-    trajectories = episode.trajectories
-    crashed = np.zeros(episode.steps, bool)
-    crashed[-1:] = episode.status == "collision"
-    return Outcome(
-        speeds=episode.speeds[1:],
-        accelerations=np.stack([trajectory.applied for trajectory in trajectories], 1),
-        headways=np.stack(
-            [time_headway(t.states.leader_gap[1:], t.states.speed[1:]) for t in trajectories], 1
-        ),
-        crashed=crashed,
-    )
 
 
 def _steady(values: Floats) -> Floats:
@@ -92,7 +77,8 @@ def episode_return(episode: Episode) -> float:
 
 def return_eq16(episode: Episode) -> float:
     """Sum of the paper's reward, Eq. 16 with its sign mended, not discounted."""
-    return float(sum(term.sum() for term in eq16(outcome_of(episode)).values()))
+    outcome = outcome_of(episode.speeds, episode.trajectories, episode.status == "collision")
+    return float(sum(term.sum() for term in eq16(outcome).values()))
 
 
 def mean_abs_accel(episode: Episode) -> float:

@@ -6,6 +6,7 @@ from typing import Any
 from unjam.errors import wrong
 from unjam.parameters import build
 from unjam.scenarios.figure_eight import FigureEight
+from unjam.scenarios.merge import Merge
 from unjam.scenarios.ring import Ring
 from unjam.scenarios.scenario import Scenario
 
@@ -15,10 +16,11 @@ SCENARIOS: dict[str, Scenario] = {
     "ring-jammed": Ring(warmup=6000),
     "figure-eight": FigureEight(),
     "figure-eight-30": FigureEight(radius=(30, 30)),
+    "merge": Merge(),
 }
 
 
-KINDS: dict[str, type[Scenario]] = {"ring": Ring, "figure-eight": FigureEight}
+KINDS: dict[str, type[Scenario]] = {"ring": Ring, "figure-eight": FigureEight, "merge": Merge}
 """All kinds of road, by their title."""
 
 

@@ -1,16 +1,15 @@
 """What a scenario is: where the vehicles drive, how an episode starts and when it ends."""
 
-from dataclasses import dataclass as plain_dataclass
 from dataclasses import field
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from unjam.parameters import STRICT, Count, CountOrNone, NotNegative, Positive
 from unjam.physics.idm import IDMParameters
+from unjam.scenarios.road import Road
 
 VEHICLE_LENGTH = 5.0
 """[m], of every vehicle"""
@@ -36,37 +35,6 @@ far more timid where roads cross.
 """
 
 
-@plain_dataclass(frozen=True)
-class Road:
-    """One episode's road and traffic, ready to be written as SUMO's input files."""
-
-    nodes: str
-    """XML of the nodes, for netconvert"""
-    edges: str
-    """XML of the edges, for netconvert"""
-    netconvert_options: tuple[str, ...]
-    connections: str
-    """XML of the connections, for netconvert; empty: all that are possible"""
-    traffic: str
-    """XML of vehicle types, routes and vehicles"""
-    vehicle_ids: tuple[str, ...]
-    """all vehicles, in the order in which they stand along the road"""
-    cav_ids: tuple[str, ...]
-    """those of them that a driver drives"""
-    start_positions: NDArray[np.float64]
-    """front bumper of each vehicle along the route at the start [m]"""
-    loop_length: float
-    """length of the closed road [m]"""
-    crossings: tuple[tuple[float, float], ...]
-    """where along the road it crosses another way: there SUMO drives commanded people itself [m]"""
-    limit_speed: float
-    """speed that the traffic cannot exceed in the long run [m/s]: the scenario's own limit"""
-    outline: NDArray[np.float64]
-    """the road's centre line: rows (coordinate along the route, x, y) [m]"""
-    drawn: dict[str, float] = field(default_factory=dict)
-    """what the episode's seed has drawn, by name"""
-
-
 @dataclass(frozen=True, config=STRICT)
 class Scenario:
     """What all scenarios share; each kind of road adds its own."""
@@ -74,6 +42,8 @@ class Scenario:
     title: ClassVar[str]
     reward: ClassVar[str]
     """reward used where none is named"""
+    people_gap: ClassVar[float] = 0.0
+    """gap that SUMO keeps for commanded people [m]"""
 
     simulation_step: Positive = 0.1
     """time step of SUMO [s]"""
@@ -95,6 +65,8 @@ class Scenario:
     people: People = "native"
     """who computes how people drive: `native` SUMO's own IDM; `commanded` the same IDM as a speed command in
     every step, as in Flow"""
+    right_of_way: bool = True
+    """whether vehicles obey the right of way where roads meet; if not, SUMO only keeps them from colliding"""
     impatience: Annotated[float, Field(ge=0, le=1)] = 0.0
     """how readily vehicles that must yield take a gap in crossing traffic (SUMO's `impatience`)"""
     noise: NotNegative = 0.2
@@ -139,6 +111,10 @@ class Scenario:
         """
         raise NotImplementedError
 
+    def possible_cavs(self) -> tuple[str, ...]:
+        """Return the ids of all CAVs that an episode may have."""
+        raise NotImplementedError
+
     def facts(self) -> list[tuple[str, str]]:
         """Return what a reader wants to know of this road, as (name, value) pairs."""
         raise NotImplementedError
@@ -179,7 +155,7 @@ def _human_layer(scenario: Scenario) -> dict[str, Any]:
         "maxSpeed": humans.desired_speed,
     }
     if scenario.people == "commanded":
-        layer |= {"accel": 2.6, "decel": 4.5, "tau": 1.0, "minGap": 0.0}
+        layer |= {"accel": 2.6, "decel": 4.5, "tau": 1.0, "minGap": scenario.people_gap}
     return layer
 
 
