@@ -95,5 +95,7 @@ class OwnRoad(Road):
     """share of the vehicles that become CAVs"""
     cav_types: tuple[str, ...]
     """vehicle types all of whose vehicles become CAVs"""
+    cars: frozenset[str]
+    """vehicle types that the share may pick"""
     cav_seed: int
     """which vehicles the share picks"""

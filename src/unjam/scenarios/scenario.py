@@ -2,6 +2,7 @@
 
 from dataclasses import field
 from typing import Annotated, Any, ClassVar, Literal
+from xml.sax.saxutils import quoteattr
 
 import numpy as np
 from pydantic import Field
@@ -16,6 +17,9 @@ VEHICLE_LENGTH = 5.0
 
 SMALLEST_CAV_GAP = 0.5
 """gap that SUMO keeps for a CAV [m]"""
+
+CAV_COLOUR = "215,38,61"
+"""red, in SUMO's window"""
 
 Actuation = Literal["shielded", "raw", "flow"]
 """How SUMO carries out a CAV's command.
@@ -131,7 +135,12 @@ def vehicle_type(name: str, scenario: Scenario, **attributes: Any) -> str:
         "impatience": scenario.impatience,
         "emissionClass": scenario.emission_class,
     }
-    pairs = " ".join(f'{key}="{value}"' for key, value in {**common, **attributes}.items())
+    return type_xml({**common, **attributes})
+
+
+def type_xml(attributes: dict[str, Any]) -> str:
+    """Return the XML of a vehicle type."""
+    pairs = " ".join(f"{key}={quoteattr(str(value))}" for key, value in attributes.items())
     return f"<vType {pairs}/>"
 
 
@@ -162,26 +171,31 @@ def _human_layer(scenario: Scenario) -> dict[str, Any]:
 def cav_type(scenario: Scenario) -> str:
     """Return the XML of the CAVs: a type that executes any safe command exactly.
 
-    With SUMO's safe-speed check on, a Krauss vehicle with a reaction time of one step and a small minimum
-    gap is the one that stays out of the way until the command would lead to a crash. Where the actuation is
-    Flow's, it is the human type instead; with a gap, or it would creep up until it touches.
+    Where the actuation is Flow's, it is the human type instead; with a gap, or it would creep up until it
+    touches.
     """
-    colour = "215,38,61"  # red, in SUMO's window
     if scenario.actuation == "flow":
         layer = _human_layer(scenario)
         smallest = max(layer["minGap"], SMALLEST_CAV_GAP)
-        return vehicle_type("cav", scenario, color=colour, **{**layer, "minGap": smallest})
+        return vehicle_type("cav", scenario, color=CAV_COLOUR, **{**layer, "minGap": smallest})
+    layer = obedient_layer(scenario.simulation_step)
+    return vehicle_type("cav", scenario, **layer, maxSpeed=scenario.humans.desired_speed)
+
+
+def obedient_layer(simulation_step: float) -> dict[str, Any]:
+    """Return the attributes of a type that executes any safe command exactly.
+
+    With SUMO's safe-speed check on, a Krauss vehicle with a reaction time of one step and a small minimum
+    gap is the one that stays out of the way until the command would lead to a crash.
+    """
     limits = 20.0  # [m/s2] far beyond what a CAV asks for, so that only safety clips a command
-    return vehicle_type(
-        "cav",
-        scenario,
-        color=colour,
-        carFollowModel="Krauss",
-        accel=limits,
-        decel=limits,
-        emergencyDecel=limits,
-        apparentDecel=limits,
-        tau=scenario.simulation_step,
-        minGap=SMALLEST_CAV_GAP,
-        maxSpeed=scenario.humans.desired_speed,
-    )
+    return {
+        "color": CAV_COLOUR,
+        "carFollowModel": "Krauss",
+        "accel": limits,
+        "decel": limits,
+        "emergencyDecel": limits,
+        "apparentDecel": limits,
+        "tau": simulation_step,
+        "minGap": SMALLEST_CAV_GAP,
+    }

@@ -245,7 +245,12 @@ class ClosedTraffic(Traffic[ClosedRoad]):
             for row, (name, place) in enumerate(zip(road.cav_ids, self._cavs, strict=True))
         ]
         fuel = np.array(self.log_fuel) if self.full else np.zeros((0, 0))
-        pictured = {"loop_length": road.loop_length, "crossings": road.crossings, "outline": road.outline}
+        pictured = {
+            "limit_speed": road.limit_speed,
+            "loop_length": road.loop_length,
+            "crossings": road.crossings,
+            "outline": road.outline,
+        }
         return TrafficLog(
             road.vehicle_ids, road.cav_ids, speeds, positions, states.leader_gap, fuel, stays, pictured
         )

@@ -130,7 +130,6 @@ def _episode(traffic: Traffic, seed: Sequence[int], reward: Reward, log: Residua
         step=traffic.scenario.decision_step,
         warmup=traffic.scenario.warmup,
         drawn=traffic.road.drawn,
-        limit_speed=traffic.road.limit_speed,
         vehicle_ids=found.vehicle_ids,
         cav_ids=found.cav_ids,
         collisions=traffic.collisions,

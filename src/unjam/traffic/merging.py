@@ -95,4 +95,4 @@ class MergingTraffic(OpenTraffic[MergingRoad]):
     def _pictured(self, vehicles: Sequence[str]) -> dict[str, Any]:
         branches = tuple(BRANCHES[self.road.origins[name].branch] for name in vehicles)
         lines = self._lines() if self.full else np.zeros((0, 2))
-        return {"branches": branches, "lines": lines}
+        return {"limit_speed": self.road.limit_speed, "branches": branches, "lines": lines}

@@ -1,10 +1,12 @@
 """SUMO's network files: made by netconvert, once for each content."""
 
+import gzip
 import hashlib
 import os
 import shutil
 import subprocess
 import tempfile
+from collections.abc import Iterator
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -84,13 +86,27 @@ def network_file(plain: PlainNetwork) -> Path:
 def network_lines(path: Path) -> NDArray[np.float64]:
     """Return the centre lines of all lanes: rows (x, y) [m], a row of NaN between two lines."""
     rows: list[tuple[float, float]] = []
-    for _, element in ElementTree.iterparse(path):
-        if element.tag == "lane":
-            points = (point.split(",") for point in element.get("shape", "").split())
-            rows += [(float(x), float(y)) for x, y, *_ in points]
-            rows.append((float("nan"), float("nan")))
-        element.clear()
+    for lane in _lanes(path):
+        points = (point.split(",") for point in lane["shape"].split())
+        rows += [(float(x), float(y)) for x, y, *_ in points]
+        rows.append((float("nan"), float("nan")))
     return np.array(rows, np.float64).reshape(-1, 2)
+
+
+@cache
+def edge_lengths(path: Path) -> dict[str, float]:
+    """Return the length of each edge [m]."""
+    return {lane["id"].rpartition("_")[0]: float(lane["length"]) for lane in _lanes(path)}
+
+
+def _lanes(path: Path) -> Iterator[dict[str, str]]:
+    """Yield the attributes of each lane of a network file."""
+    with gzip.open(path) if path.suffix == ".gz" else path.open("rb") as file:
+        for _, element in ElementTree.iterparse(file):
+            if element.tag == "lane":
+                yield dict(element.attrib)
+            if element.tag == "edge":
+                element.clear()
 
 
 def _netconvert(plain: PlainNetwork, folder: Path) -> Path:

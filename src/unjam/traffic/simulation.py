@@ -164,6 +164,47 @@ class Simulation:
         places[:, 2] = np.radians(90.0 - places[:, 2])  # SUMO counts clockwise from north, in degrees
         return places
 
+    def more_expected(self) -> bool:
+        """Return whether anybody is on the road or will be."""
+        return self._sumo.simulation.getMinExpectedNumber() > 0
+
+    def type_of(self, name: str) -> str:
+        """Return a vehicle's type."""
+        return self._sumo.vehicle.getTypeID(name)
+
+    def route_of(self, name: str) -> tuple[str, ...]:
+        """Return the edges of a vehicle's route."""
+        return tuple(self._sumo.vehicle.getRoute(name))
+
+    def edge_places(self, ids: Sequence[str]) -> list[tuple[str, float]]:
+        """Return on which edge each of `ids` is, and where along it [m]."""
+        vehicle = self._sumo.vehicle
+        return [(vehicle.getRoadID(name), vehicle.getLanePosition(name)) for name in ids]
+
+    def allowed_speeds(self, ids: Sequence[str]) -> list[float]:
+        """Return how fast each of `ids` may drive where it is [m/s]."""
+        return [self._sumo.vehicle.getAllowedSpeed(name) for name in ids]
+
+    def neighbours(self, name: str, farthest: float) -> tuple[float, float, float, float] | None:
+        """Return speed and gap of the vehicle ahead and of the one behind, as SUMO sees them [m/s, m].
+
+        The gap is bumper to bumper. Who is farther than `farthest` is not there: as fast, and that far away.
+        """
+        vehicle = self._sumo.vehicle
+        speed = self._get_speed(name)
+        found = []
+        for other, gap, keeper in (
+            (*(vehicle.getLeader(name, farthest) or ("", 0.0)), name),
+            (*(follower := vehicle.getFollower(name, farthest)), follower[0]),
+        ):
+            if not other:
+                found += [speed, farthest]
+                continue
+            true_gap = gap + vehicle.getMinGap(keeper)  # SUMO's lacks the gap that the one behind keeps
+            there = true_gap < farthest
+            found += [self._get_speed(other) if there else speed, min(max(true_gap, 0.0), farthest)]
+        return tuple(found)
+
     def distances(self, ids: Sequence[str]) -> list[float]:
         """Return how far each of `ids` has driven since it entered [m]."""
         return list(map(self._get_distance, ids))

@@ -4,10 +4,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from unjam.scenarios.road import ClosedRoad, MergingRoad
+from unjam.scenarios.road import ClosedRoad, MergingRoad, OwnRoad
 from unjam.scenarios.scenario import Scenario
 from unjam.traffic.closed import ClosedTraffic
 from unjam.traffic.merging import MergingTraffic
+from unjam.traffic.own import OwnTraffic
 from unjam.traffic.simulation import Simulation
 from unjam.traffic.traffic import Traffic
 
@@ -30,4 +31,6 @@ def make_traffic(
         return ClosedTraffic(scenario, road, seeds, simulation, plain_numbers, full)
     if isinstance(road, MergingRoad):
         return MergingTraffic(scenario, road, seeds, simulation, full)
+    if isinstance(road, OwnRoad):
+        return OwnTraffic(scenario, road, seeds, simulation, full)
     raise TypeError(f"no traffic for {type(road).__name__}")
