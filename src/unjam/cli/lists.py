@@ -96,7 +96,7 @@ def _common_facts(scenario: Any) -> list[tuple[str, str]]:
             "warm-up",
             f"{scenario.warmup} all-human steps ({scenario.warmup * step:g} s), before control, not counted",
         ),
-        ("people", f"IDM with acceleration noise of std {scenario.noise_per_step:.3f} m/s2 a step"),
+        ("people", scenario.people_in_words),
         ("action", f"acceleration within ±{scenario.action_limit:g} m/s2, {scenario.actuation}"),
         ("observation", "; ".join(OBSERVATION_NAMES["local"])),
         ("reward", scenario.reward),

@@ -34,7 +34,7 @@ def draw_road(scene: Scene, fastest: float, words: str) -> Image.Image:
         fastest: the speed of the brightest colour [m/s].
         words: a few lines, written beside the road.
     """
-    lines = _split(scene.lines)
+    lines = split_lines(scene.lines)
     points = np.concatenate(lines)
     low, high = points.min(0), points.max(0)
     size, centre = float((high - low).max()), (low + high) / 2
@@ -84,7 +84,7 @@ def scenes(episode: Any, moments: Sequence[int]) -> Iterator[Scene]:
         yield Scene(lines, episode.places[moment] if places is None else places, episode.speeds[moment], cavs)
 
 
-def _split(lines: np.ndarray) -> list[np.ndarray]:
+def split_lines(lines: np.ndarray) -> list[np.ndarray]:
     """Return the lines one by one: rows of NaN lie between them."""
     gaps = np.flatnonzero(np.isnan(lines[:, 0]))
     parts = np.split(lines, gaps)

@@ -77,6 +77,11 @@ class OwnNetwork(Scenario):
         )
 
     @property
+    def people_in_words(self) -> str:
+        """How people drive."""
+        return "as the vehicle types of its files say"
+
+    @property
     def drawn_ranges(self) -> dict[str, tuple[float, float]]:
         """Nothing that a critic could see."""
         return {}

@@ -91,6 +91,11 @@ class Scenario:
         scale = self.simulation_step**0.5 if self.noise_scaling == "sqrt-step" else 1.0
         return self.noise * scale
 
+    @property
+    def people_in_words(self) -> str:
+        """How people drive."""
+        return f"IDM with acceleration noise of std {self.noise_per_step:.3f} m/s2 a step"
+
     def draw(self, generator: np.random.Generator) -> Road:
         """Return the road of one episode; everything random about it comes from `generator`."""
         raise NotImplementedError

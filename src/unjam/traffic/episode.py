@@ -60,7 +60,12 @@ def run_episode(
         with Simulation() as simulation:
             return run_episode(scenario, driver, seed, reward, explore, full, simulation, progress)
     traffic = make_traffic(scenario, seed, simulation, driver.plain_numbers, full)
-    return _episode(traffic, seed, earned, drive_traffic(traffic, driver, explore, progress))
+    log = drive_traffic(traffic, driver, explore, progress)
+    if traffic.entered == 0 and not driver.native:
+        raise InputError(
+            f"no CAV was on the road in {traffic.decisions} decisions: let more vehicles be CAVs"
+        )
+    return _episode(traffic, seed, earned, log)
 
 
 @dataclass(frozen=True)
@@ -124,6 +129,8 @@ def _note_newcomers(memories: list[Memory], memory: Memory, traffic: Traffic) ->
 def _episode(traffic: Traffic, seed: Sequence[int], reward: Reward, log: ResidualLog | None) -> Episode:
     """Put the record of finished traffic in order."""
     found = traffic.log()
+    outcome = outcome_of(found.speeds.T, found.stays, traffic.crashed)
+    terms = _checked(reward(outcome), traffic.decisions)
     return Episode(
         seed=tuple(seed),
         status="collision" if traffic.crashed else "completed",
@@ -137,16 +144,16 @@ def _episode(traffic: Traffic, seed: Sequence[int], reward: Reward, log: Residua
         positions=np.ascontiguousarray(found.positions.T),
         gaps=np.ascontiguousarray(found.gaps.T),
         fuel=found.fuel,
-        trajectories=_trajectories(traffic, found, reward, log),
+        terms=terms,
+        trajectories=_trajectories(traffic, found, terms, log),
         **found.pictured,
     )
 
 
 def _trajectories(
-    traffic: Traffic, found: TrafficLog, reward: Reward, log: ResidualLog | None
+    traffic: Traffic, found: TrafficLog, terms: dict[str, Floats], log: ResidualLog | None
 ) -> tuple[Trajectory, ...]:
     """Return the trajectory of each stay."""
-    terms = _checked(reward(outcome_of(found.speeds.T, found.stays, traffic.crashed)), traffic.decisions)
     trajectories = []
     for stay in found.stays:
         during = slice(stay.start, stay.start + len(stay.applied))

@@ -127,10 +127,11 @@ class OpenTraffic(Traffic[RoadKind]):
         for _ in range(scenario.steps_per_decision):
             told = {name: value for name, value in zip(names, applied, strict=False) if name in self._on_road}
             speeds = self._simulation.speeds(list(told))
-            commanded = {
+            wanted = {
                 name: next_speed(speed, value, step)
                 for (name, value), speed in zip(told.items(), speeds, strict=True)
             }
+            commanded = self._legal(wanted)
             self._simulate(commanded)
             still = [name for name in commanded if name in self._on_road]
             for name, moved in zip(still, self._simulation.speeds(still), strict=True):
@@ -158,6 +159,10 @@ class OpenTraffic(Traffic[RoadKind]):
         if colliding:
             self.collisions = max(self.collisions, len(colliding))
             self.crashed = self.crashed or self._ends_with(colliding)
+
+    def _legal(self, speeds: dict[str, float]) -> dict[str, float]:
+        """Return wanted speeds of CAVs, none above what the road allows [m/s]."""
+        return speeds
 
     def _ends_with(self, colliding: Sequence[str]) -> bool:
         """Whether a collision of these vehicles ends the episode."""

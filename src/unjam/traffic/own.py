@@ -61,6 +61,10 @@ class OwnTraffic(OpenTraffic[OwnRoad]):
         types = "{}" if scenario.actuation == "flow" else CAV_TYPES
         self._simulation.take_control(names, scenario.actuation, scenario.right_of_way, types)
 
+    def _legal(self, speeds: dict[str, float]) -> dict[str, float]:
+        allowed = self._simulation.allowed_speeds(list(speeds))
+        return {name: min(speed, most) for (name, speed), most in zip(speeds.items(), allowed, strict=True)}
+
     def _ends_with(self, colliding: Sequence[str]) -> bool:
         return any(name in self._cavs for name in colliding)
 
@@ -85,8 +89,10 @@ class OwnTraffic(OpenTraffic[OwnRoad]):
         if not self.full or not self._routes:
             return found
         lengths = edge_lengths(self._network)
-        visits = Counter(edge for places in self._log_edges for edge, _ in places)
-        route = max(self._routes, key=lambda edges: sum(visits[edge] for edge in set(edges)))
+        planned: Counter[str] = Counter()  # not where they were: all drivers' pictures show the same route
+        for edges, count in self._routes.items():
+            planned.update(dict.fromkeys(edges, count))
+        route = max(self._routes, key=lambda edges: sum(planned[edge] for edge in set(edges)))
         starts = accumulate((lengths[edge] for edge in route), initial=0.0)
         begins = dict(reversed(list(zip(route, starts, strict=False))))
         column = {name: index for index, name in enumerate(found.vehicle_ids)}

@@ -103,7 +103,14 @@ class Episode:
     places: Floats = field(default_factory=lambda: np.zeros((0, 0, 3)))
     """(x, y, heading) of front bumpers on a road with ends [m, rad], shape (T + 1, N, 3); no rows where not
     recorded"""
+    terms: dict[str, Floats] = field(default_factory=dict)
+    """terms of the reward by name, shape (T,)"""
     trajectories: tuple[Trajectory, ...] = ()
+
+    @property
+    def reward(self) -> Floats:
+        """What each decision earned, shape (T,): the sum of the terms."""
+        return np.sum(list(self.terms.values()), axis=0)
 
     @property
     def steps(self) -> int:
@@ -150,8 +157,10 @@ def pack_episode(episode: Episode) -> tuple[dict[str, Any], dict[str, Floats]]:
     facts: dict[str, Any] = {
         field.name: getattr(episode, field.name)
         for field in fields(Episode)
-        if field.name not in (*_ARRAYS, "trajectories")
+        if field.name not in (*_ARRAYS, "terms", "trajectories")
     }
+    arrays |= {f"terms.{name}": array for name, array in episode.terms.items()}
+    facts["terms"] = list(episode.terms)
     facts["trajectories"] = []
     for index, trajectory in enumerate(episode.trajectories):
         arrays |= {f"{index}.{name}": getattr(trajectory, name) for name in _TRAJECTORY_ARRAYS}
@@ -188,6 +197,7 @@ def unpack_episode(facts: dict[str, Any], arrays: dict[str, Floats]) -> Episode:
             )
         )
     values: dict[str, Any] = {**facts, **{name: arrays[name] for name in _ARRAYS}}
+    values["terms"] = {name: arrays[f"terms.{name}"] for name in facts["terms"]}
     for name in ("seed", "vehicle_ids", "cav_ids", "branches"):
         values[name] = tuple(values[name])
     values["crossings"] = tuple((start, end) for start, end in values["crossings"])

@@ -125,6 +125,7 @@ class Simulation:
         else:  # its own words about all that is not named below
             additional = ",".join(str(path) for path in (*road.network.additional_files, traffic))
             files = ["--configuration-file", str(road.network.path), "--additional-files", additional]
+            files += ["--verbose", "false"]
         return [
             *files,
             *("--step-length", str(step), "--seed", str(seed)),
