@@ -1,3 +1,5 @@
+from dataclasses import fields
+
 import numpy as np
 import pytest
 import torch
@@ -5,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from stable_baselines3.common.buffers import RolloutBuffer
 
-from unjam.agents.buffers import discounted_returns, fill_rollout_buffer
+from unjam.agents.buffers import Rows, discounted_returns, fill_rollout_buffer, join_rows, rows_of
 from unjam.agents.policy import ResidualPolicy
 from unjam.drivers import LocalState
 from unjam.traffic.record import Trajectory
@@ -52,7 +54,7 @@ def fill(
 ) -> RolloutBuffer:
     spaces = policy.observation_space, policy.action_space
     buffer = RolloutBuffer(1, *spaces, device="cpu", gamma=gamma, gae_lambda=gae_lambda)
-    fill_rollout_buffer(buffer, policy, trajectories, extra or [()] * len(trajectories))
+    fill_rollout_buffer(buffer, policy, rows_of(trajectories, extra or [()] * len(trajectories)))
     return buffer
 
 
@@ -168,6 +170,24 @@ def test_the_value_after_the_end_is_that_of_the_trajectorys_own_road() -> None:
     assert buffer.returns[-1, 0] == pytest.approx(expected, rel=1e-5)
 
 
+def test_parts_that_are_joined_are_the_rows_of_all_their_trajectories() -> None:
+    trajectories = [make_trajectory(seed, 3 + seed, hold=2, terminated=seed == 1) for seed in range(4)]
+    extra = [(float(seed),) for seed in range(4)]
+    parts = [rows_of(trajectories[:1], extra[:1]), rows_of(trajectories[1:], extra[1:])]
+    joined, expected = join_rows(parts), rows_of(trajectories, extra)
+    for field in fields(Rows):
+        np.testing.assert_array_equal(getattr(joined, field.name), getattr(expected, field.name))
+        assert getattr(joined, field.name).dtype == getattr(expected, field.name).dtype
+
+
+def test_after_each_row_comes_the_next_of_its_trajectory_or_where_that_ended() -> None:
+    trajectories = [make_trajectory(0, 5, hold=2), make_trajectory(1, 1), make_trajectory(2, 3)]
+    rows = rows_of(trajectories, [()] * 3)
+    expected = np.concatenate([trajectory.observations[1:] for trajectory in trajectories])
+    np.testing.assert_array_equal(rows.next_observations, expected.astype(np.float32))
+    assert rows.lasts.tolist() == [2, 3, 6]
+
+
 def test_refuses_another_number_of_trajectories_than_of_their_roads() -> None:
     with pytest.raises(ValueError, match="shorter"):
         fill(random_policy(critic_inputs=1), [make_trajectory(0, 3), make_trajectory(1, 3)], [(0.0,)])
@@ -199,7 +219,7 @@ def test_the_ratio_is_one_in_the_shuffled_order_of_the_update_too() -> None:
 def test_a_buffer_takes_the_size_of_each_iteration() -> None:
     policy = random_policy()
     buffer = fill(policy, [make_trajectory(0, 50)])
-    fill_rollout_buffer(buffer, policy, [make_trajectory(1, 20)], [()])
+    fill_rollout_buffer(buffer, policy, rows_of([make_trajectory(1, 20)], [()]))
     assert len(buffer.rewards) == 20
     assert sum(len(rows.returns) for rows in buffer.get(7)) == 20
     np.testing.assert_array_equal(
@@ -226,10 +246,15 @@ def test_discounted_returns_are_the_sums_written_out(
         for t in range(len(earned)):
             within = sum(gamma ** (later - t) * earned[later] for later in range(t, len(earned)))
             expected.append(within + gamma ** (len(earned) - t) * after)
-    np.testing.assert_allclose(discounted_returns(trajectories, gamma), expected, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(
+        discounted_returns(rows_of(trajectories, [()] * len(trajectories)), gamma),
+        expected,
+        rtol=1e-9,
+        atol=1e-9,
+    )
 
 
 def test_a_cut_trajectory_that_always_earns_the_same_is_worth_the_same_everywhere() -> None:
     trajectory = make_trajectory(0, 30)
     trajectory.terms["one"][:], trajectory.terms["other"][:] = 1.5, 0.5
-    np.testing.assert_allclose(discounted_returns([trajectory], 0.95), 2.0 / 0.05)
+    np.testing.assert_allclose(discounted_returns(rows_of([trajectory], [()]), 0.95), 2.0 / 0.05)

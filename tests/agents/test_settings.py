@@ -20,7 +20,7 @@ from unjam.parameters import build
         (PolicySettings, "authority", float("inf")),
         (PolicySettings, "exploration_std", 0.0),
         (PolicySettings, "exploration_std", float("nan")),
-        (PolicySettings, "hold", 0),
+        (PolicySettings, "hold", -1.0),
         (PolicySettings, "learn_exploration", "perhaps"),
         (TRPOSettings, "batch_steps", 0),
         (TRPOSettings, "batch_steps", 10.5),
@@ -68,3 +68,13 @@ def test_settings_do_not_change_once_made(made: Any) -> None:
 def test_lists_of_a_toml_file_become_tuples() -> None:
     made = build(PolicySettings, {"hidden": [32, 16], "observe": ["local", "loop_length"]}, "")
     assert made == PolicySettings(hidden=(32, 16), observe=("local", "loop_length"))
+
+
+@pytest.mark.parametrize(
+    ("hold", "decision_step", "decisions"),
+    [(1.0, 0.1, 10), (1.0, 1.0, 1), (1.0, 0.2, 5), (0.0, 0.1, 1), (0.5, 1.0, 1), (0.3, 0.1, 3)],
+)
+def test_a_residual_is_held_for_so_many_seconds_whatever_a_decision_takes(
+    hold: float, decision_step: float, decisions: int
+) -> None:
+    assert PolicySettings(hold=hold).decisions_held(decision_step) == decisions

@@ -8,19 +8,19 @@ from safetensors.torch import load, save
 from unjam.agents.settings import PolicySettings
 from unjam.agents.state import learner_state, restore_learner
 
-from .test_algorithms import Task, same
+from .task import Task, same
 
 
 @pytest.mark.parametrize("learned", [True, False])
 def test_a_restored_learner_goes_on_to_the_last_bit(learned: bool) -> None:
-    policy = PolicySettings(hidden=(8, 8), hold=2, learn_exploration=learned)
-    through = Task(policy).learn(4)
-    counters, tensors = learner_state(Task(policy).learn(2).learner)
+    policy = PolicySettings(hidden=(8, 8), learn_exploration=learned)
+    through = Task(policy, hold=2).learn(4)
+    counters, tensors = learner_state(Task(policy, hold=2).learn(2).learner)
     # As a checkpoint does it, and in a process that has drawn other numbers since.
     counters, tensors = json.loads(json.dumps(counters)), load(save(tensors))
     torch.manual_seed(99)
     np.random.seed(99)
-    resumed = Task(policy)
+    resumed = Task(policy, hold=2)
     restore_learner(resumed.learner, counters, tensors)
     resumed.learn(4)
     assert same(resumed.parameters(), through.parameters())
@@ -41,7 +41,7 @@ def test_a_restored_learner_has_the_state_that_was_kept() -> None:
 
 def test_the_state_holds_the_momenta_of_the_critic() -> None:
     _, tensors = learner_state(Task().learn(1).learner)
-    momenta = [tensor for name, tensor in tensors.items() if name.endswith(".exp_avg")]
+    momenta = [tensor for name, tensor in tensors.items() if name.endswith("/exp_avg")]
     assert len(momenta) == 4  # weight and bias of one hidden layer and of the head
     assert all(tensor.abs().max() > 0 for tensor in momenta)
 
@@ -66,6 +66,6 @@ def test_a_learner_that_goes_on_does_not_change_the_state_it_came_from() -> None
 
 def test_weights_of_another_network_are_refused() -> None:
     counters, tensors = learner_state(Task().learn(1).learner)
-    other = Task(PolicySettings(hidden=(4,), hold=1))
+    other = Task(PolicySettings(hidden=(4,)))
     with pytest.raises(RuntimeError, match="size mismatch"):
         restore_learner(other.learner, counters, tensors)

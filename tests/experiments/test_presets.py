@@ -37,5 +37,6 @@ def test_the_papers_preset_has_the_papers_numbers() -> None:
     assert (made.trpo.gamma, made.trpo.gae_lambda, made.trpo.target_kl) == (0.995, 0.97, 0.01)
     assert (made.trpo.batch_steps, made.policy.hidden, made.policy.exploration_std) == (6000, (64, 64), 1.0)
     assert made.policy.observe == ("local",)
-    assert made.policy.hold == 1
+    assert made.policy.decisions_held(0.1) == 1
+    assert not made.spread
     assert made.make_expert() == PISaturation(time_constant=0)

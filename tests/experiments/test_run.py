@@ -274,7 +274,7 @@ def test_without_validation_the_last_policy_is_the_controller(tmp_path: Path, le
     assert {row["return_validation"] for row in progress(tmp_path / "run")} == {None}
     loaded = load_controller(tmp_path / "run")
     assert isinstance(loaded, ResidualDriver)
-    for found, expected in zip(loaded.network.layers, run.learner.policy.network().layers, strict=True):
+    for found, expected in zip(loaded.network.layers, run.learner.network().layers, strict=True):
         np.testing.assert_array_equal(found[0], expected[0])
         np.testing.assert_array_equal(found[1], expected[1])
     assert controller_manifest(tmp_path / "run")["iteration"] == 2
@@ -291,7 +291,7 @@ def test_episodes_of_an_iteration_are_spread_over_the_lengths_where_asked(
     tmp_path: Path, spread: bool, learn: Learn
 ) -> None:
     config = small_config(
-        trpo__spread=spread, trpo__batch_steps=11 * 20, steps=20, road__horizon=20, evaluation__every=0
+        spread=spread, trpo__batch_steps=11 * 20, steps=20, road__horizon=20, evaluation__every=0
     )
     run = learn(tmp_path / "run", config)
     lengths = [episode.drawn["length"] for episode in run.learner._episodes]
@@ -317,7 +317,7 @@ def test_training_explores_and_validation_does_not(tmp_path: Path, learn: Learn)
     run = learn(tmp_path / "run", small_config(policy__exploration_std=0.3))
     (trajectory,) = run.learner._episodes[0].trajectories
     assert np.std(trajectory.residual) > 0.1
-    again = run.driver(run.learner.policy.network())
+    again = run.driver(run.learner.network())
     assert run._validate(again) == progress(tmp_path / "run")[-1]["return_validation"]
 
 

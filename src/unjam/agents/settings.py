@@ -30,9 +30,9 @@ class PolicySettings:
     """standard deviation of the exploration noise at the start, as a share of the action limit"""
     learn_exploration: bool = True
     """whether the standard deviation is learned, or stays what it is at the start"""
-    hold: Count = 10
-    """decisions for which one residual is held: on the ring a second, over which noise adds up to a change
-    of speed instead of cancelling itself"""
+    hold: NotNegative = 1.0
+    """how long one residual is held [s], rounded to whole decisions, at least one: over a second noise adds
+    up to a change of speed instead of cancelling itself"""
     critic_sees_road: bool = True
     """whether the value network also sees what the episode has drawn (the ring's length); without it, it
     takes a large gap for a longer and faster ring, and the policy learns to fall back"""
@@ -40,17 +40,25 @@ class PolicySettings:
     """scale the value network by the returns of the first iteration: one that starts at zero needs tens of
     iterations to reach values of 150"""
 
+    def decisions_held(self, decision_step: float) -> int:
+        """Return for how many decisions a residual is held where one takes `decision_step` seconds."""
+        return max(1, round(self.hold / decision_step))
+
 
 @dataclass(frozen=True, config=STRICT)
-class TRPOSettings:
-    """Trust region policy optimisation; the preset `paper` has the values of Table B5 where these differ."""
+class LearnerSettings:
+    """What every learner has."""
 
     batch_steps: Count = 12_000
     """actual steps in an iteration, rounded up to whole episodes"""
-    spread: bool = True
-    """whether the episodes of an iteration cover the range of what they draw (the ring's lengths) evenly"""
     gamma: Discount = 0.99
     """discount from one look of the network to the next"""
+
+
+@dataclass(frozen=True, config=STRICT)
+class TRPOSettings(LearnerSettings):
+    """Trust region policy optimisation; the preset `paper` has the values of Table B5 where these differ."""
+
     gae_lambda: Share = 0.97
     target_kl: Positive = 0.03
     cg_damping: Positive = 0.1

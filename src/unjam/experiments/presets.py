@@ -7,14 +7,15 @@ PRESETS: dict[str, dict[str, Any]] = {
     "paper": {
         "expert": "pi:time_constant=0",
         "steps": 4_000_000,
+        "spread": False,
         "policy": {
             "observe": ["local"],
             "exploration_std": 1.0,
-            "hold": 1,
+            "hold": 0,
             "critic_sees_road": False,
             "normalise_value": False,
         },
-        "trpo": {"batch_steps": 6000, "spread": False, "gamma": 0.995, "target_kl": 0.01},
+        "trpo": {"batch_steps": 6000, "gamma": 0.995, "target_kl": 0.01},
     },
     # Ends within about five minutes on two cores, evaluation included.
     "demo": {"steps": 960_000},
