@@ -8,7 +8,7 @@ import torch
 
 from unjam.agents.algorithms import LEARNERS
 from unjam.agents.episodic import Iteration, Training
-from unjam.agents.settings import LearnerSettings, PolicySettings, TRPOSettings
+from unjam.agents.settings import LearnerSettings, PolicySettings, PPOSettings, SACSettings, TRPOSettings
 from unjam.agents.state import learner_state
 from unjam.drivers import LocalState
 from unjam.drivers.network import Network
@@ -17,7 +17,11 @@ from unjam.traffic.record import Episode, Trajectory
 
 INPUTS, DECISIONS = 2, 100
 LENGTHS = (220.0, 270.0)
-QUICK: dict[str, LearnerSettings] = {"trpo": TRPOSettings(critic_epochs=3)}
+QUICK: dict[str, LearnerSettings] = {
+    "trpo": TRPOSettings(critic_epochs=3),
+    "ppo": PPOSettings(epochs=5),
+    "sac": SACSettings(start_steps=0, updates_per_step=0.01, batch=16, buffer_rows=1000),
+}
 """settings with which each learner is quick"""
 
 Target = Callable[[np.ndarray], np.ndarray]

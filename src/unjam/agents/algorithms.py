@@ -1,15 +1,28 @@
 """The learners: Algorithm 1 over those of Stable-Baselines3. Each learns from the rows of an iteration."""
 
+import math
 from collections.abc import Callable
 from typing import Any, cast
 
 import sb3_contrib
-from stable_baselines3.common.buffers import RolloutBuffer
+import stable_baselines3
+from stable_baselines3.common.buffers import ReplayBuffer, RolloutBuffer
 
-from unjam.agents.buffers import Rows, discounted_returns, fill_rollout_buffer
+from unjam.agents.buffers import (
+    Rows,
+    add_to_replay_buffer,
+    discounted_returns,
+    fill_rollout_buffer,
+    shifted_rewards,
+)
 from unjam.agents.episodic import Episodic, Training
 from unjam.agents.policy import ResidualPolicy
-from unjam.agents.settings import TRPOSettings
+from unjam.agents.settings import PPOSettings, SACSettings, TRPOSettings
+from unjam.agents.squashed_policy import SquashedResidualPolicy, uniform_network
+from unjam.drivers.network import Network
+
+SIZED_LATER = 2
+"""stands for the size of rollout buffer and batch until an iteration says how many rows it has"""
 
 
 class OnPolicy(Episodic):
@@ -54,5 +67,85 @@ class TRPO(OnPolicy, sb3_contrib.TRPO):
             super().train()
 
 
-LEARNERS: dict[str, Callable[[Training, Any], Episodic]] = {"trpo": TRPO}
+class PPO(OnPolicy, stable_baselines3.PPO):
+    """Proximal policy optimisation from whole episodes."""
+
+    def __init__(self, training: Training, settings: PPOSettings) -> None:
+        super().__init__(
+            training,
+            ResidualPolicy,
+            n_steps=SIZED_LATER,
+            batch_size=SIZED_LATER,
+            n_epochs=settings.epochs,
+            gamma=settings.gamma,
+            gae_lambda=settings.gae_lambda,
+            clip_range=settings.clip,
+            # SB3 clips the gradients of actor and critic together; they share no weight, and the critic's
+            # gradient, in the units of returns, would leave nothing of the actor's.
+            max_grad_norm=math.inf,
+        )
+        self._minibatches = settings.minibatches
+        cast(ResidualPolicy, self.policy).set_rates(settings.actor_rate, settings.critic_rate)
+
+    def train(self) -> None:
+        """Update policy and value network with the rows of this iteration."""
+        with self.learning() as rows:  # virtual rows will join the actual ones here
+            self.fill(rows)
+            self.batch_size = math.ceil(len(rows.rewards) / self._minibatches)
+            super().train()
+
+    def _update_learning_rate(self, optimizers: Any) -> None:
+        """Leave the rates as they are: SB3 would set one for actor and critic."""
+
+
+class SAC(Episodic, stable_baselines3.SAC):
+    """Soft actor-critic from whole episodes, and from those of earlier iterations."""
+
+    def __init__(self, training: Training, settings: SACSettings) -> None:
+        temperature = settings.temperature
+        super().__init__(
+            training,
+            SquashedResidualPolicy,
+            learning_rate=settings.rate,
+            buffer_size=settings.buffer_rows,
+            learning_starts=0,  # see train
+            batch_size=settings.batch,
+            tau=settings.tau,
+            gamma=settings.gamma,
+            replay_buffer_kwargs={"handle_timeout_termination": False},  # a cut is no end in our rows
+            ent_coef=f"auto_{temperature}" if settings.learn_temperature else temperature,
+            target_entropy=settings.target_entropy,
+        )
+        self._settings = settings
+
+    @property
+    def _starting(self) -> bool:
+        return self.num_timesteps < self._settings.start_steps
+
+    def exploring_network(self) -> Network:
+        """Return the policy's twin; before the first update, what the settings say."""
+        if self._starting and self._settings.start == "uniform":
+            return uniform_network(self.training.inputs, cast(SquashedResidualPolicy, self.policy).authority)
+        return self.network()
+
+    def train(self, *arguments: Any, **named: Any) -> None:
+        """Add the rows of this iteration to the replay buffer, and update actor and critics from it."""
+        with self.learning() as rows:  # virtual rows will join the actual ones here
+            self.fill(rows)
+            if not self._starting:
+                steps = sum(episode.steps for episode in self._episodes)
+                updates = max(1, round(steps * self._settings.updates_per_step))
+                super().train(gradient_steps=updates, batch_size=self.batch_size)
+
+    def fill(self, rows: Rows) -> None:
+        """Add rows to the replay buffer, their rewards shifted and scaled."""
+        policy = cast(SquashedResidualPolicy, self.policy)
+        if self.training.policy.normalise_value and self.iteration == 1:
+            policy.reward_offset.fill_(rows.rewards.mean())
+        rewards = shifted_rewards(rows, policy.reward_offset.item(), self.gamma)
+        buffer = cast(ReplayBuffer, self.replay_buffer)
+        add_to_replay_buffer(buffer, rows, policy.authority, rewards * self._settings.reward_scale)
+
+
+LEARNERS: dict[str, Callable[[Training, Any], Episodic]] = {"trpo": TRPO, "ppo": PPO, "sac": SAC}
 """every learner by name: made of what it learns on and its own settings"""

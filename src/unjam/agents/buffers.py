@@ -6,12 +6,13 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from stable_baselines3.common.buffers import RolloutBuffer
+from stable_baselines3.common.buffers import ReplayBuffer, RolloutBuffer
 from stable_baselines3.common.policies import ActorCriticPolicy
 
 from unjam.traffic.record import Trajectory
 
 Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -22,7 +23,7 @@ class Rows:
     """what the actor sees, then what the critic alone sees, shape (rows, inputs + critic inputs)"""
     actions: Float32
     """residuals that the network chose [m/s2], shape (rows,)"""
-    rewards: NDArray[np.float64]
+    rewards: Float64
     """what was earned while each residual was held, shape (rows,)"""
     starts: NDArray[np.intp]
     """first row of each trajectory, shape (trajectories,)"""
@@ -105,7 +106,37 @@ def fill_rollout_buffer(buffer: RolloutBuffer, policy: ActorCriticPolicy, rows: 
     buffer.compute_returns_and_advantage(torch.zeros(1), np.ones(1, bool))
 
 
-def discounted_returns(rows: Rows, gamma: float) -> NDArray[np.float64]:
+def add_to_replay_buffer(buffer: ReplayBuffer, rows: Rows, authority: float, rewards: Float64) -> None:
+    """Add rows to those of earlier iterations, in place of the oldest where the buffer is full.
+
+    Only a collision ends what is to be earned: a trajectory that was cut goes on with the value of where it
+    ended. SB3 keeps actions as shares of their bounds, here of the `authority` [m/s2].
+    """
+    done = np.zeros(len(rewards), np.float32)
+    done[rows.lasts] = rows.terminated
+    places = (buffer.pos + np.arange(len(rewards))) % buffer.buffer_size
+    buffer.observations[places, 0] = rows.observations
+    buffer.next_observations[places, 0] = rows.next_observations
+    buffer.actions[places, 0, 0] = rows.actions / np.float32(authority)
+    buffer.rewards[places, 0] = rewards
+    buffer.dones[places, 0] = done
+    end = buffer.pos + len(rewards)
+    buffer.full = buffer.full or end >= buffer.buffer_size
+    buffer.pos = end % buffer.buffer_size
+
+
+def shifted_rewards(rows: Rows, offset: float, gamma: float) -> Float64:
+    """Return the rewards less `offset`, shape (rows,), so that the same policies are the best ones.
+
+    What follows a row is then worth less by offset / (1 - gamma), wherever it is; after a collision, where
+    nothing follows, the last reward is less by what is missing.
+    """
+    rewards = rows.rewards - offset
+    rewards[rows.lasts] -= np.where(rows.terminated, offset * gamma / (1.0 - gamma), 0.0)
+    return rewards
+
+
+def discounted_returns(rows: Rows, gamma: float) -> Float64:
     """Return the discounted sum of the rewards that follow each row, shape (rows,).
 
     The end of a cut trajectory counts as if it went on at its mean reward.

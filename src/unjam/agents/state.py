@@ -1,12 +1,18 @@
 """All that a learner must keep to go on exactly where it stopped, as plain numbers and tensors."""
 
-from typing import Any
+from typing import Any, cast
 
 import torch
+from stable_baselines3.common.buffers import ReplayBuffer
 
+from unjam.agents.algorithms import SAC
 from unjam.agents.episodic import Episodic
 
 Tensors = dict[str, torch.Tensor]
+
+REPLAY = ("observations", "next_observations", "actions", "rewards", "dones")
+REPLAY_PLACE = ("pos", "full")
+"""where the next row goes, and whether the buffer is full"""
 
 
 def learner_state(learner: Episodic) -> tuple[dict[str, Any], Tensors]:
@@ -26,6 +32,9 @@ def learner_state(learner: Episodic) -> tuple[dict[str, Any], Tensors]:
                 tensors |= {f"{part}/{index}/{name}": tensor for name, tensor in entry.items()}
         else:
             tensors |= {f"{part}/{name}": tensor for name, tensor in state.items()}
+    if isinstance(learner, SAC):
+        counters |= {name: getattr(learner.replay_buffer, name) for name in REPLAY_PLACE}
+        tensors |= _tensors_in_place(learner)
     return counters, {name: tensor.detach().clone() for name, tensor in tensors.items()}
 
 
@@ -36,6 +45,23 @@ def restore_learner(learner: Episodic, counters: dict[str, Any], tensors: Tensor
     learner.iteration = counters["iteration"]
     learner.num_timesteps = counters["actual_steps"]
     learner._n_updates = counters["updates"]
+    if isinstance(learner, SAC):
+        for name in REPLAY_PLACE:
+            setattr(learner.replay_buffer, name, counters[name])
+        for name, tensor in _tensors_in_place(learner).items():
+            tensor.detach().copy_(tensors[name])
+
+
+def _tensors_in_place(learner: SAC) -> Tensors:
+    """Return what SB3 does not name among its parameters, as tensors that share the learner's memory.
+
+    That is the filled part of the replay buffer and, where it is learned, the temperature.
+    """
+    buffer = cast(ReplayBuffer, learner.replay_buffer)
+    tensors = {f"replay/{name}": torch.from_numpy(getattr(buffer, name)[: buffer.size()]) for name in REPLAY}
+    if learner.log_ent_coef is not None:
+        tensors["log_ent_coef"] = learner.log_ent_coef
+    return tensors
 
 
 def _state_of(part: str, fresh: dict[str, Any], tensors: Tensors) -> dict[str, Any]:

@@ -40,7 +40,7 @@ def train(
     ] = None,
     steps: Annotated[int | None, typer.Option(min=1, help="Actual simulator steps to train for.")] = None,
     seed: Annotated[int | None, typer.Option(min=0, help="Seed of the whole run.")] = None,
-    agent: Annotated[str | None, typer.Option(help="Learner: trpo.")] = None,
+    agent: Annotated[str | None, typer.Option(help="Learner: trpo, ppo, sac.")] = None,
     expert: Annotated[
         str | None,
         typer.Option(help="Driver that the residual is added to, as in drive --driver; none: no expert."),

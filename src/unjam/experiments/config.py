@@ -9,7 +9,7 @@ import tomli_w
 from pydantic import Field, field_validator, model_validator
 from pydantic.dataclasses import dataclass
 
-from unjam.agents.settings import LearnerSettings, PolicySettings, TRPOSettings
+from unjam.agents.settings import LearnerSettings, PolicySettings, PPOSettings, SACSettings, TRPOSettings
 from unjam.drivers.constant import Constant
 from unjam.drivers.driver import Driver
 from unjam.errors import InputError, wrong_name
@@ -40,7 +40,7 @@ class RunConfig:
     scenario: str = "ring"
     road: dict[str, Any] = field(default_factory=dict)
     """changes to the scenario's parameters"""
-    agent: Literal["trpo"] = "trpo"
+    agent: Literal["trpo", "ppo", "sac"] = "trpo"
     """who learns; its settings are in the table of its name"""
     expert: str = "pi"
     """driver that the residual is added to: a name, `path.py:name`, a run folder, a .unjam file; `none`:
@@ -57,6 +57,8 @@ class RunConfig:
     ring's lengths) evenly"""
     policy: PolicySettings = field(default_factory=PolicySettings)
     trpo: TRPOSettings = field(default_factory=TRPOSettings)
+    ppo: PPOSettings = field(default_factory=PPOSettings)
+    sac: SACSettings = field(default_factory=SACSettings)
     evaluation: EvaluationSettings = field(default_factory=EvaluationSettings)
     preset: str = ""
     """which preset this started from, for the record"""
