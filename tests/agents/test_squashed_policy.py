@@ -81,7 +81,8 @@ def test_the_numpy_twin_gives_the_residual_and_the_noise_of_the_torch_policy(
 @pytest.mark.parametrize(("log_std", "clipped"), [(5.0, 2.0), (-30.0, -20.0)])
 def test_the_twins_noise_has_the_bounds_of_the_policys(log_std: float, clipped: float) -> None:
     policy = make_policy()
-    torch.nn.init.constant_(policy.actor.log_std.bias, log_std)  # pyright: ignore[reportArgumentType]
+    with torch.no_grad():
+        policy.actor.get_parameter("log_std.bias").fill_(log_std)
     found = policy.network().explore(np.zeros((1, 5)), np.array([1e-2]))
     np.testing.assert_allclose(found, np.tanh(math.exp(clipped) * 1e-2), rtol=1e-6)
 

@@ -34,6 +34,8 @@ def small_config(**changes: Any) -> RunConfig:
         "road": {"length": [120, 130], "vehicles": 8, "horizon": 100},
         "policy": {"hidden": [8]},
         "trpo": {"batch_steps": STEPS, "critic_epochs": 2, "critic_batch": 16},
+        "ppo": {"batch_steps": STEPS, "epochs": 3},
+        "sac": {"batch_steps": STEPS, "start_steps": 400, "updates_per_step": 0.02, "batch": 8},
         "evaluation": {"every": 1, "validation_episodes": 2, "episodes": 2, "baselines": ["human"]},
         "steps": 2 * STEPS,
         "workers": 1,
@@ -162,6 +164,31 @@ def test_a_run_that_was_stopped_ends_as_if_it_had_not_been(
     assert len(progress(folder)) == iterations
     learn(folder, config, resume=True)
     assert outcome(folder) == outcome(uninterrupted)
+
+
+@pytest.mark.parametrize("agent", ["ppo", "sac"])
+def test_a_run_of_any_learner_ends_as_if_it_had_not_been_stopped(
+    tmp_path: Path, agent: str, learn: Learn
+) -> None:
+    config = small_config(agent=agent, steps=4 * STEPS, policy__hidden=[8, 8])
+    learn(tmp_path / "one go", config)
+    for iterations in (1, 3):
+        with pytest.raises(Stop):
+            learn(tmp_path / "run", config, stop_after(iterations), resume=iterations > 1)
+    learn(tmp_path / "run", config, resume=True)
+    assert outcome(tmp_path / "run") == outcome(tmp_path / "one go")
+
+
+def test_each_learner_learns_its_own_way(uninterrupted: Path, tmp_path: Path, learn: Learn) -> None:
+    for agent, key in {"ppo": "clip_fraction", "sac": "critic_loss"}.items():
+        learn(tmp_path / agent, small_config(agent=agent))
+        rows = progress(tmp_path / agent)
+        assert rows[0]["return_expert"] == progress(uninterrupted)[0]["return_expert"]
+        assert key in rows[1]["learner"]
+        assert [row["actual_steps"] for row in rows] == [STEPS, 2 * STEPS]
+        loaded = load_controller(tmp_path / agent)
+        assert isinstance(loaded, ResidualDriver)
+        assert loaded.network.squashes_noise is (agent == "sac")
 
 
 def test_a_run_that_is_stopped_again_and_again_ends_as_if_it_had_not_been(
