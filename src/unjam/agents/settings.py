@@ -71,7 +71,7 @@ class TRPOSettings(LearnerSettings):
 
 @dataclass(frozen=True, config=STRICT)
 class PPOSettings(LearnerSettings):
-    """Proximal policy optimisation; the preset `paper` has the values of Table B5 where these differ."""
+    """Proximal policy optimisation; its defaults are the values of Table B3, but for larger iterations."""
 
     gae_lambda: Share = 0.97
     clip: Annotated[float, Field(gt=0, lt=1)] = 0.2
@@ -85,7 +85,7 @@ class PPOSettings(LearnerSettings):
 
 @dataclass(frozen=True, config=STRICT)
 class SACSettings(LearnerSettings):
-    """Soft actor-critic; the preset `paper` has the values of Table B5 where these differ."""
+    """Soft actor-critic; the preset `paper` has the values of Table B4 where these differ."""
 
     batch_steps: Count = 6_000
     tau: Annotated[float, Field(gt=0, le=1)] = 0.005

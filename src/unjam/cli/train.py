@@ -65,6 +65,8 @@ def train(
 
       unjam train ring --preset demo
 
+      unjam train ring --agent sac --steps 120000
+
       unjam train ring-jammed --expert follower-stopper --steps 500000 --seed 3
 
       unjam train ring --expert my_driver.py:gentle --reward my_reward.py:calm
