@@ -157,7 +157,7 @@ def test_the_toml_of_a_road_given_in_python_makes_it_again(tmp_path: Path) -> No
         expert=st.text(),
         reward=st.text(),
         steps=st.integers(1, 2**62),
-        seed=st.integers(0, 10**6),
+        seed=st.integers(0, 10**6 - 1),
         policy=st.builds(
             PolicySettings,
             hidden=st.lists(st.integers(1, 999), min_size=1).map(tuple),
