@@ -37,18 +37,8 @@ def test_exploration_adds_scaled_noise() -> None:
     np.testing.assert_allclose(network.explore(observation, noise) - network(observation), 0.2 * noise)
 
 
-def squashing_network() -> Network:
-    """A network whose second output is the log standard deviation of its noise."""
-    network = random_network(5)
-    *hidden, (weight, bias) = network.layers
-    generator = np.random.default_rng(4)
-    spread = generator.normal(size=(len(weight), 1)), generator.normal(size=1)
-    last = np.hstack([weight, spread[0]]), np.hstack([bias, spread[1]])
-    return Network((*hidden, last), authority=1.5)
-
-
 def test_noise_that_the_network_sizes_itself_comes_before_the_tanh() -> None:
-    network = squashing_network()
+    network = random_network(5, outputs=2)
     observation, noise = np.random.default_rng(1).normal(size=(2, 30, 5))
     noise = noise[:, 0]
     hidden = observation
@@ -56,14 +46,14 @@ def test_noise_that_the_network_sizes_itself_comes_before_the_tanh() -> None:
         hidden = np.maximum(0.0, hidden @ weight + bias)
     weight, bias = network.layers[-1]
     mean, log_std = (hidden @ weight + bias).T
-    np.testing.assert_allclose(network(observation), 1.5 * np.tanh(mean), atol=1e-12)
-    expected = 1.5 * np.tanh(mean + np.exp(log_std) * noise)
+    np.testing.assert_allclose(network(observation), np.tanh(mean), atol=1e-12)
+    expected = np.tanh(mean + np.exp(log_std) * noise)
     np.testing.assert_allclose(network.explore(observation, noise), expected, atol=1e-12)
     assert np.ptp(log_std) > 0.1
 
 
 def test_exploring_rows_at_once_equal_single_rows_and_plain_numbers() -> None:
-    for network in (random_network(5), squashing_network()):
+    for network in (random_network(5), random_network(5, outputs=2)):
         observation, noise = np.random.default_rng(2).normal(size=(2, 9, 5))
         together = network.explore(observation, noise[:, 0])
         for row, drawn, expected in zip(observation, noise[:, 0], together, strict=True):
@@ -73,7 +63,7 @@ def test_exploring_rows_at_once_equal_single_rows_and_plain_numbers() -> None:
             assert type(single) is float
 
 
-@pytest.mark.parametrize("network", [random_network(5), squashing_network()])
+@pytest.mark.parametrize("network", [random_network(5), random_network(5, outputs=2)])
 def test_arrays_make_the_same_network_again(network: Network) -> None:
     again = network_from_arrays(network_arrays(network), network.authority, network.exploration_std)
     observation, noise = np.ones((2, 5)), np.ones(2)

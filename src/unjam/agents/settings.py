@@ -29,7 +29,7 @@ class PolicySettings:
     exploration_std: Positive = 0.1
     """standard deviation of the exploration noise at the start, as a share of the action limit"""
     learn_exploration: bool = True
-    """whether the standard deviation is learned, or stays what it is at the start"""
+    """whether the standard deviation is learned, or stays what it is at the start (sac always learns it)"""
     hold: NotNegative = 1.0
     """how long one residual is held [s], rounded to whole decisions, at least one: over a second noise adds
     up to a change of speed instead of cancelling itself"""
