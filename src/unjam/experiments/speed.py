@@ -67,7 +67,8 @@ def measure_speed(rounds: int = ROUNDS, told: Callable[[str], None] | None = Non
 
 
 def _measure(rounds: int, say: Callable[[str], None]) -> dict[str, Any]:
-    ring, driver = SCENARIOS["ring"], neural_driver(PolicySettings().hold)
+    ring = SCENARIOS["ring"]
+    driver = neural_driver(PolicySettings().decisions_held(ring.decision_step))
     every_step = neural_driver(1)
     found: dict[str, list[float]] = {"bare": [], "episode": [], "every_step": [], "loop": [], "traci": []}
     others: dict[str, dict[str, list[float]]] = {name: {"bare": [], "episode": []} for name in OTHER_ROADS}
