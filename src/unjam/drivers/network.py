@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from unjam.errors import InputError
+from unjam.physics.arrays import Array, namespace
 
 Floats = NDArray[np.float64]
 
@@ -32,8 +33,13 @@ class Network:
         object.__setattr__(self, "_folded", _fold_biases(self.layers))
 
     def __call__(self, observation: Any) -> Any:
-        """Return the residual acceleration [m/s2]: shape (n,) for (n, inputs), a float for a tuple."""
+        """Return the residual acceleration [m/s2]: shape (n,) for (n, inputs), a float for a tuple.
+
+        Torch tensors are answered with tensors, in their own precision and on their own device.
+        """
         single = isinstance(observation, tuple)
+        if not single and not isinstance(observation, np.ndarray):
+            return self._on_tensors(observation)
         if single:
             hidden = np.array((*observation, 1.0))
         else:
@@ -42,6 +48,13 @@ class Network:
         for weight in self._folded[1:]:
             hidden = np.maximum(hidden, 0.0, out=hidden).dot(weight)
         return self.authority * (math.tanh(hidden) if single else np.tanh(hidden))
+
+    def _on_tensors(self, observation: Array) -> Array:
+        xp, hidden = namespace(observation), observation
+        for index, layer in enumerate(self.layers):
+            weight, bias = (xp.as_tensor(part, dtype=hidden.dtype, device=hidden.device) for part in layer)
+            hidden = xp.addmm(bias, hidden.relu_() if index else hidden, weight)
+        return self.authority * hidden[:, 0].tanh()
 
     def explore(self, observation: Any, noise: Any) -> Any:
         """Return the residual with exploration; `noise` is standard normal, shaped like the residual."""

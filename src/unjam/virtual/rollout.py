@@ -1,0 +1,184 @@
+"""Virtual rollouts: how long they may be (Eq. 15), and driving them with the full policy."""
+
+from dataclasses import dataclass
+from math import floor, isfinite
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from unjam.drivers.driver import Driver, Memory
+from unjam.drivers.local_state import LocalState
+from unjam.drivers.residual import ResidualDriver, observe
+from unjam.errors import UnjamError
+from unjam.physics.arrays import clip
+from unjam.virtual.data import ActualData
+from unjam.virtual.expert import memory_on, on_tensors, remembered
+from unjam.virtual.settings import VirtualSettings
+from unjam.virtual.world import BOUNDS, World
+
+
+def rollout_length(eps_m: float, settings: VirtualSettings) -> int:
+    """Return k* = min(k_max, floor(kappa / eps_m)) [decisions], Eq. 15; 0: the model is not to be used."""
+    if not isfinite(eps_m):
+        return 0
+    if eps_m * settings.k_max <= settings.kappa:
+        return settings.k_max
+    return floor(settings.kappa / eps_m)
+
+
+def return_bound(eps_pi: float, eps_m: float, k: int, gamma: float, largest_reward: float) -> float:
+    """Return C, by how much the actual return may fall short of the virtual one (paper, below Eq. 13).
+
+    Args:
+        eps_pi: total variation between the policy and the one that collected the data.
+        eps_m: total variation between virtual and actual next state.
+        k: rollout length [decisions].
+        gamma: discount for a decision.
+        largest_reward: R_max, the largest |reward| of a decision.
+    """
+    far = 1.0 / (1.0 - gamma)
+    policy = gamma ** (k + 1) * eps_pi * far**2 + gamma**k * eps_pi * far
+    return 2.0 * largest_reward * (policy + k * eps_m * far)
+
+
+class Starts(NamedTuple):
+    """Actual rows from which virtual rollouts begin; n rows."""
+
+    state: LocalState
+    """tensors of shape (n,)"""
+    memory: Memory
+    """of the expert, as `on_tensors` of it takes it"""
+    drawn: Tensor
+    """what the rows' episodes have drawn, scaled, shape (n, m)"""
+    looks: NDArray[np.int64]
+    """where they are: rows (recording, decision), shape (n, 2)"""
+
+
+@dataclass(frozen=True)
+class Rollouts:
+    """Virtual experience: n rows, each of as many looks of the network; tensors."""
+
+    observations: Tensor
+    """what the network saw at each look, and at the end, shape (n, looks + 1, inputs)"""
+    actions: Tensor
+    """the residual it chose, with its exploration noise, not clipped [m/s2], shape (n, looks)"""
+    rewards: Tensor
+    """what was earned while each residual was held, zero after a crash, shape (n, looks)"""
+    made: Tensor
+    """looks that each row made: those after its crash mean nothing, shape (n,)"""
+    terminated: Tensor
+    """whether it crashed; otherwise it was cut, and goes on where it ended, shape (n,)"""
+    drawn: Tensor
+    """what its episode had drawn, scaled, shape (n, m)"""
+    start: NDArray[np.int64]
+    """where it began: rows (recording, decision), shape (n, 2)"""
+    decisions: int
+    """virtual decisions in all"""
+    bounded: dict[str, float]
+    """share of the decisions in which each of BOUNDS had to be enforced"""
+
+
+def draw_starts(data: ActualData, rows: int, ahead: int, seed: np.random.SeedSequence) -> NDArray[np.int64]:
+    """Return random decisions at which a residual was due, rows (recording, decision), shape (rows, 2).
+
+    At least `ahead` recorded decisions follow each. None where the data have none such.
+    """
+    looks = data.looks(ahead)
+    if not len(looks):
+        return looks
+    return looks[np.random.default_rng(seed).integers(len(looks), size=rows)]
+
+
+def begin(data: ActualData, looks: NDArray[np.int64], expert: Driver, device: torch.device | str) -> Starts:
+    """Return the start of virtual rollouts at `looks`, with what the expert remembered there."""
+    recordings = [data.recordings[place] for place in looks[:, 0]]
+
+    def placed(values: list[np.float64]) -> Tensor:
+        return torch.as_tensor(np.array(values), dtype=torch.float32, device=device)
+
+    columns = zip(
+        *([values[at] for values in r.states] for r, at in zip(recordings, looks[:, 1], strict=True)),
+        strict=True,
+    )
+    memory = remembered(expert, data.recordings, looks)
+    return Starts(
+        state=LocalState(*(placed(list(values)) for values in columns)),
+        memory=memory_on(on_tensors(expert), memory, device),
+        drawn=placed([recording.drawn for recording in recordings]),  # pyright: ignore[reportArgumentType]
+        looks=looks,
+    )
+
+
+@torch.no_grad()
+def imagine(
+    driver: ResidualDriver,
+    world: World,
+    starts: Starts,
+    decisions: int,
+    generator: torch.Generator | None,
+) -> Rollouts:
+    """Drive with the full policy, expert plus residual, for `decisions` from actual states.
+
+    `decisions` is rounded down to whole looks of the network; the expert decides in each of them, and what
+    it remembers is rolled forward. Rows that have crashed are driven on, but count no more.
+
+    Args:
+        driver: expert, network, and for how long a residual is held.
+        world: the virtual environment.
+        starts: where to begin.
+        decisions: k*.
+        generator: of the exploration noise; None: no exploration.
+
+    Raises:
+        UnjamError: the world gave something that is not finite.
+        InputError: so did a driver of the user's.
+    """
+    expert, limit, network = on_tensors(driver.expert), driver.action_limit, driver.network
+    state, memory = starts.state, starts.memory
+    n, looks = len(state.speed), decisions // driver.hold
+    like = state.speed
+    observations, actions, rewards = [], [], []
+    running = torch.ones_like(like)
+    made, bounded, lived = like * 0.0, like.new_zeros(len(BOUNDS)), like.new_zeros(())
+    for _ in range(looks):
+        made += running
+        earned, residual = torch.zeros_like(like), None
+        for _ in range(driver.hold):
+            wanted, memory = expert.act(state, memory)
+            wanted = clip(wanted, -limit, limit)
+            if residual is None:
+                seen = observe(driver.parts, state, wanted, expert, memory)
+                if generator is None:
+                    residual = network(seen)
+                else:
+                    noise = torch.randn(n, generator=generator, device=like.device)
+                    residual = network.explore(seen, noise)
+                observations.append(seen)
+                actions.append(residual)
+            step = world.step(state, clip(wanted + residual, -limit, limit), starts.drawn)
+            state = step.state
+            earned += step.reward * running
+            bounded += (step.bounded * running).sum(1)
+            lived += running.sum()
+            running = running * ~step.crashed
+        rewards.append(earned)
+    wanted, memory = expert.act(state, memory)
+    observations.append(observe(driver.parts, state, clip(wanted, -limit, limit), expert, memory))
+    rollouts = Rollouts(
+        observations=torch.stack(observations, 1),
+        actions=torch.stack(actions, 1) if looks else like.new_zeros((n, 0)),
+        rewards=torch.stack(rewards, 1) if looks else like.new_zeros((n, 0)),
+        made=made.long(),
+        terminated=running == 0.0,
+        drawn=starts.drawn,
+        start=starts.looks,
+        decisions=int(lived.item()),
+        bounded=dict(zip(BOUNDS, (bounded / lived.clip(1.0)).tolist(), strict=True)),
+    )
+    for name in ("observations", "actions", "rewards"):
+        if not getattr(rollouts, name).isfinite().all():
+            raise UnjamError(f"virtual environment: {name} of a rollout are not finite")
+    return rollouts
