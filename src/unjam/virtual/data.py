@@ -123,15 +123,22 @@ class ActualData:
         )
 
     def looks(self, ahead: int = 1) -> NDArray[np.int64]:
-        """Return where a residual was due and at least `ahead` decisions follow: rows (recording, decision)."""
-        return np.concatenate(
-            [np.zeros((0, 2), np.int64)]
-            + [
-                np.stack([np.full_like(decisions, place), decisions], 1)
-                for place, r in enumerate(self.recordings)
-                for decisions in [np.arange(0, len(r.reward) - ahead + 1, r.hold)]
-            ]
-        )
+        """Return where a residual was due and at least `ahead` decisions follow.
+
+        Rows (recording, decision).
+        """
+        due = [np.arange(0, len(r.reward) - ahead + 1, r.hold) for r in self.recordings]
+        places = np.repeat(np.arange(len(due)), [len(decisions) for decisions in due])
+        return np.column_stack([places, np.concatenate([[], *due]).astype(np.int64)])
+
+    def states_at(self, looks: NDArray[np.int64]) -> LocalState:
+        """Return the states at `looks`, rows (recording, decision), arrays of shape (rows,)."""
+        found = LocalState(*(np.empty(len(looks)) for _ in LocalState._fields))
+        for place in np.unique(looks[:, 0]):
+            rows = np.flatnonzero(looks[:, 0] == place)
+            for into, values in zip(found, self.recordings[place].states, strict=True):
+                into[rows] = values[looks[rows, 1]]
+        return found
 
 
 def is_held_out(episode: int, share: float) -> bool:

@@ -1,9 +1,8 @@
 """Fitting the virtual environment to actual data, and how wrong it is afterwards: eps_m of Eq. 15."""
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import sqrt
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -17,21 +16,8 @@ from unjam.traffic.reward import make_reward
 from unjam.virtual.base import base_reward, base_step
 from unjam.virtual.data import Transitions
 from unjam.virtual.model import NOISE_ROWS, NUMBERS, TARGETS, EnvironmentModel
+from unjam.virtual.model_error import SMALLEST_CHANGE, OneStep, one_step, total_variation, unexplained
 from unjam.virtual.settings import VirtualSettings
-
-SMALLEST_CHANGE = 1e-4
-"""what varies by less than this is as good as constant [m/s, m, reward]"""
-
-
-class OneStep(NamedTuple):
-    """Root mean squares on the holdout, one step ahead [m/s, m, reward]."""
-
-    base: float
-    """error of the base alone"""
-    model: float
-    """error of a member of the ensemble, the base where it is better"""
-    change: float
-    """of what there was to predict: the change in the step, or the reward, about its mean"""
 
 
 @dataclass(frozen=True)
@@ -39,7 +25,7 @@ class Fit:
     """What came of a fit."""
 
     errors: dict[str, float]
-    """the model error eps_m by estimator.
+    """the model error eps_m by estimator
 
     `unexplained`: mean square of the holdout error over the variance of the change, mean of the five numbers
     of the state. `total_variation`: between the distributions of the next state of a random member and of
@@ -78,24 +64,42 @@ def fit(
     """
     generator = np.random.default_rng(np.random.SeedSequence(list(seed)))
     device = model.input_mean.device
-    inputs, targets = inputs_of(actual), targets_of(actual, model.base, scenario, reward)
+    inputs = torch.as_tensor(inputs_of(actual)).to(device)
+    targets = torch.as_tensor(targets_of(actual, model.base, scenario, reward)).to(device)
     training = _some(~actual.held_out, settings.fit_rows, generator)
     holdout = _some(actual.held_out, max(1, round(settings.fit_rows * settings.holdout)), generator)
-    seen, wanted = (torch.as_tensor(values[training]).to(device) for values in (inputs, targets))
-    model.normalise(seen, wanted, SMALLEST_CHANGE)
-    left = targets[:, -1]
-    model.reward_range.copy_(torch.tensor([left.min(), left.max()]))
+    model.normalise(inputs[training], targets[training], SMALLEST_CHANGE)
+    model.reward_range.copy_(torch.stack([targets[:, -1].min(), targets[:, -1].max()]))
 
-    drawn = generator.integers(len(training), size=(settings.members, len(training)))
-    bootstrap = training[drawn]
+    bootstrap = training[generator.integers(len(training), size=(model.members, len(training)))]
     last_loss, epochs = _descend(
         model,
-        _normalised(model, inputs, targets, bootstrap),
-        _normalised(model, inputs, targets, holdout),
+        (_seen(model, inputs[bootstrap]), _wanted(model, targets[bootstrap])),
+        (_seen(model, inputs[holdout]), _wanted(model, targets[holdout])),
         settings,
         generator,
     )
-    return _judge(model, actual, inputs, targets, holdout, generator, last_loss, len(training), epochs)
+
+    wanted, predicted = targets[holdout].cpu().numpy(), _predicted(model, inputs[holdout])
+    learned = np.square(wanted - predicted).mean((0, 1)) < np.square(wanted).mean(0)
+    predicted = predicted * learned  # where the base is better, it is used alone
+    left = wanted - predicted.mean(0)
+    noise = left[generator.integers(len(left), size=NOISE_ROWS)] - left.mean(0)
+    model.learned.copy_(torch.as_tensor(learned))
+    model.noise.copy_(torch.as_tensor(noise))
+
+    changed = [getattr(actual.following, name) - getattr(actual.states, name) for name in NUMBERS]
+    changed = np.column_stack([*changed, actual.reward])[holdout]
+    steps = {
+        name: one_step(wanted[:, i], predicted[:, :, i], changed[:, i]) for i, name in enumerate(TARGETS)
+    }
+    errors = {
+        "unexplained": unexplained([steps[name] for name in NUMBERS]),
+        "total_variation": total_variation(predicted[:, :, :-1], left[:, :-1].std(0)),
+        "released": last_loss,
+    }
+    names = tuple(itertools.compress(TARGETS, learned))
+    return Fit(errors, steps, names, len(training), len(holdout), epochs)
 
 
 def inputs_of(actual: Transitions) -> Floats:
@@ -119,14 +123,21 @@ def _some(chosen: NDArray[np.bool_], most: int, generator: np.random.Generator) 
     return generator.permutation(rows)[:most]
 
 
-def _normalised(
-    model: EnvironmentModel, inputs: Floats, targets: Floats, rows: NDArray[np.int64]
-) -> tuple[Tensor, Tensor]:
-    device = model.input_mean.device
-    seen, wanted = (torch.as_tensor(values[rows]).to(device) for values in (inputs, targets))
-    seen = (seen - model.input_mean) / model.input_scale
-    wanted = (wanted - model.target_mean) / model.target_scale
-    return seen.float(), wanted.float()
+def _seen(model: EnvironmentModel, inputs: Tensor) -> Tensor:
+    """Return inputs in SI units as the networks take them."""
+    return ((inputs - model.input_mean) / model.input_scale).float()
+
+
+def _wanted(model: EnvironmentModel, targets: Tensor) -> Tensor:
+    """Return targets in SI units as the networks are to answer them."""
+    return ((targets - model.target_mean) / model.target_scale).float()
+
+
+@torch.no_grad()
+def _predicted(model: EnvironmentModel, inputs: Tensor) -> Floats:
+    """Return what each member answers to the same rows, SI units, shape (members, rows, 6)."""
+    answers = _answers(model, _seen(model, inputs)) * model.target_scale + model.target_mean
+    return answers.double().cpu().numpy()
 
 
 def _descend(
@@ -178,73 +189,3 @@ def _losses(model: EnvironmentModel, seen: Tensor, wanted: Tensor) -> Tensor:
 def _answers(model: EnvironmentModel, seen: Tensor) -> Tensor:
     """Return what every member answers to the same rows, shape (members, rows, 6)."""
     return model(seen.expand(model.members, -1, -1))
-
-
-def _judge(
-    model: EnvironmentModel,
-    actual: Transitions,
-    inputs: Floats,
-    targets: Floats,
-    holdout: NDArray[np.int64],
-    generator: np.random.Generator,
-    last_loss: float,
-    rows: int,
-    epochs: int,
-) -> Fit:
-    """Measure the errors on the holdout; fall back to the base, and keep the noise, by them."""
-    seen, _ = _normalised(model, inputs, targets, holdout)
-    answers = _answers(model, seen) * model.target_scale + model.target_mean
-    predicted = answers.double().cpu().numpy()  # (members, rows, 6)
-    wanted = targets[holdout]
-    base = np.sqrt(np.square(wanted).mean(0))
-    learned = np.sqrt(np.square(wanted - predicted).mean((0, 1))) < base
-    predicted = predicted * learned
-    error = np.sqrt(np.square(wanted - predicted).mean((0, 1)))
-
-    left = wanted - predicted.mean(0)
-    noise = left[generator.integers(len(left), size=NOISE_ROWS)] - left.mean(0)
-    model.learned.copy_(torch.as_tensor(learned))
-    model.noise.copy_(torch.as_tensor(noise))
-
-    changes = [getattr(actual.following, name) - getattr(actual.states, name) for name in NUMBERS]
-    change = np.array([values[holdout].std() for values in [*changes, actual.reward]])
-    one_step = {
-        name: OneStep(float(base[i]), float(error[i]), float(change[i])) for i, name in enumerate(TARGETS)
-    }
-    errors = {
-        "unexplained": unexplained([one_step[name] for name in NUMBERS]),
-        "total_variation": total_variation(predicted[:, :, :-1], left[:, :-1].std(0)),
-        "released": last_loss,
-    }
-    names = tuple(name for name, is_learned in zip(TARGETS, learned, strict=True) if is_learned)
-    return Fit(errors, one_step, names, rows, len(holdout), epochs)
-
-
-def unexplained(numbers: Sequence[OneStep]) -> float:
-    """Return the model's squared error over the variance of the change, mean of the numbers of a state.
-
-    A number that never changes is not wrong.
-    """
-    shares = [
-        (step.model / step.change) ** 2 if step.change > SMALLEST_CHANGE else 0.0 for step in numbers
-    ]
-    return sum(shares) / len(shares)
-
-
-def total_variation(predicted: Floats, noise: Floats) -> float:
-    """Return the mean total variation between Gaussians about a member's answer and about the mean of all.
-
-    Source: TV(N(m1, s), N(m2, s)) = erf(|m1 - m2| / (2 sqrt 2 s)).
-
-    Args:
-        predicted: by each member, shape (members, rows, numbers).
-        noise: standard deviation of the noise that both have, shape (numbers,).
-
-    Returns:
-        In [0, 1]; NaN for a single member, of which nobody can tell how wrong it is.
-    """
-    if len(predicted) == 1:
-        return float("nan")
-    variance = predicted.var(0, ddof=1) / np.square(noise.clip(SMALLEST_CHANGE))
-    distance = torch.as_tensor(np.sqrt(variance.sum(-1)))
-    return float(torch.erf(distance / (2.0 * sqrt(2.0))).mean())

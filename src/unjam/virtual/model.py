@@ -1,5 +1,6 @@
 """The model of the virtual environment: a base, and an ensemble of networks for what is left; Eq. 4."""
 
+import itertools
 from collections.abc import Sequence
 from math import sqrt
 
@@ -66,7 +67,7 @@ class EnvironmentModel(nn.Module):
         generator = torch_generator(seed, "cpu")
         sizes = [len(NUMBERS) + 1 + drawn, *settings.hidden, len(TARGETS)]
         self.weights, self.biases = nn.ParameterList(), nn.ParameterList()
-        for inputs, outputs in zip(sizes, sizes[1:], strict=False):
+        for inputs, outputs in itertools.pairwise(sizes):
             # as torch.nn.Linear begins
             draws = torch.rand((self.members, inputs + 1, outputs), generator=generator) * 2.0 - 1.0
             draws /= sqrt(inputs)
@@ -114,11 +115,12 @@ class EnvironmentModel(nn.Module):
     @torch.no_grad()
     def layers(self) -> Layers:
         """Return the layers in SI units, zero where the base is better: for `predict`."""
-        weights, biases = list(self.weights), list(self.biases)
-        biases[0] = biases[0] - (self.input_mean / self.input_scale)[None] @ weights[0]  # pyright: ignore[reportCallIssue, reportArgumentType]
-        weights[0] = weights[0] / self.input_scale[:, None]  # pyright: ignore[reportCallIssue, reportArgumentType]
-        weights[-1] = weights[-1] * self.target_scale * self.learned  # pyright: ignore[reportCallIssue, reportArgumentType]
-        biases[-1] = (biases[-1] * self.target_scale + self.target_mean) * self.learned  # pyright: ignore[reportCallIssue, reportArgumentType]
+        weights = [weight.detach() for weight in self.weights]
+        biases = [bias.detach() for bias in self.biases]
+        biases[0] = biases[0] - (self.input_mean / self.input_scale)[None] @ weights[0]
+        weights[0] = weights[0] / self.input_scale[:, None]
+        weights[-1] = weights[-1] * (self.target_scale * self.learned)
+        biases[-1] = (biases[-1] * self.target_scale + self.target_mean) * self.learned
         return list(zip(weights, biases, strict=True))
 
 

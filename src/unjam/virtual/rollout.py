@@ -1,5 +1,6 @@
 """Virtual rollouts: how long they may be (Eq. 15), and driving them with the full policy."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from math import floor, isfinite
 from typing import NamedTuple
@@ -14,6 +15,7 @@ from unjam.drivers.local_state import LocalState
 from unjam.drivers.residual import ResidualDriver, observe
 from unjam.errors import UnjamError
 from unjam.physics.arrays import clip
+from unjam.traffic.record import Floats
 from unjam.virtual.data import ActualData
 from unjam.virtual.expert import memory_on, on_tensors, remembered
 from unjam.virtual.settings import VirtualSettings
@@ -81,35 +83,30 @@ class Rollouts:
     """share of the decisions in which each of BOUNDS had to be enforced"""
 
 
-def draw_starts(data: ActualData, rows: int, ahead: int, seed: np.random.SeedSequence) -> NDArray[np.int64]:
+def draw_starts(data: ActualData, rows: int, ahead: int, seed: Sequence[int]) -> NDArray[np.int64]:
     """Return random decisions at which a residual was due, rows (recording, decision), shape (rows, 2).
 
-    At least `ahead` recorded decisions follow each. None where the data have none such.
+    At least `ahead` recorded decisions follow each; shape (0, 2) where there are none such.
     """
     looks = data.looks(ahead)
-    if not len(looks):
-        return looks
-    return looks[np.random.default_rng(seed).integers(len(looks), size=rows)]
+    generator = np.random.default_rng(np.random.SeedSequence(list(seed)))
+    return looks[generator.integers(len(looks), size=rows)] if len(looks) else looks
 
 
 def begin(data: ActualData, looks: NDArray[np.int64], expert: Driver, device: torch.device | str) -> Starts:
     """Return the start of virtual rollouts at `looks`, with what the expert remembered there."""
-    recordings = [data.recordings[place] for place in looks[:, 0]]
-
-    def placed(values: list[np.float64]) -> Tensor:
-        return torch.as_tensor(np.array(values), dtype=torch.float32, device=device)
-
-    columns = zip(
-        *([values[at] for values in r.states] for r, at in zip(recordings, looks[:, 1], strict=True)),
-        strict=True,
-    )
+    drawn = np.stack([data.recordings[place].drawn for place in looks[:, 0]])
     memory = remembered(expert, data.recordings, looks)
     return Starts(
-        state=LocalState(*(placed(list(values)) for values in columns)),
+        state=LocalState(*(_tensor(values, device) for values in data.states_at(looks))),
         memory=memory_on(on_tensors(expert), memory, device),
-        drawn=placed([recording.drawn for recording in recordings]),  # pyright: ignore[reportArgumentType]
+        drawn=_tensor(drawn, device),
         looks=looks,
     )
+
+
+def _tensor(values: Floats, device: torch.device | str) -> Tensor:
+    return torch.as_tensor(values, dtype=torch.float32, device=device)
 
 
 @torch.no_grad()

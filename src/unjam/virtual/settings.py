@@ -31,9 +31,9 @@ class VirtualSettings:
     """most passes over the rows in a fit, which goes on from the fit before"""
     patience: Count = 3
     """passes without progress on the holdout after which a fit ends"""
-    rate: Positive = 2e-3
+    rate: Positive = 3e-3
     """learning rate of Adam"""
-    batch: Count = 256
+    batch: Count = 512
     """rows of each network in a gradient step"""
     noise: bool = True
     """whether virtual steps are as noisy as the model's errors on the holdout, or the mean of each network"""

@@ -106,9 +106,7 @@ class VirtualWorld:
         left_of_reward = left[-1].clip(self._lowest, self._highest)
         nobody = gaps >= largest
         speed = speeds[0]
-        driven = distance_driven(
-            state.speed, speed, scenario.simulation_step, scenario.steps_per_decision
-        )
+        driven = distance_driven(state.speed, speed, scenario.simulation_step, scenario.steps_per_decision)
         following = LocalState(
             speed=speed,
             leader_speed=torch.where(nobody[0], speed, speeds[1]),
@@ -134,5 +132,5 @@ class VirtualWorld:
             chosen = torch.randint(
                 NOISE_ROWS, (rows,), generator=self._generator, device=self._generator.device
             )
-            left = left + self._noise[chosen]
+            left = left + self._noise.index_select(0, chosen)
         return left
