@@ -92,16 +92,16 @@ def test_a_driver_without_memory_needs_none() -> None:
 
 def test_built_in_drivers_take_tensors_as_they_are(my_drivers: Path) -> None:
     pi = PISaturation()
-    assert on_tensors(pi) is pi
-    assert isinstance(on_tensors(FileDriver(my_drivers, "Keeper")), ThroughNumPy)
+    assert on_tensors(pi, "cpu") is pi
+    assert isinstance(on_tensors(FileDriver(my_drivers, "Keeper"), "cpu"), ThroughNumPy)
     on_a_users = ResidualDriver(FileDriver(my_drivers, "Keeper"), random_network(), 1.0)
-    assert isinstance(on_tensors(on_a_users), ThroughNumPy)
+    assert isinstance(on_tensors(on_a_users, "cpu"), ThroughNumPy)
 
 
 @pytest.mark.parametrize("number", [0, 1, 2])
 def test_on_tensors_it_drives_as_on_arrays(number: int, my_drivers: Path) -> None:
     expert = experts(my_drivers)[number]
-    on_world = on_tensors(expert)
+    on_world = on_tensors(expert, "cpu")
     generator = np.random.default_rng(1)
     memory = expert.initial_memory(4)
     tensors = memory_on(on_world, memory, "cpu")
@@ -122,6 +122,6 @@ def test_on_tensors_it_drives_as_on_arrays(number: int, my_drivers: Path) -> Non
 def test_an_acceleration_that_is_not_finite_is_told(my_drivers: Path) -> None:
     state = LocalState(*(torch.ones(3) for _ in LocalState._fields))
     with pytest.raises(InputError, match="virtual environment: acceleration is nan; allowed: finite"):
-        on_tensors(FileDriver(my_drivers, "broken")).act(state, {})
+        on_tensors(FileDriver(my_drivers, "broken"), "cpu").act(state, {})
     with pytest.raises(InputError, match=r"shape \(4,\); allowed: \(3,\)"):
-        on_tensors(FileDriver(my_drivers, "short")).act(state, {})
+        on_tensors(FileDriver(my_drivers, "short"), "cpu").act(state, {})

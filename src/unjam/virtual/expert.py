@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -22,6 +22,8 @@ class ThroughNumPy(Driver):
     tensors: ClassVar[bool] = True
 
     driver: Driver
+    device: torch.device
+    """where the world is"""
 
     def initial_memory(self, n: int) -> Memory:
         """Return the driver's."""
@@ -36,17 +38,20 @@ class ThroughNumPy(Driver):
         numbers = LocalState(*(values.double().cpu().numpy() for values in state))
         answer, memory = self.driver.act(numbers, memory)
         acceleration = check_acceleration(answer, len(state.speed), "virtual environment")
-        return torch.as_tensor(acceleration).to(state.speed), memory
+        return self._tensor(acceleration), memory
 
     def memory_features(self, memory: Memory) -> Tensor | None:
-        """Return the driver's features as a tensor of the world's precision."""
+        """Return the driver's features as a tensor."""
         features = self.driver.memory_features(memory)
-        return None if features is None else torch.as_tensor(np.asarray(features), dtype=torch.float32)
+        return None if features is None else self._tensor(np.asarray(features))
+
+    def _tensor(self, values: NDArray[Any]) -> Tensor:
+        return torch.as_tensor(values, dtype=torch.float32, device=self.device)
 
 
-def on_tensors(driver: Driver) -> Driver:
-    """Return a driver that takes tensors: the same, or the same through NumPy."""
-    return driver if getattr(driver, "tensors", False) else ThroughNumPy(driver)
+def on_tensors(driver: Driver, device: torch.device | str) -> Driver:
+    """Return a driver that takes tensors on `device`: the same, or the same through NumPy."""
+    return driver if getattr(driver, "tensors", False) else ThroughNumPy(driver, torch.device(device))
 
 
 def memory_on(driver: Driver, memory: Memory, device: torch.device | str) -> Memory:

@@ -99,7 +99,7 @@ def begin(data: ActualData, looks: NDArray[np.int64], expert: Driver, device: to
     memory = remembered(expert, data.recordings, looks)
     return Starts(
         state=LocalState(*(_tensor(values, device) for values in data.states_at(looks))),
-        memory=memory_on(on_tensors(expert), memory, device),
+        memory=memory_on(on_tensors(expert, device), memory, device),
         drawn=_tensor(drawn, device),
         looks=looks,
     )
@@ -133,13 +133,13 @@ def imagine(
         UnjamError: the world gave something that is not finite.
         InputError: so did a driver of the user's.
     """
-    expert, limit, network = on_tensors(driver.expert), driver.action_limit, driver.network
-    state, memory = starts.state, starts.memory
-    n, looks = len(state.speed), decisions // driver.hold
-    like = state.speed
+    state, memory, like = starts.state, starts.memory, starts.state.speed
+    expert, limit = on_tensors(driver.expert, like.device), driver.action_limit
+    n, looks = len(like), decisions // driver.hold
     observations, actions, rewards = [], [], []
-    running = torch.ones_like(like)
-    made, bounded, lived = like * 0.0, like.new_zeros(len(BOUNDS)), like.new_zeros(())
+    running, made = torch.ones_like(like), torch.zeros_like(like)
+    lived = torch.zeros((), dtype=torch.float64, device=like.device)  # single precision counts to 2^24 only
+    bounded = torch.zeros(len(BOUNDS), dtype=torch.float64, device=like.device)
     for _ in range(looks):
         made += running
         earned, residual = torch.zeros_like(like), None
@@ -148,11 +148,7 @@ def imagine(
             wanted = clip(wanted, -limit, limit)
             if residual is None:
                 seen = observe(driver.parts, state, wanted, expert, memory)
-                if generator is None:
-                    residual = network(seen)
-                else:
-                    noise = torch.randn(n, generator=generator, device=like.device)
-                    residual = network.explore(seen, noise)
+                residual = _residual(driver, seen, generator)
                 observations.append(seen)
                 actions.append(residual)
             step = world.step(state, clip(wanted + residual, -limit, limit), starts.drawn)
@@ -179,3 +175,11 @@ def imagine(
         if not getattr(rollouts, name).isfinite().all():
             raise UnjamError(f"virtual environment: {name} of a rollout are not finite")
     return rollouts
+
+
+def _residual(driver: ResidualDriver, seen: Tensor, generator: torch.Generator | None) -> Tensor:
+    """Return the network's residual, with exploration noise where there is a generator of it."""
+    if generator is None:
+        return driver.network(seen)
+    noise = torch.randn(len(seen), generator=generator, device=seen.device)
+    return driver.network.explore(seen, noise)
