@@ -19,7 +19,7 @@ from unjam.errors import InputError, UnjamError
 from unjam.scenarios import make_scenario
 from unjam.traffic.episode import run_episode
 
-NAMES = {"unjam/Ring-v0": "ring", "unjam/FigureEight-v0": "figure-eight"}
+NAMES = {"unjam/Ring-v0": "ring", "unjam/FigureEight-v0": "figure-eight", "unjam/Merge-v0": "merge"}
 SHORT: Any = {"horizon": 60}
 
 

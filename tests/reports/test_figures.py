@@ -19,7 +19,7 @@ from unjam.reports.figures import (
     data_uri,
     learning_curve,
     space_time,
-    speed_and_gap,
+    over_time,
     speed_scale,
     time_split,
 )
@@ -168,9 +168,9 @@ def test_space_time_of_rings_of_different_length_shows_all_of_each() -> None:
         assert all(panel.get_ylim() == pytest.approx((0, LENGTH)) for panel in panels)
 
 
-def test_speed_and_gap_has_a_line_of_each_driver_in_each_panel() -> None:
+def test_over_time_has_a_line_of_each_driver_in_each_panel() -> None:
     shown = drivers(3)
-    speed, gap, wave = panels_of(speed_and_gap(shown))
+    speed, gap, wave = panels_of(over_time(shown))
     for number, episode in enumerate(shown):
         cav = episode.cavs[0]
         for axes, values in ((speed, episode.speeds[:, cav]), (gap, episode.gaps[:, cav])):
@@ -181,8 +181,8 @@ def test_speed_and_gap_has_a_line_of_each_driver_in_each_panel() -> None:
         assert {axes.lines[number].get_color() for axes in (speed, gap, wave)} == {LINES[number]}
 
 
-def test_speed_and_gap_names_the_drivers_and_the_limit() -> None:
-    figure = speed_and_gap(drivers(2))
+def test_over_time_names_the_drivers_and_the_limit() -> None:
+    figure = over_time(drivers(2))
     [legend] = figure.legends
     assert [text.get_text() for text in legend.get_texts()] == ["driver 0", "driver 1", "limit"]
     limit = panels_of(figure)[0].lines[-1]
@@ -262,7 +262,7 @@ def content(uri: str) -> tuple[str, bytes]:
 
 FIGURES: Sequence[Callable[[bool], Figure]] = (
     lambda wide: space_time(drivers(2), wide),
-    lambda wide: speed_and_gap(drivers(2), wide),
+    lambda wide: over_time(drivers(2), wide),
     lambda wide: learning_curve({"ring-001": RUN}, {"pi": 100.0}, wide),
     lambda wide: time_split(RUN, wide),
 )

@@ -20,7 +20,7 @@ def drawn(radius: int, **changes: object) -> Road:
 
 @pytest.mark.parametrize("radius", [20, 30, 32, 35, 50])
 def test_lap_is_as_long_as_in_the_network_file(radius: int) -> None:
-    tree = ElementTree.parse(network_file(drawn(radius)))
+    tree = ElementTree.parse(network_file(drawn(radius).network))
     lanes = {lane.get("id"): float(lane.get("length", "nan")) for lane in tree.iter("lane")}
     links = {
         (link.get("from"), link.get("to")): link.get("via")

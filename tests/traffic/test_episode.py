@@ -37,7 +37,7 @@ def drives_badly(simulation: Simulation) -> None:
 
 def another_road(simulation: Simulation) -> None:
     ring = Ring(length=(130, 140), vehicles=11, cavs=3, warmup=77, horizon=50, simulation_step=0.2)
-    run_episode(ring, RESIDUAL, (9,), explore=True, record_fuel=True, simulation=simulation)
+    run_episode(ring, RESIDUAL, (9,), explore=True, full=True, simulation=simulation)
 
 
 def stops_in_the_middle(simulation: Simulation) -> None:
@@ -248,7 +248,7 @@ def test_of_a_driver_without_a_network_the_expert_is_all(simulation: Simulation)
 
 def test_fuel_is_recorded_only_when_asked_for_and_changes_nothing_else(simulation: Simulation) -> None:
     without = run_episode(RING, IDM(), (0,), simulation=simulation)
-    episode = run_episode(RING, IDM(), (0,), record_fuel=True, simulation=simulation)
+    episode = run_episode(RING, IDM(), (0,), full=True, simulation=simulation)
     assert without.fuel.shape == (0, 0)
     assert episode.fuel.shape == (300, 22)
     assert (episode.fuel >= 0.0).all()
@@ -261,7 +261,7 @@ def test_fuel_is_recorded_only_when_asked_for_and_changes_nothing_else(simulatio
 def test_fuel_depends_on_the_emission_class(simulation: Simulation) -> None:
     van = replace(RING, emission_class="HBEFA4/LCV_diesel_N1-III_Euro-6ab")
     car, other = (
-        run_episode(scenario, IDM(), (0,), record_fuel=True, simulation=simulation).fuel.mean()
+        run_episode(scenario, IDM(), (0,), full=True, simulation=simulation).fuel.mean()
         for scenario in (RING, van)
     )
     assert other > 1.1 * car

@@ -12,7 +12,7 @@ from unjam.scenarios.figure_eight import FigureEight
 from unjam.scenarios.scenario import SMALLEST_CAV_GAP
 from unjam.traffic.episode import run_episode
 from unjam.traffic.simulation import Simulation
-from unjam.traffic.stepping import Traffic
+from unjam.traffic.stepping import make_traffic
 from unjam.traffic.workers import EpisodeTask, Workers
 
 SEEDS = 5
@@ -40,7 +40,7 @@ def test_agrees_with_flow_within_six_percent_without_collision() -> None:
 
 
 def test_leader_and_gap_are_those_of_sumo(simulation: Simulation) -> None:
-    traffic = Traffic(FigureEight(cavs=14), (3,), simulation)
+    traffic = make_traffic(FigureEight(cavs=14), (3,), simulation)
     traffic.start(controlled=True)
     ids, compared = traffic.road.vehicle_ids, 0
     for _ in range(400):
@@ -70,7 +70,7 @@ def test_vehicles_from_the_right_yield(simulation: Simulation) -> None:
 def test_on_the_crossing_people_are_left_to_sumo(
     simulation: Simulation, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    traffic = Traffic(FigureEight(radius=(32, 32)), (0,), simulation)
+    traffic = make_traffic(FigureEight(radius=(32, 32)), (0,), simulation)
     asked: list[tuple[str, float]] = []
     monkeypatch.setattr(
         simulation, "command_speeds", lambda ids, speeds: asked.extend(zip(ids, speeds, strict=True))

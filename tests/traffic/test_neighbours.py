@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from unjam.scenarios import Ring
 from unjam.traffic.neighbours import loop_neighbours, loop_state
 from unjam.traffic.simulation import Simulation
-from unjam.traffic.stepping import Traffic
+from unjam.traffic.stepping import make_traffic
 
 CAR = 5.0
 
@@ -89,7 +89,7 @@ def test_leaders_and_gaps_in_running_traffic_are_sumos(
 ) -> None:
     steps = 300
     ring = Ring(length=(length, length), vehicles=vehicles, cavs=cavs, warmup=40, horizon=steps)
-    traffic = Traffic(ring, (3,), simulation)
+    traffic = make_traffic(ring, (3,), simulation)
     traffic.start(controlled=True)
     pushes = np.random.default_rng(0).uniform(-0.6, 1.0, (steps, cavs))
     names, seen = traffic.road.vehicle_ids, []
@@ -112,7 +112,7 @@ def test_leaders_and_gaps_in_running_traffic_are_sumos(
 
 def test_positions_are_sumos_own_along_the_road(simulation: Simulation) -> None:
     ring = Ring(length=(222, 222), warmup=30, horizon=400)
-    traffic = Traffic(ring, (1,), simulation)
+    traffic = make_traffic(ring, (1,), simulation)
     traffic.start(controlled=False)
     for _ in range(400):
         traffic.advance(None)

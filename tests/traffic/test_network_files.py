@@ -16,13 +16,13 @@ import pytest
 
 from unjam.errors import DiskError, EpisodeError, MissingPartError
 from unjam.scenarios import Ring
-from unjam.scenarios.scenario import Road
+from unjam.scenarios.road import PlainNetwork
 from unjam.traffic import network_files
 from unjam.traffic.network_files import cache_folder, network_file, sumo_program
 
 
-def road_of(length: int) -> Road:
-    return Ring(length=(length, length)).draw(np.random.default_rng(0))
+def road_of(length: int) -> PlainNetwork:
+    return Ring(length=(length, length)).draw(np.random.default_rng(0)).network
 
 
 @pytest.fixture
@@ -72,7 +72,8 @@ def test_other_traffic_on_the_same_road_needs_no_other_network(
 ) -> None:
     made = network_file(road_of(230))
     monkeypatch.setattr(subprocess, "run", refuse_to_run)
-    assert network_file(replace(road_of(230), traffic="", vehicle_ids=("other",))) == made
+    other = Ring(length=(230, 230), vehicles=11, cavs=3).draw(np.random.default_rng(1))
+    assert network_file(other.network) == made
 
 
 def test_whatever_changes_the_network_makes_another_file(
@@ -147,7 +148,7 @@ def test_processes_that_make_the_same_network_at_once_get_one_whole_file(cache: 
         "import sys, numpy as np\n"
         "from unjam.scenarios import Ring\n"
         "from unjam.traffic.network_files import network_file\n"
-        "road = Ring(length=(260, 260)).draw(np.random.default_rng(0))\n"
+        "road = Ring(length=(260, 260)).draw(np.random.default_rng(0)).network\n"
         "print('ready', flush=True)\n"
         "sys.stdin.readline()\n"
         "print(network_file(road))\n"

@@ -57,7 +57,7 @@ def test_fingerprints_differ_in_the_last_bit_of_any_array() -> None:
 )
 def test_an_episode_arrives_as_it_was_sent(scenario: Ring, driver: Driver, simulation: Simulation) -> None:
     episode = run_episode(
-        scenario, driver, (1, 2), explore=True, record_fuel=scenario.cavs == 3, simulation=simulation
+        scenario, driver, (1, 2), explore=True, full=scenario.cavs == 3, simulation=simulation
     )
     assert len(episode.trajectories) == scenario.cavs
     assert fingerprint(travelled(episode)) == fingerprint(episode)

@@ -119,7 +119,7 @@ def test_a_headway_is_gap_over_speed_and_very_long_for_a_standing_vehicle() -> N
 
 
 def test_rewards_are_found_by_name() -> None:
-    assert set(REWARDS) == {"released", "eq16", "eq16-as-printed"}
+    assert set(REWARDS) == {"released", "released-merge", "eq16", "eq16-as-printed"}
     assert make_reward("released") is released
 
 
@@ -171,6 +171,6 @@ def test_what_ones_own_reward_raises_is_told_with_its_line(tmp_path: Path) -> No
 
 @pytest.mark.parametrize("name", ["fame", "", "Released", "released "])
 def test_an_unknown_reward_lists_the_known(name: str) -> None:
-    known = "released, eq16, eq16-as-printed, path.py:name"
+    known = "released, released-merge, eq16, eq16-as-printed, path.py:name"
     with pytest.raises(InputError, match=f"reward: {name!r} is not allowed; allowed: {known}"):
         make_reward(name)

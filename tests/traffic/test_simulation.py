@@ -10,7 +10,7 @@ from unjam.scenarios import Ring
 from unjam.scenarios.scenario import Road
 from unjam.traffic.episode import run_episode
 from unjam.traffic.simulation import Backend, Simulation
-from unjam.traffic.stepping import Traffic
+from unjam.traffic.stepping import make_traffic
 
 from .test_record import fingerprint
 
@@ -38,7 +38,7 @@ def test_a_refused_simulation_does_not_make_room_for_a_third(simulation: Simulat
 def test_simulations_over_traci_run_beside_it_without_disturbing_it(simulation: Simulation) -> None:
     expected = run_episode(RING, IDM(), (0,), simulation=simulation)
     with Simulation("traci") as first, Simulation("traci") as second:
-        traffics = [Traffic(RING, (0,), each) for each in (simulation, first, second)]
+        traffics = [make_traffic(RING, (0,), each) for each in (simulation, first, second)]
         for traffic in traffics:
             traffic.start(controlled=False)
         for _ in range(50):
@@ -135,7 +135,7 @@ def test_netconverts_own_words_about_a_broken_road_reach_the_user_in_one_line(
     change: tuple[str, str], words: str, road: Road, simulation: Simulation
 ) -> None:
     with pytest.raises(EpisodeError) as caught:
-        simulation.load(replace(road, **dict([change])), 0.1, 0)
+        simulation.load(replace(road, network=replace(road.network, **dict([change]))), 0.1, 0)
     assert words in str(caught.value)
     assert "\n" not in str(caught.value)
 
@@ -170,6 +170,6 @@ def test_libsumo_and_traci_give_identical_episodes() -> None:
     found = []
     for backend in ("libsumo", "traci"):
         with Simulation(backend) as simulation:
-            episode = run_episode(RING, PISaturation(), (5,), record_fuel=True, simulation=simulation)
+            episode = run_episode(RING, PISaturation(), (5,), full=True, simulation=simulation)
         found.append(fingerprint(episode))
     assert found[0] == found[1]

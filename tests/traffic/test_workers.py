@@ -115,7 +115,7 @@ def has_ended(process: int) -> bool:
 def tasks_of_all_kinds(my_drivers: Path) -> list[EpisodeTask]:
     return [
         EpisodeTask(replace(SHORT, horizon=900), PISaturation(), (0,)),
-        EpisodeTask(SHORT, Human(), (1, 2), record_fuel=True),
+        EpisodeTask(SHORT, Human(), (1, 2), full=True),
         EpisodeTask(replace(SHORT, warmup=40, cavs=2), RESIDUAL, (2,), "eq16", explore=True),
         EpisodeTask(replace(SHORT, actuation="raw", horizon=500), Constant(1.0), (3,)),
         EpisodeTask(replace(SHORT, steps_per_decision=5), FileDriver(my_drivers, "gentle"), (4,)),
@@ -127,7 +127,7 @@ def tasks_of_all_kinds(my_drivers: Path) -> list[EpisodeTask]:
 def test_any_number_of_workers_gives_the_bytes_of_this_process(count: int, my_drivers: Path) -> None:
     tasks = tasks_of_all_kinds(my_drivers)
     expected = [
-        run_episode(task.scenario, task.driver, task.seed, task.reward, task.explore, task.record_fuel)
+        run_episode(task.scenario, task.driver, task.seed, task.reward, task.explore, task.full)
         for task in tasks
     ]
     with Workers(count) as workers:

@@ -1,12 +1,15 @@
 """`unjam drive`: run episodes with a driver, print metrics, write a report."""
 
+from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from unjam.cli.options import (
     DEFAULT_WORKERS,
+    CavShareOption,
     CavsOption,
+    CavTypesOption,
     EpisodesOption,
     JsonOption,
     LengthOption,
@@ -42,6 +45,8 @@ def drive(
     vehicles: VehiclesOption = None,
     cavs: CavsOption = None,
     warmup: WarmupOption = None,
+    cav_share: CavShareOption = None,
+    cav_types: CavTypesOption = None,
     reward: RewardOption = "",
     settings: Annotated[
         list[str] | None, typer.Option("--set", help="Any parameter of the scenario: key=value.")
@@ -62,16 +67,21 @@ def drive(
       unjam drive ring-jammed -d human -d pi -d pi:time_constant=0 --episodes 10
 
       unjam drive ring --driver my_driver.py:gentle --json
+
+      unjam drive my.sumocfg --cav-share 0.1 --driver pi
     """
     from unjam.cli.output import aside, console, counting_steps, metrics_table, print_json
     from unjam.experiments.drive import drive as run
     from unjam.experiments.drive import raise_failures
     from unjam.scenarios.registry import make_scenario
 
-    road = {**road_changes(length, radius, vehicles, cavs, warmup), **assignments(settings)}
+    road = {
+        **road_changes(length, radius, vehicles, cavs, warmup, cav_share, cav_types),
+        **assignments(settings),
+    }
     total = make_scenario(scenario, road).horizon * episodes * len(driver)
-    folder = new_folder(out, f"drive-{scenario}") if report else None
-    with counting_steps(f"driving {scenario}", total) as steps:
+    folder = new_folder(out, f"drive-{Path(scenario).stem}") if report else None
+    with counting_steps(f"driving {Path(scenario).name}", total) as steps:
         result = run(scenario, driver, episodes, seed, road, reward, workers, folder, steps)
     if json:
         print_json(result.document())

@@ -67,22 +67,22 @@ def scenarios(
 
 
 def _draw(scenario: Any, name: str, path: Path) -> None:
-    """Write a picture of the road that seed 0 draws, with all vehicles at their start."""
+    """Write a picture of the road that seed 0 draws, with its vehicles at the start."""
     from io import BytesIO
-
-    import numpy as np
 
     from unjam.files import check_folder, write_whole
     from unjam.reports.road_picture import draw_road
+    from unjam.traffic.simulation import Simulation
+    from unjam.traffic.stepping import make_traffic
 
     check_folder(path)
-    road = scenario.draw(np.random.default_rng(0))
-    cavs = {road.vehicle_ids.index(cav) for cav in road.cav_ids}
-    standing = np.zeros(len(road.vehicle_ids))
-    words = "\n".join([name, *(f"{key} {value:g} m" for key, value in road.drawn.items())])
+    with Simulation() as simulation:
+        traffic = make_traffic(scenario, (0,), simulation)
+        traffic.start(controlled=False)
+        scene = traffic.scene()
+    words = "\n".join([name, *(f"{key} {value:g} m" for key, value in traffic.road.drawn.items())])
     content = BytesIO()
-    image = draw_road(road.outline, road.loop_length, standing, road.start_positions, cavs, 1.0, words)
-    image.save(content, "PNG")
+    draw_road(scene, 1.0, words).save(content, "PNG")
     write_whole(path, content.getvalue())
 
 
@@ -96,7 +96,7 @@ def _common_facts(scenario: Any) -> list[tuple[str, str]]:
             "warm-up",
             f"{scenario.warmup} all-human steps ({scenario.warmup * step:g} s), before control, not counted",
         ),
-        ("people", f"IDM with acceleration noise of std {scenario.noise_per_step:.3f} m/s2 a step"),
+        ("people", scenario.people_in_words),
         ("action", f"acceleration within ±{scenario.action_limit:g} m/s2, {scenario.actuation}"),
         ("observation", "; ".join(OBSERVATION_NAMES["local"])),
         ("reward", scenario.reward),

@@ -9,7 +9,9 @@ import typer
 from unjam.errors import InputError
 from unjam.parameters import parse_assignments
 
-ScenarioArgument = Annotated[str, typer.Argument(help="Name of the scenario; `unjam scenarios` lists them.")]
+ScenarioArgument = Annotated[
+    str, typer.Argument(help="A scenario's name (`unjam scenarios` lists them), or your own .sumocfg file.")
+]
 RewardOption = Annotated[
     str,
     typer.Option(
@@ -33,6 +35,14 @@ RadiusOption = Annotated[
 ]
 VehiclesOption = Annotated[int | None, typer.Option("--vehicles", help="Number of vehicles.")]
 CavsOption = Annotated[int | None, typer.Option("--cavs", help="Number of CAVs among them.")]
+CavShareOption = Annotated[
+    float | None,
+    typer.Option("--cav-share", help="Share of CAVs among the vehicles of your own network."),
+]
+CavTypesOption = Annotated[
+    str | None,
+    typer.Option("--cav-types", help="Vehicle types that are CAVs, on your own network: car,truck."),
+]
 WarmupOption = Annotated[
     int | None, typer.Option("--warmup", help="All-human simulation steps before the CAVs take over.")
 ]
@@ -41,7 +51,13 @@ DEFAULT_WORKERS = os.cpu_count() or 1
 
 
 def road_changes(
-    length: str | None, radius: str | None, vehicles: int | None, cavs: int | None, warmup: int | None
+    length: str | None,
+    radius: str | None,
+    vehicles: int | None,
+    cavs: int | None,
+    warmup: int | None,
+    cav_share: float | None,
+    cav_types: str | None,
 ) -> dict[str, Any]:
     """Return the changes to a scenario that the road options ask for."""
     asked = {
@@ -50,6 +66,8 @@ def road_changes(
         "vehicles": vehicles,
         "cavs": cavs,
         "warmup": warmup,
+        "cav_share": cav_share,
+        "cav_types": cav_types.split(",") if cav_types else None,
     }
     return {name: value for name, value in asked.items() if value is not None}
 
@@ -73,7 +91,7 @@ def new_folder(out: Path | None, name: str) -> Path:
     """Return the folder for new results: `out`, or the next free one under `runs/`."""
     if out is not None:
         return out
-    number = 1
-    while (Path("runs") / f"{name}-{number:03d}").exists():
+    words, number = Path(name).stem, 1  # a scenario may be a file
+    while (Path("runs") / f"{words}-{number:03d}").exists():
         number += 1
-    return Path("runs") / f"{name}-{number:03d}"
+    return Path("runs") / f"{words}-{number:03d}"

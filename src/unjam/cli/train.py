@@ -9,7 +9,9 @@ import typer
 
 from unjam.cli.options import (
     DEFAULT_WORKERS,
+    CavShareOption,
     CavsOption,
+    CavTypesOption,
     JsonOption,
     LengthOption,
     OutOption,
@@ -51,6 +53,8 @@ def train(
     vehicles: VehiclesOption = None,
     cavs: CavsOption = None,
     warmup: WarmupOption = None,
+    cav_share: CavShareOption = None,
+    cav_types: CavTypesOption = None,
     workers: WorkersOption = DEFAULT_WORKERS,
     out: OutOption = None,
     resume: Annotated[
@@ -81,7 +85,8 @@ def train(
     changes: dict[str, Any] = {key: value for key, value in flags.items() if value is not None}
     changes |= {"reward": reward} if reward else {}
     changes |= {
-        f"road.{key}": value for key, value in road_changes(length, radius, vehicles, cavs, warmup).items()
+        f"road.{key}": value
+        for key, value in road_changes(length, radius, vehicles, cavs, warmup, cav_share, cav_types).items()
     }
     changes |= {"workers": workers}
     for key, value in assignments(settings).items():

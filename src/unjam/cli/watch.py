@@ -6,7 +6,9 @@ from typing import Annotated
 import typer
 
 from unjam.cli.options import (
+    CavShareOption,
     CavsOption,
+    CavTypesOption,
     JsonOption,
     LengthOption,
     RadiusOption,
@@ -34,6 +36,8 @@ def watch(
     vehicles: VehiclesOption = None,
     cavs: CavsOption = None,
     warmup: WarmupOption = None,
+    cav_share: CavShareOption = None,
+    cav_types: CavTypesOption = None,
     settings: Annotated[
         list[str] | None, typer.Option("--set", help="Any parameter of the scenario: key=value.")
     ] = None,
@@ -59,7 +63,11 @@ def watch(
     from unjam.traffic.workers import EpisodeTask, Workers
 
     road = make_scenario(
-        scenario, {**road_changes(length, radius, vehicles, cavs, warmup), **assignments(settings)}
+        scenario,
+        {
+            **road_changes(length, radius, vehicles, cavs, warmup, cav_share, cav_types),
+            **assignments(settings),
+        },
     )
     driven = make_driver(driver, road.decision_step)
     if video is None:

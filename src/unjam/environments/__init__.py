@@ -2,12 +2,16 @@
 
 from gymnasium.envs.registration import register, registry
 
-SCENARIO_OF = {"unjam/Ring-v0": "ring", "unjam/FigureEight-v0": "figure-eight"}
-"""the scenario of each environment that Gymnasium makes by name"""
+ARGUMENTS_OF = {
+    "unjam/Ring-v0": {"scenario": "ring"},
+    "unjam/FigureEight-v0": {"scenario": "figure-eight"},
+    "unjam/Merge-v0": {"scenario": "merge", "cavs": 1},
+}
+"""what each environment that Gymnasium makes by name is made of"""
 
 
 def register_all() -> None:
     """Tell Gymnasium of the environments; they are imported when one is made."""
-    for name, scenario in SCENARIO_OF.items():
+    for name, arguments in ARGUMENTS_OF.items():
         if name not in registry:
-            register(name, "unjam.environments.single:RoadEnv", kwargs={"scenario": scenario})
+            register(name, "unjam.environments.single:RoadEnv", kwargs=arguments)

@@ -12,12 +12,13 @@ from unjam.controller import make_driver
 from unjam.drivers.constant import Constant
 from unjam.drivers.local_state import ObservationPart
 from unjam.drivers.residual import observation_size, observe
-from unjam.errors import UnjamError
+from unjam.errors import EpisodeError, UnjamError
 from unjam.physics.arrays import clip
 from unjam.scenarios.registry import make_scenario
 from unjam.traffic.reward import Outcome, make_reward, time_headway
 from unjam.traffic.simulation import Backend, Simulation, libsumo_is_taken
-from unjam.traffic.stepping import Traffic
+from unjam.traffic.stepping import make_traffic
+from unjam.traffic.traffic import Traffic
 
 Observations = NDArray[np.float32]
 
@@ -29,15 +30,19 @@ LARGEST_OBSERVATION = 50.0
 class Step:
     """What one decision led to."""
 
+    cavs: list[str]
+    """who is on the road now"""
     observations: Observations
-    """shape (CAVs, numbers)"""
+    """theirs, shape (CAVs, numbers)"""
+    left: dict[str, NDArray[np.float32]]
+    """who left the road in this decision, with what each saw before it"""
     reward: float
     terms: dict[str, float]
     """the reward's terms by name"""
     terminated: bool
     """whether there was a collision"""
     truncated: bool
-    """whether the horizon is reached"""
+    """whether the horizon is reached, or nobody will be on the road any more"""
 
 
 class SteppedRoad:
@@ -100,29 +105,46 @@ class SteppedRoad:
             self._seed = int(generator.integers(2**31))
         numbers = (self._seed, self._episodes) if self._episodes else (self._seed,)
         self._episodes += 1
-        self._traffic = traffic = Traffic(self.scenario, numbers, self._open())
+        self._traffic = traffic = make_traffic(self.scenario, numbers, self._open())
         history = traffic.start(controlled=True)
-        self._memory = self._expert.initial_memory(len(traffic.road.cav_ids))
+        self._memory = self._expert.initial_memory(len(traffic.cavs))
         if history is not None and self.scenario.recall_warmup:
             self._memory = self._expert.recall(self._memory, history)
-        self._decisions = 0
+        self._await_cav()
+        if not traffic.cavs:
+            raise EpisodeError(f"no CAV entered the road in {traffic.decisions} decisions")
         return self._look()
 
     def step(self, actions: Any) -> Step:
-        """Make one decision: `actions`, shape (CAVs,), added to the expert's accelerations [m/s2]."""
-        traffic = self.traffic
+        """Make one decision: `actions`, shape (CAVs,), added to the expert's accelerations [m/s2].
+
+        Where nobody is left, the road goes on without CAVs until the next one enters.
+        """
+        traffic, before = self.traffic, list(self.traffic.cavs)
         limit = self.scenario.action_limit
         applied = clip(self._wanted + np.asarray(actions, np.float64), -limit, limit)
         traffic.advance(applied)
-        self._memory = self._after
-        self._decisions += 1
-        speeds, state = np.array(traffic.speeds), traffic.local_state()
-        headways = time_headway(state.leader_gap, state.speed)
-        outcome = Outcome(speeds[None], applied[None], headways[None], np.array([traffic.crashed]))
+        self._memory = traffic.carry(self._after, self._expert)
+        stayed, speeds, state = list(traffic.stayed), np.array(traffic.speeds), traffic.local_state()
+        headways = time_headway(state.leader_gap, state.speed)[: len(stayed)]
+        outcome = Outcome(speeds[None], applied[stayed][None], headways[None], np.array([traffic.crashed]))
         terms = {name: float(values[0]) for name, values in self._reward(outcome).items()}
-        ended = self._decisions >= self.scenario.horizon
-        truncated = ended and not traffic.crashed
-        return Step(self._look(), sum(terms.values()), terms, traffic.crashed, truncated)
+        left = {name: self._seen[row] for row, name in enumerate(before) if row not in stayed}
+        self._await_cav()
+        truncated = self._ended() and not traffic.crashed
+        observations = self._look()
+        return Step(
+            list(traffic.cavs), observations, left, sum(terms.values()), terms, traffic.crashed, truncated
+        )
+
+    def _ended(self) -> bool:
+        return self.traffic.decisions >= self.scenario.horizon or self.traffic.over
+
+    def _await_cav(self) -> None:
+        """Let the road go on until a CAV is on it, or the episode ends."""
+        while not (self.traffic.cavs or self._ended() or self.traffic.crashed):
+            self.traffic.advance(np.zeros(0))
+            self._memory = self.traffic.carry(self._memory, self._expert)
 
     @property
     def traffic(self) -> Traffic:
@@ -142,7 +164,8 @@ class SteppedRoad:
         wanted, self._after = self._expert.act(state, self._memory)
         self._wanted = clip(wanted, -limit, limit)
         seen = observe(self._parts, state, self._wanted, self._expert, self._after)
-        return seen.clip(-LARGEST_OBSERVATION, LARGEST_OBSERVATION).astype(np.float32)
+        self._seen = seen.clip(-LARGEST_OBSERVATION, LARGEST_OBSERVATION).astype(np.float32)
+        return self._seen
 
     def _open(self) -> Simulation:
         """Return the simulation, opened when first needed.

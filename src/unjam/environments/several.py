@@ -8,13 +8,15 @@ from gymnasium import spaces
 from pettingzoo import ParallelEnv
 
 from unjam.drivers.local_state import ObservationPart
-from unjam.environments.road import Observations, SteppedRoad
+from unjam.environments.road import SteppedRoad
 
 
 class ParallelRoad(ParallelEnv[str, Any, Any]):
     """Several CAVs among people; all earn the same reward, that of the road.
 
-    Action and observation of each are those of `RoadEnv`.
+    Action and observation of each are those of `RoadEnv`. On the merge `agents` changes: a CAV appears at the
+    first decision after it entered, and is truncated when it leaves; while none is on the road, time goes on
+    by itself.
     """
 
     metadata: ClassVar[dict[str, Any]] = {"name": "unjam_road_v0", "render_modes": []}  # pyright: ignore
@@ -29,8 +31,7 @@ class ParallelRoad(ParallelEnv[str, Any, Any]):
     ) -> None:
         """Prepare the environment; the arguments are those of `RoadEnv`."""
         self._road = SteppedRoad(scenario, changes, reward, expert, observe)
-        road = self._road.scenario.draw(np.random.default_rng(0))
-        self.possible_agents = list(road.cav_ids)
+        self.possible_agents = list(self._road.scenario.possible_cavs())
         self.agents: list[str] = []
         self.render_mode = None
         self.observation_spaces = dict.fromkeys(self.possible_agents, self._road.observation_space)
@@ -49,28 +50,26 @@ class ParallelRoad(ParallelEnv[str, Any, Any]):
     ) -> tuple[dict[str, Any], dict[str, Any]]:
         """Start an episode: that of `seed`; without one, the next after the last seed's."""
         observations = self._road.reset(seed, np.random.default_rng())
-        self.agents = list(self._road.traffic.road.cav_ids)
-        return self._by_agent(observations), {agent: {} for agent in self.agents}
+        self.agents = list(self._road.traffic.cavs)
+        return dict(zip(self.agents, observations, strict=True)), {agent: {} for agent in self.agents}
 
     def step(self, actions: dict[str, Any]) -> tuple[dict[str, Any], ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Make one decision of every CAV."""
         if not self.agents:
             return {}, {}, {}, {}, {}
-        agents = self.agents
-        done = self._road.step([float(np.asarray(actions[agent]).reshape(())) for agent in agents])
-        answer = (
-            self._by_agent(done.observations),
-            dict.fromkeys(agents, done.reward),
+        acted = self.agents
+        done = self._road.step([float(np.asarray(actions[agent]).reshape(())) for agent in acted])
+        observations = {**done.left, **dict(zip(done.cavs, done.observations, strict=True))}
+        agents = list(observations)
+        ended = done.terminated or done.truncated
+        self.agents = [] if ended else done.cavs
+        return (
+            observations,
+            {agent: done.reward if agent in acted else 0.0 for agent in agents},
             dict.fromkeys(agents, done.terminated),
-            dict.fromkeys(agents, done.truncated),
+            {agent: done.truncated or (agent in done.left and not done.terminated) for agent in agents},
             {agent: {"terms": done.terms} for agent in agents},
         )
-        if done.terminated or done.truncated:
-            self.agents = []
-        return answer
-
-    def _by_agent(self, observations: Observations) -> dict[str, Any]:
-        return dict(zip(self.agents, observations, strict=True))
 
     def render(self) -> None:
         """Draw nothing."""

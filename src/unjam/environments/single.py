@@ -18,8 +18,8 @@ Observation = NDArray[Any]
 class RoadEnv(gymnasium.Env[Observation, Observation]):
     """One CAV among people, on the actual simulator.
 
-    ``gymnasium.make("unjam/Ring-v0")``, ``gymnasium.make("unjam/FigureEight-v0")``; every parameter of the
-    scenario can be given: ``gymnasium.make("unjam/Ring-v0", scenario="ring-jammed", length=(230, 230))``.
+    ``gymnasium.make("unjam/Ring-v0")``, ``"unjam/FigureEight-v0"``, ``"unjam/Merge-v0"``; every parameter of
+    the scenario can be given: ``gymnasium.make("unjam/Ring-v0", scenario="ring-jammed", length=(230, 230))``.
 
     ===========  ===================================================================================
     Action       ``Box(-limit, limit, (1,), float32)``: acceleration [m/s2], limit 1 by default; with
@@ -31,8 +31,8 @@ class RoadEnv(gymnasium.Env[Observation, Observation]):
     Start        ``reset(seed=s)`` starts the very episode that ``unjam drive --seed s`` runs, warm-up
                  included
     Terminated   at a collision
-    Truncated    at the horizon
-    Time step    one decision, 0.1 s
+    Truncated    at the horizon; on the merge also when the CAV leaves the road
+    Time step    one decision: 0.1 s, on the merge 1 s
     ===========  ===================================================================================
 
     libsumo runs one simulation in a process: a second environment there runs over TraCI, twenty times slower.
@@ -71,7 +71,7 @@ class RoadEnv(gymnasium.Env[Observation, Observation]):
         self.render_mode = render_mode
         backend = "gui" if render_mode == "human" else "libsumo"
         self._road = SteppedRoad(scenario, changes, reward, expert, observe, backend)
-        if getattr(self._road.scenario, "cavs", 1) != 1:
+        if getattr(self._road.scenario, "cavs", None) != 1:
             raise InputError("cavs: several are not allowed here; allowed: 1; use unjam.parallel_env")
         self.observation_space = self._road.observation_space
         self.action_space = self._road.action_space
@@ -87,20 +87,17 @@ class RoadEnv(gymnasium.Env[Observation, Observation]):
     def step(self, action: Any) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Make one decision."""
         done = self._road.step(np.asarray(action, np.float64).reshape(1))
-        return done.observations[0], done.reward, done.terminated, done.truncated, {"terms": done.terms}
+        observation = next(iter(done.left.values())) if done.left else done.observations[0]
+        truncated = done.truncated or (bool(done.left) and not done.terminated)
+        return observation, done.reward, done.terminated, truncated, {"terms": done.terms}
 
     def render(self) -> Any:
         """Return the picture of this moment, shape (640, 640, 3); SUMO's window draws itself."""
         if self.render_mode != "rgb_array":
             return None
         traffic = self._road.traffic
-        speeds = np.array(traffic.speeds)
-        cavs = {traffic.road.vehicle_ids.index(name) for name in traffic.road.cav_ids}
         fastest = 2.0 * traffic.road.limit_speed
-        words = f"mean {speeds.mean():.1f} m/s"
-        road = traffic.road
-        picture = draw_road(road.outline, road.loop_length, speeds, traffic.positions(), cavs, fastest, words)
-        return np.asarray(picture)
+        return np.asarray(draw_road(traffic.scene(), fastest, f"mean {np.mean(traffic.speeds):.1f} m/s"))
 
     def close(self) -> None:
         """End SUMO; may be called twice."""

@@ -113,7 +113,7 @@ def drive(
         found = evaluate(made, drivers, seeds, pool, reward, progress)
     report = None
     if folder is not None:
-        about = {"scenario": scenario, "reward": reward or made.reward, "manifest": manifest()}
+        about = {"scenario": Path(scenario).name, "reward": reward or made.reward, "manifest": manifest()}
         save_evaluation(folder, found, about)
         report = write_report([folder], folder / "report.html")
     return DriveResult(scenario, found.rows, folder, report)

@@ -13,6 +13,7 @@ from unjam.drivers.driver import Driver
 from unjam.errors import DiskError, EpisodeError, InputError, MissingPartError, UnjamError
 from unjam.files import make_folder, to_json, write_whole
 from unjam.reports.metrics import METRICS, measure
+from unjam.reports.results import PICTURED
 from unjam.reports.statistics import estimate
 from unjam.scenarios.scenario import Scenario
 from unjam.traffic.record import Episode
@@ -59,10 +60,7 @@ def evaluate(
     `progress` is called with (the driver's label, the index of its episode), and the decisions made so far.
     """
     pairs = [(label, index) for index in range(len(seeds)) for label in drivers]
-    tasks = [
-        EpisodeTask(scenario, drivers[label], seeds[index], reward, record_fuel=True)
-        for label, index in pairs
-    ]
+    tasks = [EpisodeTask(scenario, drivers[label], seeds[index], reward, full=True) for label, index in pairs]
 
     def told(task: int, steps: int) -> None:
         if progress is not None:
@@ -99,7 +97,7 @@ def save_evaluation(folder: Path, evaluation: Evaluation, about: dict[str, Any])
     frame = pd.DataFrame([{**row, "seed": str(row["seed"])} for row in rows])
     arrays = {}
     for number, episode in enumerate(evaluation.shown.values()):
-        for name in ("speeds", "positions", "gaps", "outline"):
+        for name in PICTURED:
             arrays[f"{number}.{name}"] = getattr(episode, name).astype(np.float32)
     about_shown = [
         {
@@ -109,6 +107,7 @@ def save_evaluation(folder: Path, evaluation: Evaluation, about: dict[str, Any])
             "drawn": episode.drawn,
             "loop_length": episode.loop_length,
             "crossings": episode.crossings,
+            "branches": episode.branches,
             "limit_speed": episode.limit_speed,
             "vehicle_ids": episode.vehicle_ids,
             "cav_ids": episode.cav_ids,

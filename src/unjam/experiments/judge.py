@@ -43,7 +43,7 @@ def judge(
     seeds = held_out_seeds(episodes or config.evaluation.episodes)
     found = evaluate(scenario, drivers, seeds, workers, config.reward, progress)
     about = {
-        "scenario": config.scenario,
+        "scenario": Path(config.scenario).name,
         "reward": config.reward or scenario.reward,
         "trained": TRAINED,
         "expert": describe(config.make_expert()) if config.expert != "none" else "none",

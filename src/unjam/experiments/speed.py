@@ -23,7 +23,7 @@ from unjam.scenarios.registry import SCENARIOS
 from unjam.scenarios.ring import Ring
 from unjam.traffic.episode import drive_traffic, run_episode
 from unjam.traffic.simulation import Simulation
-from unjam.traffic.stepping import Traffic
+from unjam.traffic.stepping import make_traffic
 
 ROUNDS = 7
 TRACI_STEPS = 200
@@ -77,7 +77,7 @@ def _measure(rounds: int, say: Callable[[str], None]) -> dict[str, Any]:
     for number in range(1, rounds + 1):
         say(f"round {number} of {rounds}")
         with Simulation() as simulation:
-            Traffic(ring, (number,), simulation)
+            make_traffic(ring, (number,), simulation)
             found["bare"].append(_rate(partial(_step, simulation, ring.horizon), ring.horizon))
             for name, driven in (("episode", driver), ("every_step", every_step)):
                 run = partial(run_episode, ring, driven, (number,), explore=True, simulation=simulation)
@@ -85,7 +85,7 @@ def _measure(rounds: int, say: Callable[[str], None]) -> dict[str, Any]:
             found["loop"].append(_loop_rate(ring, driver, simulation))
             for name, rates in others.items():
                 road = SCENARIOS[name]
-                Traffic(road, (number,), simulation)
+                make_traffic(road, (number,), simulation)
                 rates["bare"].append(_rate(partial(_step, simulation, road.horizon), road.horizon))
                 run = partial(run_episode, road, driver, (number,), explore=True, simulation=simulation)
                 rates["episode"].append(_rate(run, road.horizon))
@@ -136,7 +136,7 @@ def _rate(run: Callable[[], object], steps: int) -> float:
 
 def _loop_rate(scenario: Ring | Any, driver: ResidualDriver, simulation: Simulation) -> float:
     """Return decisions per second of the driving loop alone."""
-    traffic = Traffic(scenario, (1,), simulation, driver.plain_numbers)
+    traffic = make_traffic(scenario, (1,), simulation, driver.plain_numbers)
     return _rate(lambda: drive_traffic(traffic, driver, explore=True), scenario.horizon)
 
 

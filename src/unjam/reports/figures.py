@@ -75,28 +75,38 @@ def space_time(shown: Sequence[Shown], wide: bool = True) -> Figure:
     """Draw where every vehicle is at every time, coloured by speed; a panel per driver, all on one scale.
 
     A stop-and-go wave is a dark band that runs against the direction of travel. Where the road crosses itself
-    is shaded.
+    is shaded. Of a merging road the ramp has a panel of its own below the main road's; of your own network
+    the route that is driven most is shown.
     """
     count = len(shown)
     with rc_context(STYLE):
         columns = min(count, 2 if count == 4 else 3) if wide else 1
         rows = -(-count // columns)
-        figure = _figure(10.5 if wide else 4.4, 3.1 * rows + 0.3)
-        panels = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
+        branches = _branches(shown)
+        figure = _figure(10.5 if wide else 4.4, (3.1 + 0.9 * (len(branches) - 1)) * rows + 0.3)
+        heights = [3.0, *[1.0] * (len(branches) - 1)] * rows
+        panels = figure.subplots(
+            rows * len(branches), columns, sharex=True, squeeze=False, height_ratios=heights
+        )
         scale = speed_scale(shown)
-        for number, axes in enumerate(panels.flat):
-            if number >= count:
-                axes.set_visible(False)
-                continue
-            _trajectories(axes, shown[number], scale)
-            axes.set_title(shown[number].driver, loc="left", fontsize=10, color=INK)
-            if number % columns == 0:
-                axes.set_ylabel("position along the road [m]")
-            if number + columns >= count:
-                axes.set_xlabel("time [s]")
-                axes.tick_params(labelbottom=True)
-        panels[0, 0].set_xlim(0, max(episode.times[-1] for episode in shown))  # the panels share their axes
-        panels[0, 0].set_ylim(0, max(episode.loop_length for episode in shown))
+        longest = max(episode.times[-1] for episode in shown)
+        for number, (episode, (row, column)) in enumerate(
+            zip(shown, np.ndindex(rows, columns), strict=False)
+        ):
+            for part, branch in enumerate(branches):
+                axes = panels[row * len(branches) + part, column]
+                _trajectories(axes, episode, scale, branch, main=part == 0)
+                axes.set_xlim(0, longest)
+                axes.set_ylim(*_extent(shown, branch))
+                if part == 0:
+                    axes.set_title(episode.driver, loc="left", fontsize=10, color=INK)
+                if column == 0:
+                    axes.set_ylabel(f"{branch} [m]" if branch else "position along the road [m]")
+                if part == len(branches) - 1 and number + columns >= count:
+                    axes.set_xlabel("time [s]")
+                    axes.tick_params(labelbottom=True)
+        for axes in panels.flat:
+            axes.set_visible(bool(axes.collections))
         mappable = ScalarMappable(scale, SPEED_COLOURS)
         bar = figure.colorbar(
             mappable, ax=panels, location="right" if wide else "bottom", shrink=0.8, pad=0.02, aspect=30
@@ -106,55 +116,107 @@ def space_time(shown: Sequence[Shown], wide: bool = True) -> Figure:
         return figure
 
 
-def _trajectories(axes: Axes, episode: Shown, scale: Normalize) -> None:
+def _branches(shown: Sequence[Shown]) -> list[str]:
+    """Return the parts of the road that have panels of their own; one without a name where there are none."""
+    return list(dict.fromkeys(branch for episode in shown for branch in episode.branches)) or [""]
+
+
+def _on_branch(episode: Shown, branch: str, main: bool) -> np.ndarray:
+    """Return the positions of the vehicles while they are on a branch, shape (T + 1, N); NaN elsewhere.
+
+    Who comes from another branch is on the main one from where both meet.
+    """
+    if not branch:
+        return episode.positions
+    own = np.array(episode.branches) == branch
+    past = episode.positions >= 0
+    return np.where(own | past if main else own & ~past, episode.positions, np.nan)
+
+
+def _extent(shown: Sequence[Shown], branch: str) -> tuple[float, float]:
+    """Return the first and the last coordinate of a branch [m]."""
+    if all(episode.closed for episode in shown):
+        return 0.0, max(episode.loop_length for episode in shown)
+    main = branch == _branches(shown)[0]
+    found = [_on_branch(episode, branch, main) for episode in shown]
+    found = [positions for positions in found if not np.isnan(positions).all()]
+    if not found:
+        return 0.0, 1.0
+    return min(float(np.nanmin(each)) for each in found), max(float(np.nanmax(each)) for each in found)
+
+
+def _trajectories(axes: Axes, episode: Shown, scale: Normalize, branch: str, main: bool) -> None:
     every = max(1, len(episode.times) // POINTS_IN_TIME)
     times = episode.times[::every]
     axes.grid(False)
     for start, end in episode.crossings:
         axes.axhspan(start, end, color=GRID, lw=0)
+    positions = _on_branch(episode, branch, main)[::every]
+    cavs = set(episode.cavs)
+    seam = episode.loop_length / 2 if episode.closed else np.inf
     for column in range(episode.speeds.shape[1]):
-        position = episode.positions[::every, column] % episode.loop_length
+        position = positions[:, column] % episode.loop_length if episode.closed else positions[:, column]
         points = np.column_stack([times, position])
         segments = np.stack([points[:-1], points[1:]], axis=1)
-        keep = np.abs(np.diff(position)) < episode.loop_length / 2  # not across the seam of the road
-        is_cav = column in episode.cavs
+        keep = np.abs(np.diff(position)) < seam  # not across the seam of the road, nor where nobody is
+        is_cav = column in cavs
         lines = LineCollection(
             list(segments[keep]),
             cmap=SPEED_COLOURS,
             norm=scale,
-            linewidths=2.6 if is_cav else 1.1,
+            linewidths=(2.6 if is_cav else 1.1) if episode.closed else (1.6 if is_cav else 0.7),
             rasterized=True,
         )
         lines.set_array(episode.speeds[::every, column][:-1][keep])
         axes.add_collection(lines)
         if is_cav:
+            width = 1.3 if episode.closed else 0.6
             axes.add_collection(
-                LineCollection(list(segments[keep]), colors="#d7263d", linewidths=1.3, rasterized=True)
+                LineCollection(list(segments[keep]), colors="#d7263d", linewidths=width, rasterized=True)
             )
 
 
-def speed_and_gap(shown: Sequence[Shown], wide: bool = True) -> Figure:
-    """Draw over time: the CAV's speed, its gap, and the std of speed across all vehicles."""
+def over_time(shown: Sequence[Shown], wide: bool = True) -> Figure:
+    """Draw three quantities over time, a line per driver.
+
+    Of closed roads the CAV's speed and gap, and the std of speed across all vehicles; of roads with ends the
+    mean speed, the std, and how many vehicles wait to enter.
+    """
     with rc_context(STYLE):
         figure = _figure(10.5 if wide else 4.4, 6.2 if wide else 7.0)
-        speed, gap, wave = figure.subplots(3, 1, sharex=True)
+        panels = figure.subplots(3, 1, sharex=True)
+        closed = all(episode.closed for episode in shown)
         for episode, colour in zip(shown, LINES, strict=False):
             every = max(1, len(episode.times) // POINTS_IN_TIME)
             times = episode.times[::every]
-            column = episode.cavs[0]
-            speed.plot(times, episode.speeds[::every, column], color=colour, lw=1.2, label=episode.driver)
-            gap.plot(times, episode.gaps[::every, column], color=colour, lw=1.2)
-            wave.plot(times, np.nanstd(episode.speeds[::every], axis=1), color=colour, lw=1.2)
-        speed.axhline(shown[0].limit_speed, color=INK, lw=0.8, ls=":", label="limit")
-        speed.set_ylabel("CAV's speed [m/s]")
-        gap.set_ylabel("CAV's gap [m]")
-        wave.set_ylabel("speed std across\nvehicles [m/s]")
-        wave.set_xlabel("time [s]")
-        for axes in (speed, gap, wave):
+            for axes, values in zip(panels, _three_of(episode, closed), strict=True):
+                axes.plot(times, values[::every], color=colour, lw=1.2)
+            panels[0].plot([], [], color=colour, lw=1.2, label=episode.driver)
+        limit = shown[0].limit_speed
+        if np.isfinite(limit):
+            panels[0].axhline(limit, color=INK, lw=0.8, ls=":", label="limit")
+        labels = (
+            ("CAV's speed [m/s]", "CAV's gap [m]", "speed std across\nvehicles [m/s]")
+            if closed
+            else ("mean speed [m/s]", "speed std across\nvehicles [m/s]", "vehicles waiting\nto enter")
+        )
+        for axes, label in zip(panels, labels, strict=True):
+            axes.set_ylabel(label)
             axes.set_ylim(bottom=0)
-        speed.margins(x=0)
+        panels[-1].set_xlabel("time [s]")
+        panels[0].margins(x=0)
         figure.legend(loc="outside upper left", ncols=6 if wide else 2, fontsize=9)
         return figure
+
+
+def _three_of(episode: Shown, closed: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    there = np.where(np.isnan(episode.speeds).all(axis=1, keepdims=True), 0.0, episode.speeds)
+    std = np.nanstd(there, axis=1)
+    if closed:
+        column = episode.cavs[0]
+        return episode.speeds[:, column], episode.gaps[:, column], std
+    waiting = episode.waiting if len(episode.waiting) else np.zeros(len(std))
+    return np.nanmean(there, axis=1), std, waiting
 
 
 def learning_curve(

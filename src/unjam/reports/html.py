@@ -1,13 +1,11 @@
 """The report: one HTML page with everything in it, no network needed."""
 
-import base64
 import json
 from collections.abc import Callable, Sequence
 from importlib.resources import files
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
 from jinja2 import Environment, StrictUndefined
 from markupsafe import Markup, escape
 from matplotlib.figure import Figure
@@ -15,21 +13,17 @@ from matplotlib.figure import Figure
 from unjam import __version__
 from unjam.files import check_folder, write_whole
 from unjam.reports.figures import (
-    colour_table,
     data_uri,
     learning_curve,
+    over_time,
     space_time,
-    speed_and_gap,
-    speed_scale,
     time_split,
 )
+from unjam.reports.replay import replay_data
 from unjam.reports.results import Results, Shown, command_to_repeat, read_results
 from unjam.reports.statistics import estimate
 from unjam.reports.story import Column, cards_of, columns_of, lead_of, names_of, notes_of, table_of, title_of
-from unjam.scenarios.scenario import VEHICLE_LENGTH
 
-REPLAY_SECONDS = 0.5
-"""time between two frames of the replay [s]"""
 MOST_PANELS = 6
 
 
@@ -73,6 +67,9 @@ def render(results: Sequence[Results]) -> str:
         pictures=pictures,
         picture=lambda name, text: _picture(pictures[name], text),
         panels_note=_panels_note(panels, len(columns)),
+        over_time_title="Speed, gap and waves over time"
+        if all(episode.closed for episode in panels)
+        else "Speed, waves and queues over time",
         learning_note="Validation uses fixed seeds and chooses the controller; the table uses other seeds.",
         columns=[column.name for column in columns],
         table=table_of(columns),
@@ -123,7 +120,7 @@ def _pictures(results: Sequence[Results], panels: Sequence[Shown]) -> dict[str, 
 
     if panels:
         add("space_time", "png", lambda wide: space_time(panels, wide))
-        add("speed_and_gap", "svg", lambda wide: speed_and_gap(panels, wide))
+        add("over_time", "svg", lambda wide: over_time(panels, wide))
     named = zip(names_of(results), results, strict=True)
     runs = {name: result.progress for name, result in named if result.progress}
     if runs:
@@ -171,41 +168,3 @@ def _source(result: Results, name: str) -> dict[str, Any]:
         "facts": facts,
         "config": result.config,
     }
-
-
-def replay_data(panels: Sequence[Shown]) -> dict[str, Any]:
-    """Return what the page's replay needs: positions and speeds at a few frames a second."""
-    if not panels:
-        return {"drivers": []}
-    step = max(REPLAY_SECONDS, *(episode.step for episode in panels))
-    frames = 1 + int(max(episode.times[-1] for episode in panels) / step + 1e-9)
-    return {
-        "step": step,
-        "frames": frames,
-        "start": 0,
-        "fastest": speed_scale(panels).vmax,
-        "colours": colour_table(),
-        "vehicle_length": VEHICLE_LENGTH,
-        "drivers": [
-            {
-                "name": episode.driver,
-                "vehicles": episode.speeds.shape[1],
-                "cavs": episode.cavs,
-                "loop_length": episode.loop_length,
-                "outline": np.round(episode.outline, 2).tolist(),
-                "positions": _base64(_frames(episode, episode.positions, step, frames)),
-                "speeds": _base64(_frames(episode, episode.speeds, step, frames)),
-            }
-            for episode in panels
-        ],
-    }
-
-
-def _frames(episode: Shown, values: np.ndarray, step: float, frames: int) -> np.ndarray:
-    """Return `values` at the moments of the replay; an episode that ended before stays as at its end."""
-    moments = np.round(np.arange(frames) * step / episode.step).astype(int)
-    return values[moments.clip(max=len(values) - 1)]
-
-
-def _base64(array: np.ndarray) -> str:
-    return base64.b64encode(np.ascontiguousarray(array, "<f4").tobytes()).decode()

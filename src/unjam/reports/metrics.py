@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from unjam.traffic.record import Episode, Floats
-from unjam.traffic.reward import Outcome, eq16, time_headway
+from unjam.traffic.record import Episode, Floats, outcome_of
+from unjam.traffic.reward import eq16
 
 STEADY_STEPS = 1000
-"""decisions at the end of an episode that count as steady state"""
+"""decisions at the end of an episode that count as steady state; of one that is no longer, its second half"""
 STANDING_SPEED = 0.1
 """[m/s]; SUMO's own threshold for a halting vehicle"""
 CALM_STD = 0.3
@@ -23,23 +23,19 @@ MOVING_SPEED = 1.0
 """speed above which a time headway is a matter of safety [m/s]"""
 
 
-def outcome_of(episode: Episode) -> Outcome:
-    """Return what a reward function sees of a whole episode."""
-    trajectories = episode.trajectories
-    crashed = np.zeros(episode.steps, bool)
-    crashed[-1:] = episode.status == "collision"
-    return Outcome(
-        speeds=episode.speeds[1:],
-        accelerations=np.stack([trajectory.applied for trajectory in trajectories], 1),
-        headways=np.stack(
-            [time_headway(t.states.leader_gap[1:], t.states.speed[1:]) for t in trajectories], 1
-        ),
-        crashed=crashed,
-    )
-
-
 def _steady(values: Floats) -> Floats:
-    return values[-STEADY_STEPS:]
+    return values[-STEADY_STEPS:] if len(values) > STEADY_STEPS else values[len(values) // 2 :]
+
+
+def _over_cavs(values: Sequence[Any]) -> float:
+    """Return the mean over CAVs; NaN where there were none."""
+    return float(np.mean(values)) if len(values) else float("nan")
+
+
+def _std_across(speeds: Floats) -> float:
+    """Return the std across vehicles at one moment, averaged over the moments with at least one."""
+    there = ~np.isnan(speeds).all(axis=1)
+    return float(np.nanstd(speeds[there], axis=1).mean()) if there.any() else float("nan")
 
 
 def mean_speed(episode: Episode) -> float:
@@ -48,7 +44,7 @@ def mean_speed(episode: Episode) -> float:
 
 
 def mean_speed_steady(episode: Episode) -> float:
-    """Mean over all vehicles in the last 1,000 steps [m/s]."""
+    """Mean over all vehicles in the last 1,000 steps [m/s]; of a shorter episode, in its second half."""
     return float(np.nanmean(_steady(episode.speeds[1:])))
 
 
@@ -57,22 +53,22 @@ def speed_std_fleet(episode: Episode) -> float:
 
     The size of the waves: zero when all drive alike. Stern et al. 2018, section 4.
     """
-    return float(np.nanmean(np.nanstd(episode.speeds[1:], axis=1)))
+    return _std_across(episode.speeds[1:])
 
 
 def speed_std_fleet_steady(episode: Episode) -> float:
-    """Standard deviation of speed across vehicles, averaged over the last 1,000 steps [m/s]."""
-    return float(np.nanmean(np.nanstd(_steady(episode.speeds[1:]), axis=1)))
+    """Standard deviation of speed across vehicles, averaged over the steady state [m/s]."""
+    return _std_across(_steady(episode.speeds[1:]))
 
 
 def speed_std_cav(episode: Episode) -> float:
     """Standard deviation over time of the CAV's own speed [m/s]: the paper's `speed std` (Table 1)."""
-    return float(np.mean([np.std(trajectory.states.speed[1:]) for trajectory in episode.trajectories]))
+    return _over_cavs([np.std(trajectory.states.speed[1:]) for trajectory in episode.trajectories])
 
 
 def cav_mean_speed(episode: Episode) -> float:
     """Mean over time of the CAV's own speed [m/s]: the paper's `average speed` (Table 1)."""
-    return float(np.mean([np.mean(trajectory.states.speed[1:]) for trajectory in episode.trajectories]))
+    return _over_cavs([np.mean(trajectory.states.speed[1:]) for trajectory in episode.trajectories])
 
 
 def speed_limit_ratio(episode: Episode) -> float:
@@ -81,23 +77,24 @@ def speed_limit_ratio(episode: Episode) -> float:
 
 
 def speed_limit_ratio_steady(episode: Episode) -> float:
-    """Mean speed in the last 1,000 steps over the scenario's own limit."""
+    """Mean speed in the steady state over the scenario's own limit."""
     return mean_speed_steady(episode) / episode.limit_speed
 
 
 def episode_return(episode: Episode) -> float:
-    """Sum of the reward that the episode was run with, not discounted; mean over CAVs."""
-    return float(np.mean([trajectory.reward.sum() for trajectory in episode.trajectories]))
+    """Sum of the reward that the episode was run with, not discounted; all CAVs share it."""
+    return float(episode.reward.sum())
 
 
 def return_eq16(episode: Episode) -> float:
     """Sum of the paper's reward, Eq. 16 with its sign mended, not discounted."""
-    return float(sum(term.sum() for term in eq16(outcome_of(episode)).values()))
+    outcome = outcome_of(episode.speeds, episode.trajectories, episode.status == "collision")
+    return float(sum(term.sum() for term in eq16(outcome).values()))
 
 
 def mean_abs_accel(episode: Episode) -> float:
     """Mean absolute acceleration that the CAV was told [m/s2]; of a human driver, what it did."""
-    return float(np.mean([np.abs(trajectory.applied).mean() for trajectory in episode.trajectories]))
+    return _over_cavs([np.abs(trajectory.applied).mean() for trajectory in episode.trajectories])
 
 
 def mean_abs_jerk(episode: Episode) -> float:
@@ -161,12 +158,12 @@ def collisions(episode: Episode) -> float:
 def shield_override_share(episode: Episode) -> float:
     """Share of the CAV's commands that SUMO's safety check did not let pass (by more than 1e-6 m/s)."""
     tolerance = 1e-6 / episode.step
-    return float(np.mean([(trajectory.shield > tolerance).mean() for trajectory in episode.trajectories]))
+    return _over_cavs([(trajectory.shield > tolerance).mean() for trajectory in episode.trajectories])
 
 
 def shield_max_braking(episode: Episode) -> float:
     """Hardest braking that the safety check added to a command [m/s2]."""
-    return float(max(trajectory.shield.max() for trajectory in episode.trajectories))
+    return float(max((trajectory.shield.max() for trajectory in episode.trajectories), default=np.nan))
 
 
 def fuel_ml_per_km(episode: Episode) -> float:
@@ -181,14 +178,19 @@ def fuel_ml_per_km(episode: Episode) -> float:
 
 
 def throughput_veh_per_h(episode: Episode) -> float:
-    """Flow of the closed road [veh/h]: distance driven by all vehicles over length and time. Edie 1963."""
+    """Flow [veh/h]: on a closed road distance driven by all vehicles over length and time (Edie 1963); of a
+    road with ends, the vehicles that left it over time.
+    """
+    hours = episode.steps * episode.step / 3600.0
+    if np.isnan(episode.loop_length):
+        return episode.arrived / hours
     driven = np.nansum(episode.positions[-1] - episode.positions[0])
-    return float(driven / episode.loop_length / (episode.steps * episode.step) * 3600.0)
+    return float(driven / episode.loop_length / hours)
 
 
 def backlog_veh(episode: Episode) -> float:
     """Vehicles that wait to enter at the end; on a closed road nobody does."""
-    return 0.0
+    return float(episode.waiting[-1]) if len(episode.waiting) else 0.0
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,10 @@ from unjam.errors import InputError
 Floats = NDArray[np.float32]
 
 
+PICTURED = ("speeds", "positions", "gaps", "outline", "waiting", "lines", "places")
+"""arrays of an episode that pictures are made of"""
+
+
 @dataclass(frozen=True)
 class Shown:
     """The episode of one driver that pictures show; T decisions, N vehicles. All share one seed."""
@@ -32,13 +36,26 @@ class Shown:
     vehicle_ids: list[str]
     cav_ids: list[str]
     speeds: Floats
-    """[m/s], shape (T + 1, N)"""
+    """[m/s], shape (T + 1, N); NaN where a vehicle is not on the road"""
     positions: Floats
     """along the route, not wrapped [m], shape (T + 1, N)"""
     gaps: Floats
     """to the vehicle ahead [m], shape (T + 1, N)"""
     outline: Floats
-    """the road's centre line: rows (coordinate along the route, x, y) [m]"""
+    """a closed road's centre line: rows (coordinate along the route, x, y) [m]"""
+    branches: list[str]
+    """where each vehicle of a merging road came from"""
+    waiting: Floats
+    """vehicles that want to enter and cannot, shape (T + 1,); empty of a closed road"""
+    lines: Floats
+    """lanes of a road with ends: rows (x, y) [m], a row of NaN between two"""
+    places: Floats
+    """(x, y, heading) of vehicles on a road with ends [m, rad], shape (T + 1, N, 3)"""
+
+    @property
+    def closed(self) -> bool:
+        """Whether the road is a loop."""
+        return len(self.outline) > 0
 
     @property
     def times(self) -> NDArray[np.float64]:
@@ -48,7 +65,8 @@ class Shown:
     @property
     def cavs(self) -> list[int]:
         """Columns of the CAVs."""
-        return [self.vehicle_ids.index(name) for name in self.cav_ids]
+        column = {name: index for index, name in enumerate(self.vehicle_ids)}
+        return [column[name] for name in self.cav_ids]
 
 
 @dataclass(frozen=True)
@@ -96,7 +114,7 @@ def _results(folder: Path, about: dict[str, Any], arrays: dict[str, NDArray[Any]
     shown = {}
     for number, entry in enumerate(about.pop("shown")):
         values: dict[str, Any] = {key: _nan(value) for key, value in entry.items() if key != "seed"}
-        values |= {name: arrays[f"{number}.{name}"] for name in ("speeds", "positions", "gaps", "outline")}
+        values |= {name: arrays[f"{number}.{name}"] for name in PICTURED}
         shown[entry["driver"]] = Shown(**values)
     return Results(folder, about, rows, shown, read_progress(folder), _text(folder / "config.toml"))
 

@@ -176,9 +176,12 @@ def cards_of(result: Results) -> list[dict[str, str]]:
 
         return _card(title, mean(rows), f"all-human: {mean(human)}" if human else label)
 
+    closed = all(episode.closed for episode in result.shown.values())
     cards = [
         card("Mean speed / limit, steady", "speed_limit_ratio_steady", 0, "%", 100.0),
-        card("Speed std across vehicles, steady", "speed_std_fleet_steady", 2, "m/s"),
+        card("Speed std across vehicles, steady", "speed_std_fleet_steady", 2, "m/s")
+        if closed
+        else card("Vehicles that left the road", "throughput_veh_per_h", 0, "per hour"),
         card("Fuel", "fuel_ml_per_km", 0, "ml/km"),
     ]
     expert = result.rows.get(result.about.get("expert", ""))

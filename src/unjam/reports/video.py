@@ -8,7 +8,7 @@ from PIL import Image
 
 from unjam.errors import InputError, MissingPartError
 from unjam.files import check_folder
-from unjam.reports.road_picture import SIZE, draw_road
+from unjam.reports.road_picture import SIZE, draw_road, scenes
 from unjam.traffic.record import Episode
 
 FRAMES_PER_SECOND = 20
@@ -65,10 +65,8 @@ def _write_mp4(frames: Iterator[Image.Image], path: Path, rate: float) -> None:
 def _frames(episode: Episode, title: str, every: int) -> Iterator[Image.Image]:
     """Yield the pictures, one after the other."""
     fastest = max(1.0, float(np.nanmax(episode.speeds)))
-    cavs = {episode.vehicle_ids.index(name) for name in episode.cav_ids}
-    for step in range(0, len(episode.speeds), every):
-        speeds = episode.speeds[step]
-        words = f"{title}\n{step * episode.step:5.0f} s\nmean {float(np.nanmean(speeds)):.1f} m/s"
-        yield draw_road(
-            episode.outline, episode.loop_length, speeds, episode.positions[step], cavs, fastest, words
-        )
+    moments = range(0, len(episode.speeds), every)
+    for moment, scene in zip(moments, scenes(episode, moments), strict=True):
+        there = scene.speeds[~np.isnan(scene.speeds)]
+        mean = f"mean {there.mean():.1f} m/s" if len(there) else "nobody on the road"
+        yield draw_road(scene, fastest, f"{title}\n{moment * episode.step:5.0f} s\n{mean}")

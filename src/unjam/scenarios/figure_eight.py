@@ -19,7 +19,8 @@ from unjam.scenarios.closed_road import (
     vehicle_names,
     words_of_range,
 )
-from unjam.scenarios.scenario import VEHICLE_LENGTH, Actuation, People, Road, Scenario
+from unjam.scenarios.road import ClosedRoad, PlainNetwork
+from unjam.scenarios.scenario import VEHICLE_LENGTH, Actuation, People, Scenario
 
 CROSSING_RADIUS = 3.1
 """of the node where the ways cross [m], as Flow's"""
@@ -72,7 +73,7 @@ class FigureEight(Scenario):
             )
         return self
 
-    def draw(self, generator: np.random.Generator) -> Road:
+    def draw(self, generator: np.random.Generator) -> ClosedRoad:
         """Return a figure eight of random radius with its vehicles."""
         radius = int(generator.integers(self.radius[0], self.radius[1], endpoint=True))
         length = loop_length(radius)
@@ -82,11 +83,13 @@ class FigureEight(Scenario):
         spacing = (_edge_length(radius) - self.free_ahead) / self.vehicles
         positions = _on_edges(np.arange(self.vehicles, dtype=np.float64) * spacing, edges)
         bottom, top, _, right, left, _ = edges
-        return Road(
-            nodes=_nodes(radius),
-            edges=_edges(radius, self.humans.desired_speed),
-            connections=_CONNECTIONS,
-            netconvert_options=("--no-turnarounds", "true"),
+        return ClosedRoad(
+            network=PlainNetwork(
+                _nodes(radius),
+                _edges(radius, self.humans.desired_speed),
+                ("--no-turnarounds", "true"),
+                _CONNECTIONS,
+            ),
             traffic=loop_traffic(self, edges, ids, positions),
             vehicle_ids=ids,
             cav_ids=cavs_among(ids),
@@ -115,6 +118,10 @@ class FigureEight(Scenario):
     def part(self, index: int, count: int) -> "FigureEight":
         """Return this road with one of `count` equal parts of its radii."""
         return replace(self, radius=part_of_range(self.radius, index, count))
+
+    def possible_cavs(self) -> tuple[str, ...]:
+        """Return the ids of the CAVs, the first in front."""
+        return cavs_among(vehicle_names(self.vehicles, self.cavs)[::-1])
 
     def facts(self) -> list[tuple[str, str]]:
         """Return the road's own facts for `unjam scenarios`."""

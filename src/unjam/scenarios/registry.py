@@ -6,6 +6,8 @@ from typing import Any
 from unjam.errors import wrong
 from unjam.parameters import build
 from unjam.scenarios.figure_eight import FigureEight
+from unjam.scenarios.merge import Merge
+from unjam.scenarios.own_network import OwnNetwork, own_network
 from unjam.scenarios.ring import Ring
 from unjam.scenarios.scenario import Scenario
 
@@ -15,21 +17,29 @@ SCENARIOS: dict[str, Scenario] = {
     "ring-jammed": Ring(warmup=6000),
     "figure-eight": FigureEight(),
     "figure-eight-30": FigureEight(radius=(30, 30)),
+    "merge": Merge(),
 }
 
 
-KINDS: dict[str, type[Scenario]] = {"ring": Ring, "figure-eight": FigureEight}
+KINDS: dict[str, type[Scenario]] = {
+    "ring": Ring,
+    "figure-eight": FigureEight,
+    "merge": Merge,
+    "own-network": OwnNetwork,
+}
 """All kinds of road, by their title."""
 
 
 def make_scenario(name: str, changes: dict[str, Any] | None = None) -> Scenario:
-    """Return the scenario `name` with `changes` to its parameters.
+    """Return the scenario `name`, or that of a .sumocfg file, with `changes` to its parameters.
 
     Raises:
         InputError: unknown scenario or parameter, or a value out of range.
     """
+    if name.endswith(".sumocfg"):
+        return own_network(name, changes or {})
     if name not in SCENARIOS:
-        raise wrong("scenario", name, ", ".join(SCENARIOS))
+        raise wrong("scenario", name, ", ".join([*SCENARIOS, "a .sumocfg file"]))
     scenario = SCENARIOS[name]
     if not changes:
         return scenario

@@ -18,7 +18,8 @@ from unjam.scenarios.closed_road import (
     vehicle_names,
     words_of_range,
 )
-from unjam.scenarios.scenario import VEHICLE_LENGTH, Road, Scenario
+from unjam.scenarios.road import ClosedRoad, PlainNetwork
+from unjam.scenarios.scenario import VEHICLE_LENGTH, Scenario
 
 EDGES = 4
 
@@ -52,16 +53,17 @@ class Ring(Scenario):
             )
         return self
 
-    def draw(self, generator: np.random.Generator) -> Road:
+    def draw(self, generator: np.random.Generator) -> ClosedRoad:
         """Return a ring of random length with its vehicles."""
         length = float(generator.integers(self.length[0], self.length[1], endpoint=True))
         ids = vehicle_names(self.vehicles, self.cavs)
         positions = np.arange(self.vehicles, dtype=np.float64) * (length / self.vehicles)
-        return Road(
-            nodes=_nodes(length),
-            edges=_edges(length, self.humans.desired_speed),
-            connections="",
-            netconvert_options=("--no-internal-links", "true", "--no-turnarounds", "true"),
+        return ClosedRoad(
+            network=PlainNetwork(
+                _nodes(length),
+                _edges(length, self.humans.desired_speed),
+                ("--no-internal-links", "true", "--no-turnarounds", "true"),
+            ),
             traffic=loop_traffic(self, _loop(length), ids, positions),
             vehicle_ids=ids,
             cav_ids=cavs_among(ids),
@@ -81,6 +83,10 @@ class Ring(Scenario):
     def part(self, index: int, count: int) -> "Ring":
         """Return this ring with one of `count` equal parts of its lengths."""
         return replace(self, length=part_of_range(self.length, index, count))
+
+    def possible_cavs(self) -> tuple[str, ...]:
+        """Return the ids of the CAVs."""
+        return cavs_among(vehicle_names(self.vehicles, self.cavs))
 
     def facts(self) -> list[tuple[str, str]]:
         """Return the ring's own facts for `unjam scenarios`."""

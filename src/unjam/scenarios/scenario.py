@@ -1,22 +1,25 @@
 """What a scenario is: where the vehicles drive, how an episode starts and when it ends."""
 
-from dataclasses import dataclass as plain_dataclass
 from dataclasses import field
 from typing import Annotated, Any, ClassVar, Literal
+from xml.sax.saxutils import quoteattr
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from unjam.parameters import STRICT, Count, CountOrNone, NotNegative, Positive
 from unjam.physics.idm import IDMParameters
+from unjam.scenarios.road import Road
 
 VEHICLE_LENGTH = 5.0
 """[m], of every vehicle"""
 
 SMALLEST_CAV_GAP = 0.5
 """gap that SUMO keeps for a CAV [m]"""
+
+CAV_COLOUR = "215,38,61"
+"""red, in SUMO's window"""
 
 Actuation = Literal["shielded", "raw", "flow"]
 """How SUMO carries out a CAV's command.
@@ -36,37 +39,6 @@ far more timid where roads cross.
 """
 
 
-@plain_dataclass(frozen=True)
-class Road:
-    """One episode's road and traffic, ready to be written as SUMO's input files."""
-
-    nodes: str
-    """XML of the nodes, for netconvert"""
-    edges: str
-    """XML of the edges, for netconvert"""
-    netconvert_options: tuple[str, ...]
-    connections: str
-    """XML of the connections, for netconvert; empty: all that are possible"""
-    traffic: str
-    """XML of vehicle types, routes and vehicles"""
-    vehicle_ids: tuple[str, ...]
-    """all vehicles, in the order in which they stand along the road"""
-    cav_ids: tuple[str, ...]
-    """those of them that a driver drives"""
-    start_positions: NDArray[np.float64]
-    """front bumper of each vehicle along the route at the start [m]"""
-    loop_length: float
-    """length of the closed road [m]"""
-    crossings: tuple[tuple[float, float], ...]
-    """where along the road it crosses another way: there SUMO drives commanded people itself [m]"""
-    limit_speed: float
-    """speed that the traffic cannot exceed in the long run [m/s]: the scenario's own limit"""
-    outline: NDArray[np.float64]
-    """the road's centre line: rows (coordinate along the route, x, y) [m]"""
-    drawn: dict[str, float] = field(default_factory=dict)
-    """what the episode's seed has drawn, by name"""
-
-
 @dataclass(frozen=True, config=STRICT)
 class Scenario:
     """What all scenarios share; each kind of road adds its own."""
@@ -74,6 +46,8 @@ class Scenario:
     title: ClassVar[str]
     reward: ClassVar[str]
     """reward used where none is named"""
+    people_gap: ClassVar[float] = 0.0
+    """gap that SUMO keeps for commanded people [m]"""
 
     simulation_step: Positive = 0.1
     """time step of SUMO [s]"""
@@ -95,6 +69,8 @@ class Scenario:
     people: People = "native"
     """who computes how people drive: `native` SUMO's own IDM; `commanded` the same IDM as a speed command in
     every step, as in Flow"""
+    right_of_way: bool = True
+    """whether vehicles obey the right of way where roads meet; if not, SUMO only keeps them from colliding"""
     impatience: Annotated[float, Field(ge=0, le=1)] = 0.0
     """how readily vehicles that must yield take a gap in crossing traffic (SUMO's `impatience`)"""
     noise: NotNegative = 0.2
@@ -114,6 +90,11 @@ class Scenario:
         """Standard deviation of the acceleration noise in one simulation step [m/s2]."""
         scale = self.simulation_step**0.5 if self.noise_scaling == "sqrt-step" else 1.0
         return self.noise * scale
+
+    @property
+    def people_in_words(self) -> str:
+        """How people drive."""
+        return f"IDM with acceleration noise of std {self.noise_per_step:.3f} m/s2 a step"
 
     def draw(self, generator: np.random.Generator) -> Road:
         """Return the road of one episode; everything random about it comes from `generator`."""
@@ -139,6 +120,10 @@ class Scenario:
         """
         raise NotImplementedError
 
+    def possible_cavs(self) -> tuple[str, ...]:
+        """Return the ids of all CAVs that an episode may have."""
+        raise NotImplementedError
+
     def facts(self) -> list[tuple[str, str]]:
         """Return what a reader wants to know of this road, as (name, value) pairs."""
         raise NotImplementedError
@@ -155,7 +140,12 @@ def vehicle_type(name: str, scenario: Scenario, **attributes: Any) -> str:
         "impatience": scenario.impatience,
         "emissionClass": scenario.emission_class,
     }
-    pairs = " ".join(f'{key}="{value}"' for key, value in {**common, **attributes}.items())
+    return type_xml({**common, **attributes})
+
+
+def type_xml(attributes: dict[str, Any]) -> str:
+    """Return the XML of a vehicle type."""
+    pairs = " ".join(f"{key}={quoteattr(str(value))}" for key, value in attributes.items())
     return f"<vType {pairs}/>"
 
 
@@ -179,33 +169,38 @@ def _human_layer(scenario: Scenario) -> dict[str, Any]:
         "maxSpeed": humans.desired_speed,
     }
     if scenario.people == "commanded":
-        layer |= {"accel": 2.6, "decel": 4.5, "tau": 1.0, "minGap": 0.0}
+        layer |= {"accel": 2.6, "decel": 4.5, "tau": 1.0, "minGap": scenario.people_gap}
     return layer
 
 
 def cav_type(scenario: Scenario) -> str:
     """Return the XML of the CAVs: a type that executes any safe command exactly.
 
-    With SUMO's safe-speed check on, a Krauss vehicle with a reaction time of one step and a small minimum
-    gap is the one that stays out of the way until the command would lead to a crash. Where the actuation is
-    Flow's, it is the human type instead; with a gap, or it would creep up until it touches.
+    Where the actuation is Flow's, it is the human type instead; with a gap, or it would creep up until it
+    touches.
     """
-    colour = "215,38,61"  # red, in SUMO's window
     if scenario.actuation == "flow":
         layer = _human_layer(scenario)
         smallest = max(layer["minGap"], SMALLEST_CAV_GAP)
-        return vehicle_type("cav", scenario, color=colour, **{**layer, "minGap": smallest})
+        return vehicle_type("cav", scenario, color=CAV_COLOUR, **{**layer, "minGap": smallest})
+    layer = obedient_layer(scenario.simulation_step)
+    return vehicle_type("cav", scenario, **layer, maxSpeed=scenario.humans.desired_speed)
+
+
+def obedient_layer(simulation_step: float) -> dict[str, Any]:
+    """Return the attributes of a type that executes any safe command exactly.
+
+    With SUMO's safe-speed check on, a Krauss vehicle with a reaction time of one step and a small minimum
+    gap is the one that stays out of the way until the command would lead to a crash.
+    """
     limits = 20.0  # [m/s2] far beyond what a CAV asks for, so that only safety clips a command
-    return vehicle_type(
-        "cav",
-        scenario,
-        color=colour,
-        carFollowModel="Krauss",
-        accel=limits,
-        decel=limits,
-        emergencyDecel=limits,
-        apparentDecel=limits,
-        tau=scenario.simulation_step,
-        minGap=SMALLEST_CAV_GAP,
-        maxSpeed=scenario.humans.desired_speed,
-    )
+    return {
+        "color": CAV_COLOUR,
+        "carFollowModel": "Krauss",
+        "accel": limits,
+        "decel": limits,
+        "emergencyDecel": limits,
+        "apparentDecel": limits,
+        "tau": simulation_step,
+        "minGap": SMALLEST_CAV_GAP,
+    }

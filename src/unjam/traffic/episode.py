@@ -2,19 +2,21 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import repeat
+from typing import Any
 
 import numpy as np
 
 from unjam.drivers.driver import Driver, Memory, single_row
-from unjam.drivers.local_state import LocalState
 from unjam.drivers.residual import ResidualDriver
 from unjam.errors import InputError
 from unjam.physics.arrays import Array
 from unjam.scenarios.scenario import Scenario
-from unjam.traffic.record import Episode, Floats, Trajectory
-from unjam.traffic.reward import Outcome, Reward, make_reward, time_headway
+from unjam.traffic.record import Episode, Floats, Trajectory, outcome_of
+from unjam.traffic.reward import Reward, make_reward
 from unjam.traffic.simulation import Simulation
-from unjam.traffic.stepping import Traffic
+from unjam.traffic.stepping import make_traffic
+from unjam.traffic.traffic import Stay, Traffic, TrafficLog
 
 PROGRESS_STEPS = 10
 """decisions between two reports of progress"""
@@ -29,7 +31,7 @@ def run_episode(
     seed: Sequence[int],
     reward: str = "",
     explore: bool = False,
-    record_fuel: bool = False,
+    full: bool = False,
     simulation: Simulation | None = None,
     progress: Progress | None = None,
 ) -> Episode:
@@ -44,7 +46,8 @@ def run_episode(
         seed: integers; everything random comes from them.
         reward: name, or `path.py:name`; empty: the scenario's own.
         explore: whether a residual driver adds its exploration noise.
-        record_fuel: whether fuel is recorded (it costs a tenth of the speed).
+        full: whether fuel is recorded and, on roads with ends, where on the plane vehicles are (it costs a
+            tenth of the speed).
         simulation: an open one to use again; without it, one is opened and closed.
         progress: called now and then with the number of decisions made.
 
@@ -55,9 +58,14 @@ def run_episode(
     earned = make_reward(reward or scenario.reward)
     if simulation is None:
         with Simulation() as simulation:
-            return run_episode(scenario, driver, seed, reward, explore, record_fuel, simulation, progress)
-    traffic = Traffic(scenario, seed, simulation, driver.plain_numbers, record_fuel)
-    return _episode(traffic, seed, earned, drive_traffic(traffic, driver, explore, progress))
+            return run_episode(scenario, driver, seed, reward, explore, full, simulation, progress)
+    traffic = make_traffic(scenario, seed, simulation, driver.plain_numbers, full)
+    log = drive_traffic(traffic, driver, explore, progress)
+    if traffic.entered == 0 and not driver.native:
+        raise InputError(
+            f"no CAV was on the road in {traffic.decisions} decisions: let more vehicles be CAVs"
+        )
+    return _episode(traffic, seed, earned, log)
 
 
 @dataclass(frozen=True)
@@ -67,8 +75,8 @@ class ResidualLog:
     decisions: list[tuple[Array, Array, Array, Array]]
     """each `Decision` but its memory, which is large"""
     last_observation: Array
-    memory: Memory
-    """of the expert before the first decision, a row per CAV"""
+    memories: list[Memory]
+    """before the first decision, of each CAV by itself, in order of entry"""
     hold: int
 
 
@@ -77,18 +85,19 @@ def drive_traffic(
 ) -> ResidualLog | None:
     """Drive to the end; return what a residual driver decided, None of any other."""
     history = traffic.start(controlled=not driver.native, progress=progress)
-    memory = driver.initial_memory(len(traffic.road.cav_ids))
+    memory = driver.initial_memory(len(traffic.cavs))
     if history is not None and traffic.scenario.recall_warmup:
         memory = driver.recall(memory, history)
     residual = driver if isinstance(driver, ResidualDriver) else None
-    remembered = {} if residual is None else residual.expert_memory(memory)
+    memories: list[Memory] = []
+    _note_newcomers(memories, memory, traffic)
     if traffic.single:
         memory = single_row(memory)
-    noise = traffic.exploration_noise() if explore else [None] * traffic.scenario.horizon
+    noise = traffic.exploration_noise() if explore else repeat(None)
     decisions = []
     for step in range(1, traffic.scenario.horizon + 1):
         if residual is not None:
-            decision = residual.decide(traffic.local_state(), memory, noise[step - 1])
+            decision = residual.decide(traffic.local_state(), memory, next(noise))
             memory = decision.memory
             decisions.append(decision[:-1])
             traffic.advance(decision.acceleration)
@@ -97,81 +106,102 @@ def drive_traffic(
         else:
             acceleration, memory = driver.act(traffic.local_state(), memory)
             traffic.advance(acceleration)
+        memory = traffic.carry(memory, driver)
+        if traffic.entered > len(memories):
+            _note_newcomers(memories, memory, traffic)
         if progress is not None and step % PROGRESS_STEPS == 0:
             progress(step)
-        if traffic.crashed:
+        if traffic.crashed or traffic.over:
             break
     if residual is None:
         return None
     last = residual.observation(traffic.local_state(), memory)
-    return ResidualLog(decisions, last, remembered, residual.hold)
+    return ResidualLog(decisions, last, list(map(residual.expert_memory, memories)), residual.hold)
+
+
+def _note_newcomers(memories: list[Memory], memory: Memory, traffic: Traffic) -> None:
+    """Add the memory of each CAV that has just entered: the last rows of `memory`."""
+    count = len(traffic.cavs)
+    for row in range(count - traffic.entered + len(memories), count):
+        memories.append({name: np.array(values[row], np.float64) for name, values in memory.items()})
 
 
 def _episode(traffic: Traffic, seed: Sequence[int], reward: Reward, log: ResidualLog | None) -> Episode:
     """Put the record of finished traffic in order."""
-    road = traffic.road
-    each = traffic.scenario.steps_per_decision
-    speeds, positions = (values[:, ::each] for values in traffic.speeds_and_positions())
-    states = traffic.states(speeds, positions, np.arange(len(road.vehicle_ids)))
+    found = traffic.log()
+    outcome = outcome_of(found.speeds.T, found.stays, traffic.crashed)
+    terms = _checked(reward(outcome), traffic.decisions)
     return Episode(
         seed=tuple(seed),
         status="collision" if traffic.crashed else "completed",
         step=traffic.scenario.decision_step,
         warmup=traffic.scenario.warmup,
-        drawn=road.drawn,
-        loop_length=road.loop_length,
-        crossings=road.crossings,
-        limit_speed=road.limit_speed,
-        vehicle_ids=road.vehicle_ids,
-        cav_ids=road.cav_ids,
+        drawn=traffic.road.drawn,
+        vehicle_ids=found.vehicle_ids,
+        cav_ids=found.cav_ids,
         collisions=traffic.collisions,
-        speeds=np.ascontiguousarray(speeds.T),
-        positions=np.ascontiguousarray(positions.T),
-        gaps=np.ascontiguousarray(states.leader_gap.T),
-        fuel=np.array(traffic.log_fuel) if traffic.log_fuel else np.zeros((0, 0)),
-        outline=road.outline,
-        trajectories=_trajectories(traffic, states, reward, log),
+        speeds=np.ascontiguousarray(found.speeds.T),
+        positions=np.ascontiguousarray(found.positions.T),
+        gaps=np.ascontiguousarray(found.gaps.T),
+        fuel=found.fuel,
+        terms=terms,
+        trajectories=_trajectories(traffic, found, terms, log),
+        **found.pictured,
     )
 
 
 def _trajectories(
-    traffic: Traffic, states: LocalState, reward: Reward, log: ResidualLog | None
+    traffic: Traffic, found: TrafficLog, terms: dict[str, Floats], log: ResidualLog | None
 ) -> tuple[Trajectory, ...]:
-    """Return the trajectory of each CAV; `states` are those of all vehicles, shape (vehicles, T + 1)."""
-    road = traffic.road
-    places = [road.vehicle_ids.index(name) for name in road.cav_ids]
-    applied, shield = traffic.applied(), traffic.shield()
-    steps, cavs = applied.shape
-    crashed = np.zeros(steps, bool)
-    crashed[-1] = traffic.crashed
-    headways = time_headway(states.leader_gap[places, 1:], states.speed[places, 1:]).T
-    terms = _checked(reward(Outcome(states.speed[:, 1:].T, applied, headways, crashed)), steps)
-    expert, residual = applied, np.zeros_like(applied)
-    observations, memory, hold = np.zeros((1, cavs, 0)), {}, 1
-    if log is not None:
-        memory, hold = log.memory, log.hold
-        _, experts, residuals, seen = zip(*log.decisions, strict=True)
-        expert = np.array(experts).reshape(steps, cavs)
-        residual = np.array(residuals).reshape(steps, cavs)
-        looks = [*seen[::hold], log.last_observation]
-        observations = np.array(looks).reshape(len(looks), cavs, -1)
-    return tuple(
-        Trajectory(
-            vehicle=name,
-            start=0,
-            states=LocalState(*(np.ascontiguousarray(values[place]) for values in states)),
-            observations=np.ascontiguousarray(observations[:, row]),
-            expert=np.ascontiguousarray(expert[:, row]),
-            residual=np.ascontiguousarray(residual[:, row]),
-            applied=np.ascontiguousarray(applied[:, row]),
-            shield=np.ascontiguousarray(shield[:, row]),
-            terms=terms,
-            memory={name: np.array(values[row], np.float64) for name, values in memory.items()},
-            hold=hold,
-            terminated=traffic.crashed,
+    """Return the trajectory of each stay."""
+    trajectories = []
+    for stay in found.stays:
+        during = slice(stay.start, stay.start + len(stay.applied))
+        decided = {
+            "observations": np.zeros((1, 0)),
+            "expert": stay.applied,
+            "residual": np.zeros_like(stay.applied),
+            "memory": {},
+            "hold": 1,
+        }
+        if log is not None:
+            decided = _decided(log, stay, traffic.single)
+        trajectories.append(
+            Trajectory(
+                vehicle=stay.vehicle,
+                start=stay.start,
+                states=stay.states,
+                applied=stay.applied,
+                shield=stay.shield,
+                terms={name: values[during] for name, values in terms.items()},
+                terminated=traffic.crashed and during.stop == traffic.decisions,
+                **decided,
+            )
         )
-        for row, (name, place) in enumerate(zip(road.cav_ids, places, strict=True))
-    )
+    return tuple(trajectories)
+
+
+def _decided(log: ResidualLog, stay: Stay, single: bool) -> dict[str, Any]:
+    """Return what a residual driver decided during a stay, as entries of its trajectory."""
+    steps = range(stay.start, stay.start + len(stay.applied))
+    seen = [decision[3] for decision in log.decisions] + [log.last_observation]
+    looks = [*steps[:: log.hold], steps.stop]
+    if single:
+        experts, residuals = (np.array([decision[part] for decision in log.decisions]) for part in (1, 2))
+        observations = [seen[step] for step in looks]
+    else:
+        experts, residuals = (
+            np.array([log.decisions[step][part][row] for step, row in zip(steps, stay.rows, strict=False)])
+            for part in (1, 2)
+        )
+        observations = [seen[step][stay.rows[step - stay.start]] for step in looks]
+    return {
+        "observations": np.array(observations, np.float64).reshape(len(looks), -1),
+        "expert": experts,
+        "residual": residuals,
+        "memory": log.memories[stay.number],
+        "hold": log.hold,
+    }
 
 
 def _checked(terms: dict[str, Floats], rows: int) -> dict[str, Floats]:

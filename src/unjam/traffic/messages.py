@@ -16,7 +16,7 @@ _LENGTHS = struct.Struct(">QQ")
 def write_message(pipe: IO[bytes], facts: dict[str, Any], arrays: Arrays | None = None) -> None:
     """Write one message: `facts` as JSON, and arrays by name."""
     text = json.dumps(facts).encode()
-    data = save({name: np.ascontiguousarray(array) for name, array in arrays.items()}) if arrays else b""
+    data = save({name: np.asarray(array, order="C") for name, array in arrays.items()}) if arrays else b""
     pipe.write(_LENGTHS.pack(len(text), len(data)) + text + data)
     pipe.flush()
 

@@ -1,18 +1,23 @@
 """SUMO's network files: made by netconvert, once for each content."""
 
+import gzip
 import hashlib
 import os
 import shutil
 import subprocess
 import tempfile
+from collections.abc import Iterator
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from xml.etree import ElementTree
 
+import numpy as np
 import platformdirs
+from numpy.typing import NDArray
 
 from unjam.errors import DISK_ERRNOS, EpisodeError, MissingPartError, disk_error
-from unjam.scenarios.scenario import Road
+from unjam.scenarios.road import PlainNetwork
 
 
 def cache_folder() -> Path:
@@ -51,14 +56,16 @@ def sumo_version() -> str:
         raise MissingPartError("libsumo is not installed; install it: pip install libsumo==1.28.0") from None
 
 
-def network_file(road: Road) -> Path:
-    """Return SUMO's network file of a road, made with netconvert if this content was never made before.
+def network_file(plain: PlainNetwork) -> Path:
+    """Return SUMO's network file, made with netconvert if this content was never made before.
 
     Raises:
         MissingPartError: netconvert is missing.
         DiskError: the cache cannot be written.
     """
-    content = "\n".join([sumo_version(), *road.netconvert_options, road.nodes, road.edges, road.connections])
+    content = "\n".join(
+        [sumo_version(), *plain.netconvert_options, plain.nodes, plain.edges, plain.connections]
+    )
     name = hashlib.sha256(content.encode()).hexdigest()[:24]
     target = cache_folder() / "networks" / f"{name}.net.xml"
     if target.exists():
@@ -66,7 +73,7 @@ def network_file(road: Road) -> Path:
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=target.parent) as folder:
-            made = _netconvert(road, Path(folder))
+            made = _netconvert(plain, Path(folder))
             os.replace(made, target)  # whole or not at all, also with several workers at it
     except OSError as error:
         if error.errno in DISK_ERRNOS:
@@ -75,14 +82,41 @@ def network_file(road: Road) -> Path:
     return target
 
 
-def _netconvert(road: Road, folder: Path) -> Path:
+@cache
+def network_lines(path: Path) -> NDArray[np.float64]:
+    """Return the centre lines of all lanes: rows (x, y) [m], a row of NaN between two lines."""
+    rows: list[tuple[float, float]] = []
+    for lane in _lanes(path):
+        points = (point.split(",") for point in lane["shape"].split())
+        rows += [(float(x), float(y)) for x, y, *_ in points]
+        rows.append((float("nan"), float("nan")))
+    return np.array(rows, np.float64).reshape(-1, 2)
+
+
+@cache
+def edge_lengths(path: Path) -> dict[str, float]:
+    """Return the length of each edge [m]."""
+    return {lane["id"].rpartition("_")[0]: float(lane["length"]) for lane in _lanes(path)}
+
+
+def _lanes(path: Path) -> Iterator[dict[str, str]]:
+    """Yield the attributes of each lane of a network file."""
+    with gzip.open(path) if path.suffix == ".gz" else path.open("rb") as file:
+        for _, element in ElementTree.iterparse(file):
+            if element.tag == "lane":
+                yield dict(element.attrib)
+            if element.tag == "edge":
+                element.clear()
+
+
+def _netconvert(plain: PlainNetwork, folder: Path) -> Path:
     nodes, edges, made = folder / "road.nod.xml", folder / "road.edg.xml", folder / "road.net.xml"
-    nodes.write_text(road.nodes)
-    edges.write_text(road.edges)
+    nodes.write_text(plain.nodes)
+    edges.write_text(plain.edges)
     extra = []
-    if road.connections:
+    if plain.connections:
         connections = folder / "road.con.xml"
-        connections.write_text(road.connections)
+        connections.write_text(plain.connections)
         extra = [f"--connection-files={connections}"]
     command = [
         sumo_program("netconvert"),
@@ -92,7 +126,7 @@ def _netconvert(road: Road, folder: Path) -> Path:
         "--offset.disable-normalization=true",
         "--precision=6",
         *extra,
-        *road.netconvert_options,
+        *plain.netconvert_options,
     ]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode != 0 or not made.exists():

@@ -7,7 +7,8 @@ from unjam.drivers.idm import SMALLEST_GAP
 from unjam.physics.arrays import at_least
 from unjam.physics.idm import idm_acceleration
 from unjam.physics.kinematics import gap_on_loop
-from unjam.scenarios.scenario import VEHICLE_LENGTH, Road, Scenario
+from unjam.scenarios.road import ClosedRoad
+from unjam.scenarios.scenario import VEHICLE_LENGTH, Scenario
 
 LEAVE_TO_SUMO = -1.0
 """the commanded speed that stands for none"""
@@ -15,7 +16,7 @@ LEAVE_TO_SUMO = -1.0
 
 def wanted_speeds(
     scenario: Scenario,
-    road: Road,
+    road: ClosedRoad,
     people: Sequence[int],
     speeds: Sequence[float],
     positions: Any,

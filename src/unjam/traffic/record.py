@@ -1,5 +1,6 @@
 """What happened in an episode, and how it travels between processes."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any
 
@@ -7,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from unjam.drivers.local_state import LocalState
+from unjam.traffic.reward import Outcome, time_headway
 
 Floats = NDArray[np.float64]
 
@@ -71,7 +73,7 @@ class Episode:
     drawn: dict[str, float] = field(default_factory=dict)
     """what the seed has drawn, by name"""
     loop_length: float = float("nan")
-    """[m]"""
+    """of a closed road [m]; NaN of one with ends"""
     crossings: tuple[tuple[float, float], ...] = ()
     """where along the road it crosses itself [m]"""
     limit_speed: float = float("nan")
@@ -89,8 +91,26 @@ class Episode:
     fuel: Floats = field(default_factory=lambda: np.zeros((0, 0)))
     """fuel rate in each step [mg/s], shape (T, N); (0, 0) where it was not recorded"""
     outline: Floats = field(default_factory=lambda: np.zeros((0, 3)))
-    """the road's centre line: rows (coordinate along the route, x, y) [m]"""
+    """a closed road's centre line: rows (coordinate along the route, x, y) [m]"""
+    branches: tuple[str, ...] = ()
+    """where each vehicle of a merging road came from"""
+    arrived: int = 0
+    """vehicles that left at the end of their route"""
+    waiting: Floats = field(default_factory=lambda: np.zeros(0))
+    """vehicles that wanted to enter and could not, at each moment, shape (T + 1,); (0,) of a closed road"""
+    lines: Floats = field(default_factory=lambda: np.zeros((0, 2)))
+    """lanes of a road with ends: rows (x, y) [m], a row of NaN between two; (0, 2) where not recorded"""
+    places: Floats = field(default_factory=lambda: np.zeros((0, 0, 3)))
+    """(x, y, heading) of front bumpers on a road with ends [m, rad], shape (T + 1, N, 3); no rows where not
+    recorded"""
+    terms: dict[str, Floats] = field(default_factory=dict)
+    """terms of the reward by name, shape (T,)"""
     trajectories: tuple[Trajectory, ...] = ()
+
+    @property
+    def reward(self) -> Floats:
+        """What each decision earned, shape (T,): the sum of the terms."""
+        return np.sum(list(self.terms.values()), axis=0)
 
     @property
     def steps(self) -> int:
@@ -108,7 +128,26 @@ def failed_episode(seed: tuple[int, ...], reason: str, error: str) -> Episode:
     return Episode(seed=seed, status="failed", reason=reason, error=error)
 
 
-_ARRAYS = ("speeds", "positions", "gaps", "fuel", "outline")
+def outcome_of(speeds: Floats, stays: Sequence[Any], crashed: bool) -> Outcome:
+    """Return what a reward function sees of a whole episode.
+
+    Args:
+        speeds: of all vehicles, shape (T + 1, N).
+        stays: of CAVs: each with its first decision, states and commands; or trajectories.
+        crashed: whether the last decision ended in a collision.
+    """
+    steps = len(speeds) - 1
+    accelerations, headways = (np.full((steps, len(stays)), np.nan) for _ in range(2))
+    for column, stay in enumerate(stays):
+        during = slice(stay.start, stay.start + len(stay.applied))
+        accelerations[during, column] = stay.applied
+        headways[during, column] = time_headway(stay.states.leader_gap[1:], stay.states.speed[1:])
+    collided = np.zeros(steps, bool)
+    collided[-1:] = crashed
+    return Outcome(speeds[1:], accelerations, headways, collided)
+
+
+_ARRAYS = ("speeds", "positions", "gaps", "fuel", "outline", "waiting", "lines", "places")
 _TRAJECTORY_ARRAYS = ("observations", "expert", "residual", "applied", "shield")
 
 
@@ -118,8 +157,10 @@ def pack_episode(episode: Episode) -> tuple[dict[str, Any], dict[str, Floats]]:
     facts: dict[str, Any] = {
         field.name: getattr(episode, field.name)
         for field in fields(Episode)
-        if field.name not in (*_ARRAYS, "trajectories")
+        if field.name not in (*_ARRAYS, "terms", "trajectories")
     }
+    arrays |= {f"terms.{name}": array for name, array in episode.terms.items()}
+    facts["terms"] = list(episode.terms)
     facts["trajectories"] = []
     for index, trajectory in enumerate(episode.trajectories):
         arrays |= {f"{index}.{name}": getattr(trajectory, name) for name in _TRAJECTORY_ARRAYS}
@@ -156,7 +197,8 @@ def unpack_episode(facts: dict[str, Any], arrays: dict[str, Floats]) -> Episode:
             )
         )
     values: dict[str, Any] = {**facts, **{name: arrays[name] for name in _ARRAYS}}
-    for name in ("seed", "vehicle_ids", "cav_ids"):
+    values["terms"] = {name: arrays[f"terms.{name}"] for name in facts["terms"]}
+    for name in ("seed", "vehicle_ids", "cav_ids", "branches"):
         values[name] = tuple(values[name])
     values["crossings"] = tuple((start, end) for start, end in values["crossings"])
     values["trajectories"] = tuple(trajectories)

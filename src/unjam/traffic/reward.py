@@ -15,6 +15,8 @@ LONGEST_PENALISED_HEADWAY = 1.0
 """h_max of Eq. 16 [s]"""
 MOBILITY_WEIGHT, HEADWAY_WEIGHT, ACCELERATION_WEIGHT = 1.0, 0.1, 0.1
 """alpha, beta, gamma of Eq. 16"""
+MERGE_SPEED = 20.0
+"""speed that the merge's reward wants [m/s]"""
 STANDING = 1e-3
 """speed below which a time headway means nothing [m/s]"""
 
@@ -26,9 +28,10 @@ class Outcome(NamedTuple):
     """speeds after the step of all vehicles (in the virtual environment: of those seen) [m/s], shape
     (rows, vehicles); NaN where a vehicle is not on the road"""
     accelerations: Array
-    """what the CAVs were told, within the action limit [m/s2], shape (rows, CAVs)"""
+    """what the CAVs were told, within the action limit [m/s2], shape (rows, CAVs); NaN where one is not on
+    the road"""
     headways: Array
-    """time headways of the CAVs after the step, gap over speed [s], shape (rows, CAVs)"""
+    """time headways of the CAVs after the step, gap over speed [s], shape (rows, CAVs); NaN likewise"""
     crashed: Array
     """whether there was a collision, shape (rows,)"""
 
@@ -38,10 +41,14 @@ Reward = Callable[[Outcome], dict[str, Array]]
 
 
 def _mean(values: Array) -> Array:
-    """Mean over the last axis of those that are there (not NaN)."""
-    xp = namespace(values)
-    there = ~xp.isnan(values)
-    return xp.nan_to_num(values, nan=0.0).sum(-1) / there.sum(-1)
+    """Mean over the last axis of those that are there (not NaN); 0 where nobody is."""
+    there = ~namespace(values).isnan(values)
+    return _sum(values) / at_least(there.sum(-1), 1)
+
+
+def _sum(values: Array) -> Array:
+    """Sum over the last axis of those that are there (not NaN)."""
+    return namespace(values).nan_to_num(values, nan=0.0).sum(-1)
 
 
 def released(outcome: Outcome) -> dict[str, Array]:
@@ -52,7 +59,7 @@ def released(outcome: Outcome) -> dict[str, Array]:
     running = ~outcome.crashed
     return {
         "speed": 4.0 * _mean(outcome.speeds) / 20.0 * running,
-        "acceleration": -4.0 * abs(outcome.accelerations).mean(-1) * running,
+        "acceleration": -4.0 * _mean(abs(outcome.accelerations)) * running,
     }
 
 
@@ -74,13 +81,30 @@ def eq16_as_printed(outcome: Outcome) -> dict[str, Array]:
 def _eq16_costs(outcome: Outcome) -> dict[str, Array]:
     too_close = at_least(LONGEST_PENALISED_HEADWAY - outcome.headways, 0.0)
     return {
-        "headway": -HEADWAY_WEIGHT * too_close.sum(-1),
-        "acceleration": -ACCELERATION_WEIGHT * abs(outcome.accelerations).sum(-1),
+        "headway": -HEADWAY_WEIGHT * _sum(too_close),
+        "acceleration": -ACCELERATION_WEIGHT * _sum(abs(outcome.accelerations)),
     }
+
+
+def released_merge(outcome: Outcome) -> dict[str, Array]:
+    """Reward behind Table 1 on the merge; 0 at a crash, and never below 0.
+
+    1 - ||20 - v|| / ||20|| (norms over all vehicles), less 0.1 for each second that a CAV's headway lacks
+    to 1 s. Source: the authors' released code, after Flow's merge environment.
+    """
+    xp = namespace(outcome.speeds)
+    running = ~outcome.crashed
+    there = ~xp.isnan(outcome.speeds)
+    missed = _sum((MERGE_SPEED - outcome.speeds) ** 2) / (MERGE_SPEED**2 * at_least(there.sum(-1), 1))
+    speed = at_least(1.0 - missed**0.5, 0.0) * there.any(-1) * running
+    too_close = at_least(LONGEST_PENALISED_HEADWAY - outcome.headways, 0.0)
+    headway = -HEADWAY_WEIGHT * _sum(too_close) * running
+    return {"speed": speed, "headway": headway, "floor": at_least(-speed - headway, 0.0)}
 
 
 REWARDS: dict[str, Reward] = {
     "released": released,
+    "released-merge": released_merge,
     "eq16": eq16,
     "eq16-as-printed": eq16_as_printed,
 }

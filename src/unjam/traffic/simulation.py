@@ -12,8 +12,12 @@ from pathlib import Path
 from types import ModuleType, TracebackType
 from typing import Any, Literal, Self
 
+import numpy as np
+from numpy.typing import NDArray
+
 from unjam.errors import EpisodeError, MissingPartError, UnjamError
-from unjam.scenarios.scenario import Road
+from unjam.scenarios.road import PlainNetwork, Road
+from unjam.scenarios.scenario import Actuation
 from unjam.traffic.network_files import network_file, sumo_program
 
 Backend = Literal["libsumo", "traci", "gui"]
@@ -21,6 +25,8 @@ Backend = Literal["libsumo", "traci", "gui"]
 
 SPEED_MODES = {"shielded": 31, "raw": 30, "flow": 25}
 """SUMO's speed mode bits for each way of actuation: bit 0 is the check for a safe speed."""
+WITHOUT_RIGHT_OF_WAY = 7
+"""the bits that stay where vehicles need not obey the right of way"""
 
 _exhaust = deque(maxlen=0).extend
 """runs through an iterator, in C: a loop would cost as much as the calls"""
@@ -69,6 +75,14 @@ class Simulation:
         """how many vehicles touched another in the last step"""
         self.step: Callable[[], object] = call("simulation", "step")
         """simulates one time step"""
+        self.departed: Callable[[], Sequence[str]] = call("simulation", "getDepartedIDList")
+        """who entered the road in the last step"""
+        self.arrived: Callable[[], Sequence[str]] = call("simulation", "getArrivedIDList")
+        """who left the road at the end of its route in the last step"""
+        self.colliding: Callable[[], Sequence[str]] = call("simulation", "getCollidingVehiclesIDList")
+        """who touched another in the last step"""
+        self.waiting: Callable[[], Sequence[str]] = call("simulation", "getPendingVehicles")
+        """who wants to enter and cannot"""
 
     def load(self, road: Road, step: float, seed: int) -> None:
         """Start an episode: load network and traffic, and put the vehicles on the road.
@@ -78,7 +92,7 @@ class Simulation:
         """
         traffic = Path(self._folder.name) / "traffic.rou.xml"
         traffic.write_text(road.traffic)
-        options = self._options(network_file(road), traffic, step, seed)
+        options = self._options(road, traffic, step, seed)
         try:
             if self._running:
                 self._sumo.load(options)
@@ -103,17 +117,23 @@ class Simulation:
         self._sumo = traci.getConnection(label)
         self._bind()
 
-    def _options(self, network: Path, traffic: Path, step: float, seed: int) -> list[str]:
+    def _options(self, road: Road, traffic: Path, step: float, seed: int) -> list[str]:
+        if isinstance(road.network, PlainNetwork):
+            # Vehicles neither vanish from a jam nor give up waiting to enter.
+            patience = ["--time-to-teleport", "-1", "--max-depart-delay", "-1"]
+            files = ["--net-file", str(network_file(road.network)), "--route-files", str(traffic), *patience]
+        else:  # its own words about all that is not named below
+            additional = ",".join(str(path) for path in (*road.network.additional_files, traffic))
+            files = ["--configuration-file", str(road.network.path), "--additional-files", additional]
+            files += ["--verbose", "false"]
         return [
-            *("--net-file", str(network), "--route-files", str(traffic)),
+            *files,
             *("--step-length", str(step), "--seed", str(seed)),
             *("--no-step-log", "true", "--no-warnings", "true", "--duration-log.disable", "true"),
             *("--error-log", str(self._error_log)),
             # The only setting in which a collision is real contact and every one is reported.
             *("--collision.action", "warn", "--collision.mingap-factor", "0"),
             *("--collision.check-junctions", "true"),
-            # Vehicles neither vanish from a jam nor give up waiting to enter.
-            *("--time-to-teleport", "-1", "--max-depart-delay", "-1"),
         ]
 
     @property
@@ -133,6 +153,59 @@ class Simulation:
         """Return the speeds of `ids` [m/s]."""
         return list(map(self._get_speed, ids))
 
+    def left(self) -> list[str]:
+        """Return who left the road in the last step: at the end of its route, or moved away by SUMO."""
+        return [*self.arrived(), *self._sumo.simulation.getStartingTeleportIDList()]
+
+    def places(self, ids: Sequence[str]) -> NDArray[np.float64]:
+        """Return rows (x, y, heading) of front bumpers: [m], and [rad] against the x axis."""
+        vehicle = self._sumo.vehicle
+        rows = [(*vehicle.getPosition(name)[:2], vehicle.getAngle(name)) for name in ids]
+        places = np.array(rows, np.float64).reshape(-1, 3)
+        places[:, 2] = np.radians(90.0 - places[:, 2])  # SUMO counts clockwise from north, in degrees
+        return places
+
+    def more_expected(self) -> bool:
+        """Return whether anybody is on the road or will be."""
+        return self._sumo.simulation.getMinExpectedNumber() > 0
+
+    def type_of(self, name: str) -> str:
+        """Return a vehicle's type."""
+        return self._sumo.vehicle.getTypeID(name)
+
+    def route_of(self, name: str) -> tuple[str, ...]:
+        """Return the edges of a vehicle's route."""
+        return tuple(self._sumo.vehicle.getRoute(name))
+
+    def edge_places(self, ids: Sequence[str]) -> list[tuple[str, float]]:
+        """Return on which edge each of `ids` is, and where along it [m]."""
+        vehicle = self._sumo.vehicle
+        return [(vehicle.getRoadID(name), vehicle.getLanePosition(name)) for name in ids]
+
+    def allowed_speeds(self, ids: Sequence[str]) -> list[float]:
+        """Return how fast each of `ids` may drive where it is [m/s]."""
+        return [self._sumo.vehicle.getAllowedSpeed(name) for name in ids]
+
+    def neighbours(self, name: str, farthest: float) -> tuple[float, float, float, float] | None:
+        """Return speed and gap of the vehicle ahead and of the one behind, as SUMO sees them [m/s, m].
+
+        The gap is bumper to bumper. Who is farther than `farthest` is not there: as fast, and that far away.
+        """
+        vehicle = self._sumo.vehicle
+        speed = self._get_speed(name)
+        found = []
+        for other, gap, keeper in (
+            (*(vehicle.getLeader(name, farthest) or ("", 0.0)), name),
+            (*(follower := vehicle.getFollower(name, farthest)), follower[0]),
+        ):
+            if not other:
+                found += [speed, farthest]
+                continue
+            true_gap = gap + vehicle.getMinGap(keeper)  # SUMO's lacks the gap that the one behind keeps
+            there = true_gap < farthest
+            found += [self._get_speed(other) if there else speed, min(max(true_gap, 0.0), farthest)]
+        return tuple(found)
+
     def distances(self, ids: Sequence[str]) -> list[float]:
         """Return how far each of `ids` has driven since it entered [m]."""
         return list(map(self._get_distance, ids))
@@ -150,16 +223,23 @@ class Simulation:
         """Give `ids` other current speeds [m/s], plain floats: how noise enters."""
         _exhaust(map(self._set_previous_speed, ids, speeds))
 
-    def obey_right_of_way(self, ids: Sequence[str]) -> None:
+    def command_people(self, ids: Iterable[str], right_of_way: bool) -> None:
         """Let SUMO keep `ids` safe and to the right of way, but not to limits of acceleration."""
+        mode = SPEED_MODES["flow"] if right_of_way else SPEED_MODES["flow"] & WITHOUT_RIGHT_OF_WAY
         for name in ids:
-            self._sumo.vehicle.setSpeedMode(name, SPEED_MODES["flow"])
+            self._sumo.vehicle.setSpeedMode(name, mode)
 
-    def take_control(self, ids: Sequence[str], actuation: Literal["shielded", "raw", "flow"]) -> None:
-        """Make `ids` CAVs: from now on they obey `command_speeds`."""
+    def take_control(
+        self, ids: Iterable[str], actuation: Actuation, right_of_way: bool = True, types: str = "cav"
+    ) -> None:
+        """Make `ids` CAVs: from now on they obey `command_speeds`.
+
+        Their type becomes `types`, in which `{}` stands for the type that they had.
+        """
+        mode = SPEED_MODES[actuation] if right_of_way else SPEED_MODES[actuation] & WITHOUT_RIGHT_OF_WAY
         for name in ids:
-            self._sumo.vehicle.setType(name, "cav")
-            self._sumo.vehicle.setSpeedMode(name, SPEED_MODES[actuation])
+            self._sumo.vehicle.setType(name, types.format(self._sumo.vehicle.getTypeID(name)))
+            self._sumo.vehicle.setSpeedMode(name, mode)
 
     def close(self) -> None:
         """End the simulation and remove its files; may be called twice."""

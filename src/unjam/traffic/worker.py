@@ -70,7 +70,7 @@ def _run(facts: dict[str, Any], arrays: Arrays, simulation: Simulation, answers:
         facts["seed"],
         facts["reward"],
         facts["explore"],
-        facts["record_fuel"],
+        facts["full"],
         simulation,
         progress,
     )

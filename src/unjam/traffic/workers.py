@@ -37,7 +37,7 @@ class EpisodeTask:
     seed: tuple[int, ...]
     reward: str = ""
     explore: bool = False
-    record_fuel: bool = False
+    full: bool = False
 
     def message(self) -> Message:
         """Return the task as it travels to a worker."""
@@ -48,7 +48,7 @@ class EpisodeTask:
             "seed": list(self.seed),
             "reward": self.reward,
             "explore": self.explore,
-            "record_fuel": self.record_fuel,
+            "full": self.full,
         }
         return facts, arrays
 

@@ -17,8 +17,9 @@
     caption.append(driver.name, mean);
     figure.append(canvas, caption);
     find(".roads").append(figure);
-    return { ...driver, canvas, mean, positions: numbers(driver.positions, Float32Array),
-             speeds: numbers(driver.speeds, Float32Array), outline: driver.outline };
+    const arrays = Object.fromEntries(["positions", "places", "speeds"].filter((name) => driver[name])
+      .map((name) => [name, numbers(driver[name], Float32Array)]));
+    return { ...driver, ...arrays, canvas, mean, cavs: new Set(driver.cavs) };
   });
   const end = (data.frames - 1) * data.step;
   slider.max = end;
@@ -40,43 +41,78 @@
     return [x0 + part * (x1 - x0), y0 + part * (y1 - y0), Math.atan2(y1 - y0, x1 - x0)];
   }
 
+  // Where a vehicle's middle is between two frames, and which way it points; nothing where it is not there.
+  function spot(road, a, b, part) {
+    const mix = (values, width, index) => {
+      const [from, to] = [values[a * width + index], values[b * width + index]];
+      return Number.isNaN(to) ? from : from + part * (to - from);
+    };
+    if (road.positions) {
+      const middle = mix(road.positions, 1, 0) - data.vehicle_length / 2;
+      return place(road.lines[0], (middle % road.loop_length + road.loop_length) % road.loop_length);
+    }
+    const angle = road.places[3 * a + 2], half = data.vehicle_length / 2;
+    return [mix(road.places, 3, 0) - half * Math.cos(angle), mix(road.places, 3, 1) - half * Math.sin(angle), angle];
+  }
+
+  function bounds(lines) {
+    const box = [Infinity, -Infinity, Infinity, -Infinity];
+    lines.forEach((line) => line.forEach(([, x, y]) => {
+      box[0] = Math.min(box[0], x); box[1] = Math.max(box[1], x);
+      box[2] = Math.min(box[2], y); box[3] = Math.max(box[3], y);
+    }));
+    return box;
+  }
+
+  roads.forEach((road) => {
+    road.box = bounds(road.lines);
+    const [left, right, low, high] = road.box;
+    road.canvas.parentElement.classList.toggle("wide", right - left > 2 * (high - low));
+  });
+
   function draw(road, time) {
-    const size = road.canvas.clientWidth * (window.devicePixelRatio || 1);
-    if (road.canvas.width !== Math.round(size)) road.canvas.width = road.canvas.height = Math.round(size);
-    const xs = road.outline.map((point) => point[1]), ys = road.outline.map((point) => point[2]);
-    const [left, right, low, high] = [Math.min(...xs), Math.max(...xs), Math.min(...ys), Math.max(...ys)];
-    const metre = size / (Math.max(right - left, high - low) + 12);
+    const [left, right, low, high] = road.box;
+    const width = Math.round(road.canvas.clientWidth * (window.devicePixelRatio || 1));
+    const metre = width / (right - left + 12);
+    const height = Math.round(Math.min(1.2 * width, metre * (high - low + 12)));
+    if (road.canvas.width !== width || road.canvas.height !== height) {
+      road.canvas.width = width; road.canvas.height = height;
+    }
+    const scale = Math.min(metre, height / (high - low + 12));
+    const enlarged = Math.max(1, 6 * (window.devicePixelRatio || 1) / (scale * data.vehicle_length));
     const pen = road.canvas.getContext("2d");
     pen.setTransform(1, 0, 0, 1, 0, 0);
-    pen.clearRect(0, 0, size, size);
-    pen.setTransform(metre, 0, 0, -metre, size / 2 - metre * (left + right) / 2, size / 2 + metre * (low + high) / 2);
+    pen.clearRect(0, 0, width, height);
+    pen.setTransform(scale, 0, 0, -scale, width / 2 - scale * (left + right) / 2, height / 2 + scale * (low + high) / 2);
 
     pen.beginPath();
-    road.outline.forEach(([, x, y], index) => index ? pen.lineTo(x, y) : pen.moveTo(x, y));
-    pen.lineWidth = 4; pen.strokeStyle = "#dfe3e8"; pen.stroke();
+    road.lines.forEach((line) => line.forEach(([, x, y], index) => index ? pen.lineTo(x, y) : pen.moveTo(x, y)));
+    pen.lineWidth = Math.max(4, 1.5 / scale); pen.strokeStyle = "#dfe3e8"; pen.stroke();
 
     const frame = Math.min(time / data.step, data.frames - 1);
     const first = Math.floor(frame), second = Math.min(first + 1, data.frames - 1), part = frame - first;
-    let sum = 0;
+    let sum = 0, there = 0;
     for (let vehicle = 0; vehicle < road.vehicles; vehicle++) {
       const [a, b] = [first * road.vehicles + vehicle, second * road.vehicles + vehicle];
-      const position = road.positions[a] + part * (road.positions[b] - road.positions[a]);
-      const speed = road.speeds[a] + part * (road.speeds[b] - road.speeds[a]);
+      if (Number.isNaN(road.speeds[a])) continue;
+      const later = Number.isNaN(road.speeds[b]) ? road.speeds[a] : road.speeds[b];
+      const speed = road.speeds[a] + part * (later - road.speeds[a]);
       sum += speed;
-      const middle = ((position - data.vehicle_length / 2) % road.loop_length + road.loop_length) % road.loop_length;
-      const [x, y, angle] = place(road.outline, middle);
+      there += 1;
+      const [x, y, angle] = spot(road, a, b, part);
       pen.save();
       pen.translate(x, y);
       pen.rotate(angle);
+      pen.scale(enlarged, enlarged);
       pen.fillStyle = colour(speed);
       pen.fillRect(-data.vehicle_length / 2, -1.2, data.vehicle_length, 2.4);
-      if (road.cavs.includes(vehicle)) {
+      if (road.cavs.has(vehicle)) {
         pen.lineWidth = 0.8; pen.strokeStyle = "#d7263d";
         pen.strokeRect(-data.vehicle_length / 2 - 0.6, -1.8, data.vehicle_length + 1.2, 3.6);
       }
       pen.restore();
     }
-    road.mean.textContent = `mean ${(sum / road.vehicles).toFixed(1)} m/s`;
+    road.mean.textContent = there ? `mean ${(sum / there).toFixed(1)} m/s` : "nobody on the road";
   }
 
   let now = 0, playing = false, last = 0;

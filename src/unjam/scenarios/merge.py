@@ -1,0 +1,227 @@
+"""The merge: a highway that a ramp joins, with one lane each, where vehicles come and go."""
+
+from functools import lru_cache
+from math import cos, inf, pi
+from typing import Annotated, ClassVar, Literal
+
+import numpy as np
+from pydantic import Field, model_validator
+from pydantic.dataclasses import dataclass
+
+from unjam.drivers.idm import SMALLEST_GAP
+from unjam.parameters import STRICT, Count, CountOrNone, NotNegative, Positive
+from unjam.physics.arrays import at_least
+from unjam.physics.idm import IDMParameters, idm_acceleration
+from unjam.physics.kinematics import next_position, next_speed
+from unjam.scenarios.road import MergingRoad, Origin, PlainNetwork
+from unjam.scenarios.scenario import VEHICLE_LENGTH, People, Scenario, cav_type, human_type
+
+INFLOW_EDGE, BEFORE, AFTER, RAMP = 100.0, 500.0, 100.0, 100.0
+"""lengths of the edges on which vehicles enter, of the highway before and after the ramp, of the ramp [m]"""
+JUNCTION_RADIUS = 10.0
+"""of the node where they meet [m], as Flow's"""
+JUNCTION_WAYS = (24.525483, 23.270389)
+"""lengths of the ways across that node, of highway and ramp, as netconvert makes them from the radius [m]"""
+HIGHWAY_SPEED, RAMP_SPEED = 10.0, 7.5
+"""with which vehicles enter [m/s]"""
+JOINS_IN = pi / 4
+"""angle between ramp and highway [rad]"""
+PLATOON = 30
+"""vehicles after which each drives like the one before it"""
+HIGHWAY, ON_RAMP = 0, 1
+"""the branches"""
+
+
+@dataclass(frozen=True, config=STRICT)
+class Merge(Scenario):
+    """A highway of 700 m that a ramp joins 100 m before its end; some highway vehicles are CAVs.
+
+    At 2,000 + 100 vehicles an hour the road has two lives. From an empty start it flows freely; with a few
+    vehicles standing at the start a jam grows before the ramp and stays, and traffic backs up beyond the
+    entrance. Every CAV on the road is driven by the same driver, each with a memory of its own, from the
+    decision after it entered until it leaves.
+    """
+
+    title: ClassVar[str] = "merge"
+    reward: ClassVar[str] = "released-merge"
+    people_gap: ClassVar[float] = 2.5
+
+    inflow: Positive = 2000.0
+    """vehicles that want to enter the highway [veh/h], evenly spaced in time"""
+    ramp_flow: NotNegative = 100.0
+    """vehicles that want to enter the ramp [veh/h]"""
+    penetration: Annotated[float, Field(ge=0, le=1)] = 0.1
+    """share of the highway's vehicles that are CAVs"""
+    spacing: Literal["random", "even"] = "random"
+    """where in the stream the CAVs are: `random` as the paper; `even`: each tenth vehicle, as Flow"""
+    cavs: Count | None = None
+    """exactly so many CAVs instead of a share, among those that want to enter in the first half"""
+    standing: CountOrNone = 5
+    """people who stand on the highway at the start, evenly spread"""
+    simulation_step: Positive = 0.2
+    steps_per_decision: Count = 5
+    horizon: Count = 600
+    """decisions in an episode"""
+    people: People = "commanded"
+    right_of_way: bool = False
+
+    @model_validator(mode="after")
+    def _fits(self) -> "Merge":
+        most = int((BEFORE + INFLOW_EDGE + AFTER) / (VEHICLE_LENGTH + self.humans.minimum_gap))
+        if self.standing > most:
+            raise ValueError(f"standing: {self.standing} is not allowed; allowed: <= {most}")
+        early = len(self._early())
+        if self.cavs is not None and self.cavs > early:
+            raise ValueError(
+                f"cavs: {self.cavs} is not allowed; allowed: <= {early}, who enter in the first half"
+            )
+        if self.people == "native":
+            raise ValueError("people: 'native' is not allowed on the merge; allowed: 'commanded'")
+        return self
+
+    def draw(self, generator: np.random.Generator) -> MergingRoad:
+        """Return the road with all vehicles that may enter; random is which of them are CAVs."""
+        chosen = self._chosen(generator)
+        origins: dict[str, Origin] = {}
+        entering: list[tuple[float, str]] = []
+
+        def enter(name: str, time: float, route: str, place: float, speed: float, origin: Origin) -> None:
+            origins[name] = origin
+            entering.append(
+                (
+                    time,
+                    f'<vehicle id="{name}" type="human" route="{route}" depart="{time:.2f}" '
+                    f'departPos="{place!r}" departSpeed="{speed}" departLane="0"/>',
+                )
+            )
+
+        start = -(INFLOW_EDGE + BEFORE + JUNCTION_WAYS[HIGHWAY])
+        for index, along in enumerate(self._standing_places()):
+            beyond = along - INFLOW_EDGE
+            edge, place = ("inflow_highway", along) if beyond < 0 else ("highway", beyond)
+            enter(f"human_s{index}", 0.0, f"from_{edge}", place, 0.0, Origin(HIGHWAY, start + along))
+        for index, time in enumerate(self._times(self.inflow)):
+            name = f"{'cav' if index in chosen else 'human'}_{index}"
+            enter(name, time, "from_inflow_highway", 0.0, HIGHWAY_SPEED, Origin(HIGHWAY, start))
+        start = -(INFLOW_EDGE + RAMP + JUNCTION_WAYS[ON_RAMP])
+        for index, time in enumerate(self._times(self.ramp_flow)):
+            enter(f"human_r{index}", time, "from_inflow_ramp", 0.0, RAMP_SPEED, Origin(ON_RAMP, start))
+        entering.sort(key=lambda entry: entry[0])  # as SUMO wants it
+        routes = [
+            '<route id="from_inflow_highway" edges="inflow_highway highway after"/>',
+            '<route id="from_highway" edges="highway after"/>',
+            '<route id="from_inflow_ramp" edges="inflow_ramp ramp after"/>',
+        ]
+        vehicles = [vehicle for _, vehicle in entering]
+        traffic = ["<routes>", human_type(self), cav_type(self), *routes, *vehicles, "</routes>"]
+        return MergingRoad(
+            network=PlainNetwork(_NODES, _edges(self.humans.desired_speed), ("--no-turnarounds", "true")),
+            traffic="\n".join(traffic),
+            limit_speed=self.limit(),
+            origins=origins,
+            cav_ids=frozenset(name for name in origins if name.startswith("cav")),
+            junctions=JUNCTION_WAYS,
+        )
+
+    def _times(self, flow: float) -> list[float]:
+        """Return when the vehicles of a flow want to enter [s]."""
+        if flow == 0:
+            return []
+        seconds = self.warmup * self.simulation_step + self.horizon * self.decision_step
+        return [index * 3600.0 / flow for index in range(int(seconds * flow / 3600.0))]
+
+    def _early(self) -> list[float]:
+        times = self._times(self.inflow)
+        return times[: len(times) // 2]
+
+    def _chosen(self, generator: np.random.Generator) -> set[int]:
+        """Return which of the highway's vehicles are CAVs."""
+        count = len(self._times(self.inflow))
+        if self.cavs is not None:
+            return set(generator.choice(len(self._early()), self.cavs, replace=False).tolist())
+        if self.spacing == "even":
+            every = np.arange(count * self.penetration) / max(self.penetration, 1e-9)
+            return set(every.astype(int).tolist())
+        return set(np.flatnonzero(generator.random(count) < self.penetration).tolist())
+
+    def _standing_places(self) -> list[float]:
+        """Return where people stand at the start, along the highway [m]."""
+        return [index * (INFLOW_EDGE + BEFORE) / max(1, self.standing) for index in range(self.standing)]
+
+    def limit(self) -> float:
+        """Return the mean speed of the highway's people where no ramp, no noise and no jam disturbs them."""
+        length = INFLOW_EDGE + BEFORE + JUNCTION_WAYS[HIGHWAY] + AFTER
+        return _undisturbed_speed(self.inflow, length, self.humans, self.simulation_step)
+
+    @property
+    def drawn_ranges(self) -> dict[str, tuple[float, float]]:
+        """Nothing: all that is random is which vehicles are CAVs."""
+        return {}
+
+    def part(self, index: int, count: int) -> "Merge":
+        """Return the merge itself."""
+        return self
+
+    def possible_cavs(self) -> tuple[str, ...]:
+        """Return the ids that any of the highway's vehicles has as a CAV."""
+        return tuple(f"cav_{index}" for index in range(len(self._times(self.inflow))))
+
+    def facts(self) -> list[tuple[str, str]]:
+        """Return the road's own facts for `unjam scenarios`."""
+        share = f"{self.cavs} CAV" if self.cavs is not None else f"{100 * self.penetration:g} % CAV"
+        return [
+            ("road", "highway of 700 m with a ramp"),
+            ("vehicles", f"{self.inflow:g} + {self.ramp_flow:g} veh/h ({share})"),
+            ("limit", f"{self.limit():.2f} m/s"),
+            ("limit is", "the mean speed of the highway's traffic where nothing disturbs it"),
+        ]
+
+
+@lru_cache
+def _undisturbed_speed(flow: float, length: float, humans: IDMParameters, step: float) -> float:
+    """Return the mean speed over `length` of people who enter one behind the other and never meet a jam."""
+    delay = round(3600.0 / flow / step)
+    leader: list[tuple[float, float]] = []
+    own: list[tuple[float, float]] = []
+    for _ in range(PLATOON):
+        own = [(0.0, HIGHWAY_SPEED)]
+        while own[-1][0] < length:
+            position, speed = own[-1]
+            moment = len(own) - 1 + delay
+            ahead, ahead_speed = leader[moment] if moment < len(leader) else (inf, speed)
+            gap = at_least(ahead - position - VEHICLE_LENGTH, SMALLEST_GAP)
+            acceleration = idm_acceleration(speed, ahead_speed, gap, humans)
+            moved = next_speed(speed, acceleration, step)
+            own.append((next_position(position, moved, step), moved))
+        leader = own
+    return length / ((len(own) - 1) * step)
+
+
+_RAMP_BEGIN, _RAMP_ENTRANCE = (f"{-length * cos(JOINS_IN):.6f}" for length in (RAMP, RAMP + INFLOW_EDGE))
+_NODES = "\n".join(
+    [
+        "<nodes>",
+        f'<node id="highway_entrance" x="{-INFLOW_EDGE - BEFORE}" y="0"/>',
+        f'<node id="highway_begin" x="{-BEFORE}" y="0"/>',
+        f'<node id="ramp_entrance" x="{_RAMP_ENTRANCE}" y="{_RAMP_ENTRANCE}"/>',
+        f'<node id="ramp_begin" x="{_RAMP_BEGIN}" y="{_RAMP_BEGIN}"/>',
+        f'<node id="meeting" x="0" y="0" type="priority" radius="{JUNCTION_RADIUS}"/>',
+        f'<node id="exit" x="{AFTER}" y="0"/>',
+        "</nodes>",
+    ]
+)
+
+
+def _edges(speed: float) -> str:
+    lines = ["<edges>"]
+    for name, begin, end, length in (
+        ("inflow_highway", "highway_entrance", "highway_begin", INFLOW_EDGE),
+        ("highway", "highway_begin", "meeting", BEFORE),
+        ("inflow_ramp", "ramp_entrance", "ramp_begin", INFLOW_EDGE),
+        ("ramp", "ramp_begin", "meeting", RAMP),
+        ("after", "meeting", "exit", AFTER),
+    ):
+        lines.append(
+            f'<edge id="{name}" from="{begin}" to="{end}" numLanes="1" speed="{speed}" length="{length}"/>'
+        )
+    return "\n".join([*lines, "</edges>"])

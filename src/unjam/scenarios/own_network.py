@@ -1,0 +1,146 @@
+"""The user's own road: any SUMO network with its traffic, some of whose vehicles become CAVs."""
+
+from pathlib import Path
+from typing import Annotated, Any, ClassVar
+
+import numpy as np
+from pydantic import Field, model_validator
+from pydantic.dataclasses import dataclass
+
+from unjam.errors import InputError
+from unjam.parameters import STRICT, build
+from unjam.scenarios.road import OwnRoad, SumoConfiguration
+from unjam.scenarios.scenario import Scenario, obedient_layer, type_xml
+from unjam.scenarios.sumo_files import SumoFiles, read_sumo_files
+
+CAV_TYPES = "cav_of_{}"
+"""the type of a CAV whose own type is `{}`"""
+LONGEST = 3600.0
+"""seconds of an episode where the configuration names no end"""
+CARS = ("passenger", "private", "hov", "taxi", "evehicle", "delivery", "truck", "trailer", "bus", "coach")
+"""SUMO's vehicle classes that a share picks from"""
+KEPT = ("vClass", "length", "width", "height", "maxSpeed", "speedFactor", "guiShape", "emissionClass")
+"""attributes of a vehicle type that a CAV takes over, beside those of changing lanes"""
+
+
+@dataclass(frozen=True, config=STRICT)
+class OwnNetwork(Scenario):
+    """A network of your own, from its .sumocfg file; people drive as its vehicle types say.
+
+    Roads with several lanes, signals, and routes that end are fine. A vehicle becomes a CAV at the first
+    decision after it entered; SUMO still chooses its lane and obeys signals. Its neighbours are SUMO's.
+    Only a collision with a CAV ends an episode.
+    """
+
+    title: ClassVar[str] = "own-network"
+    reward: ClassVar[str] = "released"
+
+    file: str = ""
+    """the .sumocfg file"""
+    cav_share: Annotated[float, Field(ge=0, le=1)] = 0.0
+    """share of the vehicles that become CAVs, cars and the like alone"""
+    cav_types: tuple[str, ...] = ()
+    """vehicle types all of whose vehicles become CAVs"""
+    noise: Annotated[float, Field(ge=0, le=0)] = 0.0
+    """none: people drive as the vehicle types say"""
+
+    @model_validator(mode="after")
+    def _fits(self) -> "OwnNetwork":
+        try:
+            files = read_sumo_files(Path(self.file))
+        except InputError as error:
+            raise ValueError(str(error)) from None
+        known = ", ".join(sorted(files.used_types))
+        for name in self.cav_types:
+            if name not in files.used_types:
+                raise ValueError(f"cav_types: no vehicle has the type {name!r}; allowed: {known}")
+        if not self.cav_types:
+            if self.cav_share == 0:
+                raise ValueError("cav_share: 0.0 is not allowed without cav_types; allowed: > 0, <= 1")
+            if not any(is_car(files.types.get(name, {})) for name in files.used_types):
+                raise ValueError(f"cav_share: no vehicle is a car; its types are {known}; name cav_types")
+        if self.people != "native":
+            raise ValueError("people: 'commanded' is not allowed on your own network; allowed: 'native'")
+        return self
+
+    def draw(self, generator: np.random.Generator) -> OwnRoad:
+        """Return the network; random is which vehicles the share picks."""
+        files = read_sumo_files(Path(self.file))
+        return OwnRoad(
+            network=SumoConfiguration(files.path, files.additional_files),
+            traffic=_cav_types(self, files),
+            limit_speed=float("nan"),
+            cav_share=self.cav_share,
+            cav_types=self.cav_types,
+            cars=frozenset(name for name, attributes in files.types.items() if is_car(attributes)),
+            cav_seed=int(generator.integers(2**31)),
+        )
+
+    @property
+    def people_in_words(self) -> str:
+        """How people drive."""
+        return "as the vehicle types of its files say"
+
+    @property
+    def drawn_ranges(self) -> dict[str, tuple[float, float]]:
+        """Nothing that a critic could see."""
+        return {}
+
+    def part(self, index: int, count: int) -> "OwnNetwork":
+        """Return the network itself."""
+        return self
+
+    def possible_cavs(self) -> tuple[str, ...]:
+        """Return nothing: which vehicles there will be is known to SUMO alone."""
+        raise InputError(
+            "scenario: your own network is not allowed here: its vehicles are known to SUMO alone"
+        )
+
+    def facts(self) -> list[tuple[str, str]]:
+        """Return the road's own facts for `unjam scenarios`."""
+        types = ", ".join(self.cav_types)
+        share = f"{100 * self.cav_share:g} % CAV" if self.cav_share else ""
+        return [
+            ("road", self.file),
+            ("vehicles", "as its files say (" + ", ".join(filter(None, (share, types))) + ")"),
+            ("limit", "what its roads allow"),
+            ("limit is", "the mean speed that the roads allow where the vehicles are"),
+        ]
+
+
+def own_network(file: str, changes: dict[str, Any]) -> OwnNetwork:
+    """Return the scenario of a .sumocfg file: time step and horizon are its own, unless `changes` say more.
+
+    Raises:
+        InputError: one line on what is missing or broken, before SUMO starts.
+    """
+    files = read_sumo_files(Path(file).resolve())
+    step = float(changes.get("simulation_step", files.step))
+    seconds = (files.end if files.end is not None else files.begin + LONGEST) - files.begin
+    each = int(changes.get("steps_per_decision", 1))
+    values = {
+        "file": str(files.path),
+        "simulation_step": step,
+        "horizon": max(1, int(seconds / (step * max(1, each)))),
+        **changes,
+    }
+    return build(OwnNetwork, values, Path(file).name)
+
+
+def is_car(attributes: dict[str, str]) -> bool:
+    """Return whether a share may pick vehicles of a type; SUMO's default class is a passenger car."""
+    return attributes.get("vClass", "passenger") in CARS
+
+
+def _cav_types(scenario: OwnNetwork, files: SumoFiles) -> str:
+    """Return the XML of a CAV type beside each of the user's types: as large, but driven by commands."""
+    lines = ["<additional>"]
+    for name, attributes in files.types.items():
+        kept = {
+            key: value
+            for key, value in attributes.items()
+            if key in KEPT or key.startswith("lc") or key == "laneChangeModel"
+        }
+        calm = {"id": CAV_TYPES.format(name), "sigma": 0.0, "speedDev": 0.0}
+        lines.append(type_xml({**kept, **calm, **obedient_layer(scenario.simulation_step)}))
+    return "\n".join([*lines, "</additional>"])

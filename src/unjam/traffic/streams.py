@@ -1,0 +1,118 @@
+"""Two streams of vehicles that become one: who is where, who drives ahead and who behind.
+
+All vehicles stand in one list: those that are past the place where the ways meet, then the main road's, then
+the ramp's, each from front to back. Nobody overtakes, so that a vehicle's leader is the one before it in the
+list, but for the first of the ramp, which follows the last that is past the meeting place.
+"""
+
+from collections.abc import Collection, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from unjam.drivers.local_state import LARGEST_GAP, LocalState
+from unjam.errors import EpisodeError
+from unjam.physics.kinematics import next_position
+from unjam.scenarios.road import Origin
+from unjam.scenarios.scenario import VEHICLE_LENGTH
+
+Floats = NDArray[np.float64]
+
+FAR = 1e9
+"""gap to a leader that is not there [m]"""
+
+
+class Streams:
+    """The vehicles on a merging road, in the order described above."""
+
+    def __init__(self) -> None:
+        """Begin with an empty road."""
+        self.names: list[str] = []
+        self.positions: Floats = np.zeros(0)
+        """of front bumpers, zero where the ways meet, negative before it [m]"""
+        self.speeds: Floats = np.zeros(0)
+        """[m/s]"""
+        self._past, self._main = 0, 0
+        """how many are past the meeting place, and on the main road before it"""
+
+    def enter(self, name: str, origin: Origin, speed: float) -> None:
+        """Put a vehicle behind the last of its branch."""
+        if origin.position >= 0:
+            self._past += 1
+            place = self._past - 1
+        elif origin.branch == 0:
+            self._main += 1
+            place = self._past + self._main - 1
+        else:
+            place = len(self.names)
+        self.names.insert(place, name)
+        self.positions = np.insert(self.positions, place, origin.position)
+        self.speeds = np.insert(self.speeds, place, speed)
+
+    def leave(self, names: Collection[str]) -> None:
+        """Take the vehicles at the very front off the road."""
+        count = len(names)
+        if set(names) != set(self.names[:count]):
+            raise EpisodeError(f"{', '.join(sorted(names))} left the road from behind another vehicle")
+        self._past -= count
+        del self.names[:count]
+        self.positions, self.speeds = self.positions[count:], self.speeds[count:]
+
+    def move(self, speeds: Sequence[float], step: float) -> None:
+        """Move all vehicles by one step, `speeds` being those after it [m/s]."""
+        self.speeds = np.array(speeds, np.float64)
+        self.positions = next_position(self.positions, self.speeds, step)
+        while self._main and self.positions[self._past] >= 0:  # the first of the main road: in place already
+            self._past, self._main = self._past + 1, self._main - 1
+        while (first := self._past + self._main) < len(self.names) and self.positions[first] >= 0:
+            self.names.insert(self._past, self.names.pop(first))
+            order = np.arange(len(self.names))
+            order[self._past : first + 1] = [first, *range(self._past, first)]
+            self.positions, self.speeds = self.positions[order], self.speeds[order]
+            self._past += 1
+
+    def leaders(self) -> NDArray[np.intp]:
+        """Return the place of each vehicle's leader; -1 where it has none."""
+        ahead = np.arange(len(self.names)) - 1
+        first_on_ramp = self._past + self._main
+        if first_on_ramp < len(ahead):
+            ahead[first_on_ramp] = self._past - 1
+        return ahead
+
+    def gaps(self, leaders: NDArray[np.intp]) -> Floats:
+        """Return each vehicle's gap to its leader [m]; `FAR` where it has none."""
+        return np.where(leaders < 0, FAR, self.positions[leaders] - self.positions - VEHICLE_LENGTH)
+
+    def on_junction(self, ways: tuple[float, float]) -> NDArray[np.bool_]:
+        """Return who is on the ways across the junction, `ways` metres long, that end where both meet."""
+        before = np.zeros(len(self.names))
+        before[self._past : self._past + self._main] = ways[0]
+        before[self._past + self._main :] = ways[1]
+        return (self.positions < 0) & (self.positions >= -before)
+
+    def states(self) -> LocalState:
+        """Return what all vehicles perceive; who is farther than `LARGEST_GAP` is not there."""
+        leaders = self.leaders()
+        followers = self._followers(leaders)
+        gaps, gaps_behind = self.gaps(leaders), self._gaps_behind(followers)
+        return LocalState(
+            speed=self.speeds,
+            leader_speed=np.where(gaps < LARGEST_GAP, self.speeds[leaders], self.speeds),
+            leader_gap=gaps.clip(max=LARGEST_GAP),
+            follower_speed=np.where(gaps_behind < LARGEST_GAP, self.speeds[followers], self.speeds),
+            follower_gap=gaps_behind.clip(max=LARGEST_GAP),
+            route_position=self.positions,
+            loop_length=np.full(len(self.names), np.nan),
+        )
+
+    def _followers(self, leaders: NDArray[np.intp]) -> NDArray[np.intp]:
+        """Return the place of each vehicle's follower, of two the nearer one; -1 where it has none."""
+        behind = np.full(len(leaders), -1)
+        followed = np.flatnonzero(leaders >= 0)
+        order = followed[np.argsort(self.positions[followed], kind="stable")]
+        behind[leaders[order]] = order  # of several the last one written counts: the nearest
+        return behind
+
+    def _gaps_behind(self, followers: NDArray[np.intp]) -> Floats:
+        gaps = self.positions - self.positions[followers] - VEHICLE_LENGTH
+        return np.where(followers < 0, FAR, gaps)
