@@ -135,7 +135,7 @@ def test_on_an_open_road_nobody_beyond_the_largest_gap_is_seen() -> None:
     step = world(model(left={"leader_gap": 5.0})).step(state, torch.zeros(2), torch.zeros(2, 1))
     assert (step.state.leader_gap == LARGEST_GAP).all()
     assert_close(step.state.leader_speed, step.state.speed)
-    assert step.state.route_position.isnan().all()
+    assert_close(step.state.route_position, state.route_position + 0.1 * step.state.speed)
     assert step.reward.isfinite().all()
     closed = state._replace(loop_length=torch.full((2,), 230.0))
     beyond = world(model(left={"leader_gap": 5.0})).step(closed, torch.zeros(2), torch.zeros(2, 1))
@@ -160,6 +160,25 @@ def test_noise_has_the_distribution_of_the_errors() -> None:
     np.testing.assert_allclose(changes.std(1), [0.5, 0.2], rtol=0.03)
     assert np.corrcoef(changes)[0, 1] > 0.999
     assert torch.equal(found.speed, still.speed)
+
+
+@pytest.mark.parametrize("gap", ["leader_gap", "follower_gap"])
+def test_noise_alone_never_makes_a_crash(gap: str) -> None:
+    """A jump that does not fit into the gap does not happen; one that fits does."""
+    jumpy = model(left={})
+    jumpy.noise[:, TARGETS.index(gap)] = -20.0
+    jumpy.noise[:, TARGETS.index("reward")] = 0.5
+    state = some_state(3)._replace(
+        leader_gap=torch.tensor([40.0, 15.0, 0.01]), follower_gap=torch.tensor([40.0, 15.0, 40.0])
+    )
+    state = state._replace(speed=torch.full((3,), 9.0), leader_speed=torch.full((3,), 1.0))
+    push, drawn = torch.zeros(3), torch.zeros(3, 1)
+    found, still = (world(jumpy, noise).step(state, push, drawn) for noise in (True, False))
+    assert found.crashed.tolist() == still.crashed.tolist() == [False, False, True]
+    jumps = getattr(found.state, gap) - getattr(still.state, gap)
+    assert jumps[0].item() == pytest.approx(-20.0, abs=1e-5)
+    assert jumps[1] == 0.0
+    assert found.reward[1] == still.reward[1]
 
 
 def test_every_member_answers_for_some_rows_and_each_row_gets_all_in_time() -> None:

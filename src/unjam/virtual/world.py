@@ -15,12 +15,15 @@ from unjam.virtual.base import base_reward, base_step, largest_gap
 from unjam.virtual.model import (
     NOISE_ROWS,
     NUMBERS,
+    SPEEDS,
     EnvironmentModel,
     model_inputs,
     predict,
     random_members,
 )
 
+GAP_ROWS = slice(len(SPEEDS), len(NUMBERS))
+"""where the gaps are among NUMBERS"""
 BOUNDS = ("speed", "gap", "reward")
 """what is kept within physical bounds"""
 
@@ -66,7 +69,7 @@ class VirtualWorld:
 
     In each step a random member of the ensemble answers for each row. Noise is an error that the model made
     somewhere on the holdout, drawn anew for each row and step: so it has the errors' standard deviations,
-    the correlations between them, and their tails.
+    the correlations between them, and their tails. Noise alone never makes a crash.
     """
 
     def __init__(
@@ -96,9 +99,10 @@ class VirtualWorld:
         """Return what `applied` leads to: next state, reward, and whether that is a crash."""
         scenario = self._scenario
         known = base_step(self._base, scenario, state, applied)
-        left = self._left(state, applied, drawn).T
-        numbers = torch.stack([getattr(known, name) for name in NUMBERS]) + left[: len(NUMBERS)]
-        wanted_speeds, wanted_gaps = numbers[:3], numbers[3:]
+        expected = torch.stack([getattr(known, name) for name in NUMBERS])
+        left = self._left(state, applied, drawn, expected[GAP_ROWS]).T
+        numbers = expected + left[: len(NUMBERS)]
+        wanted_speeds, wanted_gaps = numbers[: len(SPEEDS)], numbers[GAP_ROWS]
         crashed = (wanted_gaps <= 0.0).any(0)
         largest = largest_gap(state)
         speeds = wanted_speeds.clip(0.0, scenario.humans.desired_speed)
@@ -106,14 +110,16 @@ class VirtualWorld:
         left_of_reward = left[-1].clip(self._lowest, self._highest)
         nobody = gaps >= largest
         speed = speeds[0]
-        driven = distance_driven(state.speed, speed, scenario.simulation_step, scenario.steps_per_decision)
+        position = state.route_position + distance_driven(
+            state.speed, speed, scenario.simulation_step, scenario.steps_per_decision
+        )
         following = LocalState(
             speed=speed,
             leader_speed=torch.where(nobody[0], speed, speeds[1]),
             leader_gap=gaps[0],
             follower_speed=torch.where(nobody[1], speed, speeds[2]),
             follower_gap=gaps[1],
-            route_position=(state.route_position + driven) % state.loop_length,
+            route_position=torch.where(state.loop_length.isnan(), position, position % state.loop_length),
             loop_length=state.loop_length,
         )
         earned = base_reward(self._base, self._reward, following, applied, crashed)
@@ -122,8 +128,11 @@ class VirtualWorld:
         )
         return Step(following, earned + left_of_reward * ~crashed, crashed, bounded)
 
-    def _left(self, state: LocalState, applied: Tensor, drawn: Tensor) -> Tensor:
-        """Return what the networks add to the base, with noise, shape (n, 6)."""
+    def _left(self, state: LocalState, applied: Tensor, drawn: Tensor, expected_gaps: Tensor) -> Tensor:
+        """Return what the networks add to the base, with noise, shape (n, 6).
+
+        `expected_gaps`, shape (2, n), are those of the base.
+        """
         rows, members = len(applied), self._fixed_members
         if members is None:
             members = random_members(self._members, rows, self._generator)
@@ -132,5 +141,8 @@ class VirtualWorld:
             chosen = torch.randint(
                 NOISE_ROWS, (rows,), generator=self._generator, device=self._generator.device
             )
-            left = left + self._noise.index_select(0, chosen)
+            noisy = left + self._noise.index_select(0, chosen)
+            # A vehicle that changes lanes or merges makes a gap jump: it does so only where it fits.
+            closes = (expected_gaps + noisy.T[GAP_ROWS] <= 0.0).any(0)
+            left = torch.where(closes[:, None], left, noisy)
         return left
