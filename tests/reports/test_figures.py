@@ -18,8 +18,8 @@ from unjam.reports.figures import (
     colour_table,
     data_uri,
     learning_curve,
-    space_time,
     over_time,
+    space_time,
     speed_scale,
     time_split,
 )

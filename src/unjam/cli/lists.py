@@ -9,6 +9,9 @@ import typer
 from unjam.cli.options import JsonOption
 from unjam.errors import InputError
 
+PICTURED_AFTER = 60.0
+"""seconds after which a road with ends is drawn: at the start it is all but empty"""
+
 
 def scenarios(
     name: Annotated[str | None, typer.Argument(help="One scenario, in full.")] = None,
@@ -67,11 +70,12 @@ def scenarios(
 
 
 def _draw(scenario: Any, name: str, path: Path) -> None:
-    """Write a picture of the road that seed 0 draws, with its vehicles at the start."""
+    """Write a picture of the road that seed 0 draws: at the start, or a minute later where vehicles come."""
     from io import BytesIO
 
     from unjam.files import check_folder, write_whole
     from unjam.reports.road_picture import draw_road
+    from unjam.scenarios.road import ClosedRoad
     from unjam.traffic.simulation import Simulation
     from unjam.traffic.stepping import make_traffic
 
@@ -79,10 +83,14 @@ def _draw(scenario: Any, name: str, path: Path) -> None:
     with Simulation() as simulation:
         traffic = make_traffic(scenario, (0,), simulation)
         traffic.start(controlled=False)
+        closed = isinstance(traffic.road, ClosedRoad)
+        for _ in range(0 if closed else round(PICTURED_AFTER / scenario.decision_step)):
+            traffic.advance(None)
         scene = traffic.scene()
+    fastest = max(1.0, float(scene.speeds.max(initial=0.0)))
     words = "\n".join([name, *(f"{key} {value:g} m" for key, value in traffic.road.drawn.items())])
     content = BytesIO()
-    draw_road(scene, 1.0, words).save(content, "PNG")
+    draw_road(scene, fastest, words).save(content, "PNG")
     write_whole(path, content.getvalue())
 
 

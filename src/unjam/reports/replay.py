@@ -48,12 +48,11 @@ def _vehicles(episode: Shown, step: float, frames: int) -> dict[str, Any]:
         }
     places = _frames(episode, episode.places, step, frames)
     is_cav = np.isin(np.arange(speeds.shape[1]), episode.cavs)
-    columns = [
-        (kind, column) for kind in (True, False) for column in _share(~np.isnan(speeds), is_cav == kind)
-    ]
+    cavs, people = (_share(~np.isnan(speeds), chosen) for chosen in (is_cav, ~is_cav))
+    columns = [*cavs, *people]
     packed_speeds = np.full((frames, len(columns)), np.nan, np.float32)
     packed_places = np.full((frames, len(columns), 3), np.nan, np.float32)
-    for number, (_, vehicles) in enumerate(columns):
+    for number, vehicles in enumerate(columns):
         for vehicle in vehicles:
             there = ~np.isnan(speeds[:, vehicle])
             packed_speeds[there, number] = speeds[there, vehicle]
