@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+import torch
 
 from unjam.drivers.network import Network, network_arrays, network_from_arrays
 from unjam.errors import InputError
@@ -24,6 +25,18 @@ def test_rows_at_once_equal_single_rows_and_plain_numbers() -> None:
     for row, expected in zip(observation, together, strict=True):
         assert network(row[None])[0] == pytest.approx(expected, abs=1e-12)
         assert network(tuple(map(float, row))) == pytest.approx(expected, abs=1e-12)
+
+
+@pytest.mark.parametrize(("precision", "tolerance"), [(torch.float64, 1e-12), (torch.float32, 1e-6)])
+def test_tensors_give_what_arrays_give(precision: torch.dtype, tolerance: float) -> None:
+    network = random_network(5)
+    generator = np.random.default_rng(4)
+    observation, noise = generator.normal(size=(9, 5)), generator.normal(size=9)
+    tensor = torch.tensor(observation, dtype=precision)
+    found = network.explore(tensor, torch.tensor(noise, dtype=precision))
+    assert found.dtype == precision
+    np.testing.assert_allclose(found.numpy(), network.explore(observation, noise), atol=tolerance)
+    np.testing.assert_array_equal(tensor.numpy(), observation.astype(tensor.numpy().dtype))
 
 
 def test_output_stays_within_its_authority() -> None:

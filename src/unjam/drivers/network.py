@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from unjam.errors import InputError
+from unjam.physics.arrays import Array, namespace
 
 Floats = NDArray[np.float64]
 
@@ -48,17 +49,35 @@ class Network:
         object.__setattr__(self, "_residual", np.ascontiguousarray(last[:, 0]))
 
     def __call__(self, observation: Any) -> Any:
-        """Return the residual acceleration [m/s2]: shape (n,) for (n, inputs), a float for a tuple."""
-        found = self._outputs(observation, self._residual)
-        return self.authority * (math.tanh(found) if isinstance(observation, tuple) else np.tanh(found))
+        """Return the residual acceleration [m/s2]: shape (n,) for (n, inputs), a float for a tuple.
+
+        Torch tensors are answered with tensors, in their own precision and on their own device.
+        """
+        if isinstance(observation, tuple):
+            return self.authority * math.tanh(self._outputs(observation, self._residual))
+        if isinstance(observation, np.ndarray):
+            return self.authority * np.tanh(self._outputs(observation, self._residual))
+        return self.authority * self._outputs_on_tensors(observation)[:, 0].tanh()
 
     def explore(self, observation: Any, noise: Any) -> Any:
         """Return the residual with exploration; `noise` is standard normal, shaped like the residual."""
         if not self.squashes_noise:
             return self(observation) + self.exploration_std * noise
-        mean, log_std = self._outputs(observation, self._last[:, :2]).T
-        found = self.authority * np.tanh(mean + np.exp(np.clip(log_std, *LOG_STD_RANGE)) * noise)
+        if isinstance(observation, (tuple, np.ndarray)):
+            mean, log_std = self._outputs(observation, self._last[:, :2]).T
+        else:
+            mean, log_std = self._outputs_on_tensors(observation).T
+        xp = np if isinstance(observation, tuple) else namespace(observation)
+        found = self.authority * xp.tanh(mean + xp.exp(log_std.clip(*LOG_STD_RANGE)) * noise)
         return float(found) if isinstance(observation, tuple) else found
+
+    def _outputs_on_tensors(self, observation: Array) -> Array:
+        """Return the last layer's outputs, shape (n, outputs)."""
+        xp, hidden = namespace(observation), observation
+        for index, layer in enumerate(self.layers):
+            weight, bias = (xp.as_tensor(part, dtype=hidden.dtype, device=hidden.device) for part in layer)
+            hidden = xp.addmm(bias, hidden.relu_() if index else hidden, weight)
+        return hidden
 
     def _outputs(self, observation: Any, last: Floats) -> Any:
         """Return what the weights `last` make of the last hidden layer."""
