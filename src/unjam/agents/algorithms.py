@@ -6,15 +6,19 @@ from typing import Any, cast
 
 import sb3_contrib
 import stable_baselines3
+import torch
 from stable_baselines3.common.buffers import ReplayBuffer, RolloutBuffer
+from torch.distributions import Normal
 
 from unjam.agents.buffers import (
+    MixedReplayBuffer,
     Rows,
     add_to_replay_buffer,
     discounted_returns,
     fill_rollout_buffer,
     shifted_rewards,
 )
+from unjam.agents.divergence import Gaussians
 from unjam.agents.episodic import Episodic, Training
 from unjam.agents.policy import ResidualPolicy
 from unjam.agents.settings import PPOSettings, SACSettings, TRPOSettings
@@ -31,13 +35,23 @@ class OnPolicy(Episodic):
     rollout_buffer: RolloutBuffer
     gamma: float
 
-    def fill(self, rows: Rows) -> None:
-        """Put the rows of an iteration into the rollout buffer, in place of those of the one before."""
-        policy = cast(ResidualPolicy, self.policy)
-        if self.training.policy.normalise_value and self.iteration == 1:
+    def measure_units(self, rows: Rows) -> None:
+        """Scale the value head by the returns of actual rows."""
+        if self.training.policy.normalise_value:
             returns = discounted_returns(rows, self.gamma)
+            policy = cast(ResidualPolicy, self.policy)
             policy.scale_value(float(returns.mean()), float(max(returns.std(), 1e-3)))
-        fill_rollout_buffer(self.rollout_buffer, policy, rows)
+
+    def gaussians(self, observations: torch.Tensor) -> Gaussians:
+        """Return mean and standard deviation of the residual."""
+        with torch.no_grad():
+            distribution = cast(ResidualPolicy, self.policy).get_distribution(observations).distribution
+        normal = cast(Normal, distribution)
+        return Gaussians(normal.mean.squeeze(1), normal.stddev.squeeze(1))
+
+    def fill(self, rows: Rows) -> None:
+        """Put rows into the rollout buffer, in place of those before."""
+        fill_rollout_buffer(self.rollout_buffer, cast(ResidualPolicy, self.policy), rows)
 
 
 class TRPO(OnPolicy, sb3_contrib.TRPO):
@@ -62,8 +76,8 @@ class TRPO(OnPolicy, sb3_contrib.TRPO):
 
     def train(self) -> None:
         """Update policy and value network with the rows of this iteration."""
-        with self.learning() as rows:  # virtual rows will join the actual ones here
-            self.fill(rows)
+        for update in self.updates():
+            self.fill(update.rows)
             super().train()
 
 
@@ -89,7 +103,8 @@ class PPO(OnPolicy, stable_baselines3.PPO):
 
     def train(self) -> None:
         """Update policy and value network with the rows of this iteration."""
-        with self.learning() as rows:  # virtual rows will join the actual ones here
+        for update in self.updates():
+            rows = update.rows
             self.fill(rows)
             self.batch_size = math.ceil(len(rows.rewards) / self._minibatches)
             super().train()
@@ -107,6 +122,7 @@ class SAC(Episodic, stable_baselines3.SAC):
             training,
             SquashedResidualPolicy,
             learning_rate=settings.rate,
+            replay_buffer_class=MixedReplayBuffer,
             buffer_size=settings.buffer_rows,
             learning_starts=0,  # see train
             batch_size=settings.batch,
@@ -130,20 +146,41 @@ class SAC(Episodic, stable_baselines3.SAC):
 
     def train(self, *arguments: Any, **named: Any) -> None:
         """Add the rows of this iteration to the replay buffer, and update actor and critics from it."""
-        with self.learning() as rows:  # virtual rows will join the actual ones here
-            self.fill(rows)
+        # Those of the start are made up for at its end: before it drives, the policy has seen them.
+        owed = round(self.num_timesteps * self._settings.updates_per_step) - self._n_updates
+        buffer = cast(MixedReplayBuffer, self.replay_buffer)
+        for update in self.updates():
+            if update.actual is not None:
+                self.fill(buffer, update.actual)
+            buffer.forget_virtual()
+            if update.virtual is not None:
+                self.fill(buffer.begin_virtual(len(update.virtual.rewards)), update.virtual)
+                buffer.real_ratio = 0.0 if update.actual is None else self._settings.real_ratio
             if not self._starting:
-                steps = sum(episode.steps for episode in self._episodes)
-                updates = max(1, round(steps * self._settings.updates_per_step))
-                super().train(gradient_steps=updates, batch_size=self.batch_size)
+                steps = max(1, round(owed * update.share))
+                super().train(gradient_steps=steps, batch_size=self.batch_size)
+        buffer.forget_virtual()
 
-    def fill(self, rows: Rows) -> None:
-        """Add rows to the replay buffer, their rewards shifted and scaled."""
+    @property
+    def wants_virtual(self) -> bool:
+        """Whether the start is over: before it, nothing is learned."""
+        return not self._starting
+
+    def measure_units(self, rows: Rows) -> None:
+        """Shift rewards by the mean of actual rows."""
+        if self.training.policy.normalise_value:
+            cast(SquashedResidualPolicy, self.policy).reward_offset.fill_(rows.rewards.mean())
+
+    def gaussians(self, observations: torch.Tensor) -> Gaussians:
+        """Return mean and standard deviation of the residual before the tanh."""
+        with torch.no_grad():
+            mean, log_std, _ = self.actor.get_action_dist_params(observations)
+        return Gaussians(mean.squeeze(1), log_std.squeeze(1).exp())
+
+    def fill(self, buffer: ReplayBuffer, rows: Rows) -> None:
+        """Add rows to a replay buffer, their rewards shifted and scaled."""
         policy = cast(SquashedResidualPolicy, self.policy)
-        if self.training.policy.normalise_value and self.iteration == 1:
-            policy.reward_offset.fill_(rows.rewards.mean())
         rewards = shifted_rewards(rows, policy.reward_offset.item(), self.gamma)
-        buffer = cast(ReplayBuffer, self.replay_buffer)
         add_to_replay_buffer(buffer, rows, policy.authority, rewards * self._settings.reward_scale)
 
 

@@ -2,12 +2,14 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from stable_baselines3.common.buffers import ReplayBuffer, RolloutBuffer
 from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
 from unjam.traffic.record import Trajectory
 
@@ -123,6 +125,42 @@ def add_to_replay_buffer(buffer: ReplayBuffer, rows: Rows, authority: float, rew
     end = buffer.pos + len(rewards)
     buffer.full = buffer.full or end >= buffer.buffer_size
     buffer.pos = end % buffer.buffer_size
+
+
+class MixedReplayBuffer(ReplayBuffer):
+    """SB3's replay buffer of actual rows; while it has virtual ones too, a batch is made of both."""
+
+    def __init__(self, *arguments: Any, **named: Any) -> None:
+        super().__init__(*arguments, **named)
+        self._virtual: ReplayBuffer | None = None
+        self.real_ratio = 1.0
+        """share of actual rows in a batch"""
+
+    def begin_virtual(self, rows: int) -> ReplayBuffer:
+        """Return an empty buffer for so many virtual rows, in place of the one before."""
+        self._virtual = ReplayBuffer(
+            rows,
+            self.observation_space,
+            self.action_space,
+            device=self.device,
+            handle_timeout_termination=False,
+        )
+        return self._virtual
+
+    def forget_virtual(self) -> None:
+        """Sample actual rows alone from now on."""
+        self._virtual = None
+
+    def sample(self, batch_size: int, env: Any = None) -> ReplayBufferSamples:
+        """Return a random batch."""
+        if self._virtual is None:
+            return super().sample(batch_size, env)
+        real = round(self.real_ratio * batch_size)
+        parts = [super().sample(real)] if real else []
+        if real < batch_size:
+            parts.append(self._virtual.sample(batch_size - real))
+        joined = [torch.cat(part) for part in zip(*(each[:5] for each in parts), strict=True)]
+        return ReplayBufferSamples(*joined)
 
 
 def shifted_rewards(rows: Rows, offset: float, gamma: float) -> Float64:

@@ -5,10 +5,10 @@ episodes from the workers, `train` learns from their rows.
 """
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import gymnasium
 import numpy as np
@@ -19,7 +19,9 @@ from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import RolloutReturn
 
-from unjam.agents.buffers import Rows, rows_of
+from unjam.agents.buffers import Rows, join_rows, rows_of
+from unjam.agents.divergence import Gaussians, total_variation
+from unjam.agents.imagination import Imagination
 from unjam.agents.policy import policy_spaces
 from unjam.agents.settings import PolicySettings
 from unjam.drivers.network import Network
@@ -30,6 +32,8 @@ Collect = Callable[[Network, int], Sequence[Episode]]
 """(policy, iteration) -> the episodes of this iteration, driven with exploration"""
 
 NEVER = 2**31
+COMPARED_ROWS = 2000
+"""at most so many of the visited states tell how far an update has moved the policy"""
 
 
 @dataclass(frozen=True)
@@ -43,6 +47,8 @@ class Iteration:
     """of all iterations so far"""
     virtual_steps: int
     """of all iterations so far"""
+    virtual: dict[str, Any]
+    """what there is to say of the virtual environment; empty without one"""
     log: dict[str, float]
     """what the learner says about its update"""
     seconds: dict[str, float]
@@ -61,6 +67,22 @@ class Training:
     """of the whole run"""
     collect: Collect
     after_iteration: Callable[[Iteration], None]
+    imagination: Imagination | None = None
+    """the virtual environment; None: model-free"""
+
+
+class Update(NamedTuple):
+    """What one update learns from."""
+
+    actual: Rows | None
+    virtual: Rows | None
+    share: float
+    """of all that the iteration's updates do"""
+
+    @property
+    def rows(self) -> Rows:
+        """Actual and virtual rows together."""
+        return join_rows([part for part in (self.actual, self.virtual) if part is not None])
 
 
 class SpacesOnly(gymnasium.Env[np.ndarray, np.ndarray]):
@@ -134,17 +156,86 @@ class Episodic(BaseAlgorithm):
         # What off-policy learners of SB3 ask for; the others ask only whether it is true.
         return RolloutReturn(steps, len(self._episodes), continue_training=True)
 
-    @contextmanager
-    def learning(self) -> Iterator[Rows]:
-        """Give the actual rows of this iteration to whoever learns from them, then tell of the iteration."""
-        started = time.perf_counter()
-        seed_iteration(self.training.seed, self.iteration)
-        yield self._rows()
-        self._seconds["update"] = time.perf_counter() - started
+    def measure_units(self, rows: Rows) -> None:
+        """Take the units of returns from the first iteration's actual rows."""
+
+    def gaussians(self, observations: torch.Tensor) -> Gaussians:
+        """Return the distribution of the residual at these observations, before any squashing."""
+        raise NotImplementedError
+
+    @property
+    def wants_virtual(self) -> bool:
+        """Whether virtual rows are of use in this iteration."""
+        return True
+
+    def updates(self) -> Iterator[Update]:
+        """Yield what to learn from, one update after the other; then tell of the iteration.
+
+        Actual rows alone are what units come from. Virtual rows are those of the policy as it is then.
+        """
+        imagination = self.training.imagination
+        actual = self._rows()
+        if self.iteration == 1:
+            self.measure_units(actual)
+        some = torch.as_tensor(actual.observations[:: -(-len(actual.rewards) // COMPARED_ROWS)])
+        before = self.gaussians(some)
+        self._seconds |= dict.fromkeys(("fit", "imagine", "update") if imagination else ("update",), 0.0)
+        if imagination is None:
+            yield from self._timed([Update(actual, None, 1.0)])
+        else:
+            with self._timing("fit"):
+                imagination.learn(self._episodes, self.iteration)
+            yield from self._timed(self._with_virtual(actual, imagination))
         log = {key.partition("/")[2]: float(value) for key, value in self.logger.name_to_value.items()}
+        distances = total_variation(before, self.gaussians(some))
+        log |= {"eps_pi_mean": float(distances.mean()), "eps_pi_max": float(distances.max())}
+        if imagination is not None:
+            bound = imagination.bound(log["eps_pi_max"], self.gamma)  # pyright: ignore[reportAttributeAccessIssue]
+            imagination.facts["bound"] = bound
         self.training.after_iteration(
-            Iteration(self.iteration, self._episodes, self.num_timesteps, 0, log, self._seconds)
+            Iteration(
+                self.iteration,
+                self._episodes,
+                self.num_timesteps,
+                imagination.steps if imagination else 0,
+                imagination.facts if imagination else {},
+                log,
+                self._seconds,
+            )
         )
+
+    def _with_virtual(self, actual: Rows, imagination: Imagination) -> Iterator[Update]:
+        """Yield the updates of an iteration with a virtual environment."""
+        settings = imagination.settings
+
+        def imagined(part: int = 0, parts: int = 1) -> Rows | None:
+            with self._timing("imagine"):
+                return imagination.imagine(self.network(), self.iteration, part, parts)
+
+        if not self.wants_virtual:
+            yield Update(actual, None, 1.0)
+        elif settings.update == "union":
+            yield Update(actual, imagined(), 1.0)
+        else:
+            parts = settings.updates
+            yield Update(actual, None, 1.0 / (parts + 1))
+            for part in range(parts):
+                rows = imagined(part, parts)
+                if rows is not None:
+                    yield Update(None, rows, 1.0 / (parts + 1))
+
+    def _timed(self, updates: Iterable[Update]) -> Iterator[Update]:
+        """Yield updates, and count the time until the next one is asked for as that of the update."""
+        for update in updates:
+            seed_iteration(self.training.seed, self.iteration)
+            with self._timing("update"):
+                yield update
+
+    @contextmanager
+    def _timing(self, part: str) -> Iterator[None]:
+        started = time.perf_counter()
+        yield
+        self._seconds[part] += time.perf_counter() - started
 
     def _rows(self) -> Rows:
         scenario, sees_road = self.training.scenario, self.training.policy.critic_sees_road

@@ -107,5 +107,7 @@ class SACSettings(LearnerSettings):
     start: Literal["expert", "uniform"] = "expert"
     """how these are driven: `expert`, with the little noise of `policy.exploration_std`; `uniform` residuals
     over the whole authority"""
+    real_ratio: Share = 0.5
+    """share of actual rows in a batch, where there are virtual ones"""
     buffer_rows: Count = 200_000
     """newest rows, one per look, that are learned from"""

@@ -45,6 +45,13 @@ class VirtualSettings:
     """estimator of the model error eps_m that sets the rollout length, see unjam.virtual.fitting"""
     virtual_ratio: NotNegative = 1.0
     """virtual decisions for each actual one that the agent learns from; 0: model-free"""
+    update: Literal["union", "sequential"] = "union"
+    """how the agent learns from both: from all of them at once; or first from the actual ones, then `updates`
+    times from virtual ones alone, each time with those of the newest policy, as the released code"""
+    updates: Count = 5
+    """updates on virtual rows of `sequential`"""
+    device: Literal["cpu", "cuda"] = "cpu"
+    """where the virtual environment runs"""
 
     @model_validator(mode="after")
     def _can_be_estimated(self) -> "VirtualSettings":
