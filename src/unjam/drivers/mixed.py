@@ -28,6 +28,11 @@ class Mixed(Driver):
             if driver.native:
                 raise InputError("driver: 'human' is not allowed among several; idm drives like people")
 
+    @property
+    def tensors(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Whether all of them take tensors."""
+        return all(getattr(driver, "tensors", False) for driver in self.drivers)
+
     def initial_memory(self, n: int) -> Memory:
         """Return which driver each CAV has, and what all drivers would remember of it."""
         memory: Memory = {KIND: np.arange(n, dtype=np.float64) % len(self.drivers)}
