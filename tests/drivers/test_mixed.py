@@ -30,6 +30,7 @@ def test_each_row_drives_as_its_own_driver_would() -> None:
 
 def test_it_drives_tensors_as_it_drives_arrays() -> None:
     mixed, state = Mixed((PI, IDM())), random_state(np.random.default_rng(1), 4)
+    assert mixed.tensors
     expected, _ = mixed.act(state, mixed.initial_memory(4))
     tensors = type(state)(*(torch.as_tensor(values) for values in state))
     memory = {name: torch.as_tensor(rows) for name, rows in mixed.initial_memory(4).items()}

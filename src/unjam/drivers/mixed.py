@@ -31,7 +31,7 @@ class Mixed(Driver):
     @property
     def tensors(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Whether all of them take tensors."""
-        return all(driver.tensors for driver in self.drivers)
+        return all(getattr(driver, "tensors", False) for driver in self.drivers)
 
     def initial_memory(self, n: int) -> Memory:
         """Return which driver each CAV has, and what all drivers would remember of it."""

@@ -85,7 +85,7 @@ class ResidualDriver(Driver):
     @property
     def tensors(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Whether the expert takes tensors; the network does."""
-        return self.expert.tensors
+        return getattr(self.expert, "tensors", False)
 
     @cached_property
     def _keys(self) -> tuple[str, str]:
