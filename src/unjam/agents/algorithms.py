@@ -133,9 +133,9 @@ class SAC(Episodic, stable_baselines3.SAC):
         with self.learning() as rows:  # virtual rows will join the actual ones here
             self.fill(rows)
             if not self._starting:
-                steps = sum(episode.steps for episode in self._episodes)
-                updates = max(1, round(steps * self._settings.updates_per_step))
-                super().train(gradient_steps=updates, batch_size=self.batch_size)
+                # Those of the start are made up for at its end: before it drives, the policy has seen them.
+                owed = round(self.num_timesteps * self._settings.updates_per_step) - self._n_updates
+                super().train(gradient_steps=max(1, owed), batch_size=self.batch_size)
 
     def fill(self, rows: Rows) -> None:
         """Add rows to the replay buffer, their rewards shifted and scaled."""
