@@ -316,7 +316,7 @@ def test_a_recipe_of_endless_depth_is_refused(tmp_path: Path) -> None:
         {"1.weight": np.zeros((3, 16))},
         {"1.bias": np.zeros(3)},
         {"0.weight": np.zeros(16)},
-        {"2.weight": np.zeros((16, 2)), "2.bias": np.zeros(2)},
+        {"2.weight": np.zeros((16, 3)), "2.bias": np.zeros(3)},
         {"1.bias": np.full(16, np.nan)},
         {"1.bias": np.full(16, np.inf)},
         {"0.weight": np.zeros((3, 16))},

@@ -158,7 +158,7 @@ def test_sac_learns_nothing_before_its_start_is_driven(start: Any) -> None:
     settings = SACSettings(start=start, start_steps=1700, updates_per_step=0.02, batch=8)
     task = Task(PolicySettings(hidden=(16,), exploration_std=0.1), settings, "sac").learn(4)
     updates = [entry.log.get("n_updates", 0.0) for entry in task.iterations]
-    assert updates == [0.0, 0.0, 16.0, 32.0]  # 800 actual steps in each iteration
+    assert updates == [0.0, 0.0, 48.0, 64.0]  # 800 actual steps in each iteration
     rows = np.zeros((2000, INPUTS))
     noise = np.random.default_rng(0).normal(size=len(rows))
     stds = [network.explore(rows, noise).std() for network in task.networks]

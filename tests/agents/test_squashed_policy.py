@@ -114,6 +114,14 @@ def test_the_target_starts_as_the_critic() -> None:
         assert torch.equal(found, target)
 
 
+def test_critics_promise_no_more_far_from_all_data() -> None:
+    policy = make_policy(critic_inputs=1)
+    rows = random_rows(200, 6)
+    near, far = values_of(policy, rows), values_of(policy, 1000.0 * rows)
+    assert np.abs(far).max() < 3.0 * np.abs(near).max()
+    assert np.ptp(far) > 0.01
+
+
 def test_uniform_residuals_cover_their_authority_evenly() -> None:
     network = uniform_network(3, authority=2.0)
     noise = np.random.default_rng(0).normal(size=200_000)

@@ -101,7 +101,7 @@ class SACSettings(LearnerSettings):
     """factor of what is earned from one look to the next: the temperature is weighed against it"""
     batch: Count = 256
     updates_per_step: Positive = 0.25
-    """gradient steps per actual step"""
+    """gradient steps per actual step, those of the start included"""
     start_steps: CountOrNone = 10_000
     """actual steps before the first gradient step"""
     start: Literal["expert", "uniform"] = "expert"

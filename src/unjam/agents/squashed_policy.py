@@ -5,6 +5,7 @@ from typing import Any, cast
 
 import numpy as np
 import torch
+from stable_baselines3.common.policies import ContinuousCritic
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.sac.policies import Actor, SACPolicy
 from torch import nn
@@ -23,6 +24,17 @@ class ActorView(BaseFeaturesExtractor):
     def forward(self, observations: torch.Tensor) -> torch.Tensor:
         """Return the first columns, shape (n, inputs)."""
         return observations[:, : self.features_dim]
+
+
+class NormalisedReLU(nn.Module):
+    """Layer normalisation, then ReLU: keeps critics from promising much where there is no data.
+
+    Source: Ball et al. 2023, Efficient online reinforcement learning with offline data.
+    """
+
+    def forward(self, features: torch.Tensor) -> torch.Tensor:
+        """Return the normalised units, of the shape of `features`."""
+        return torch.relu(nn.functional.layer_norm(features, features.shape[-1:]))
 
 
 class SquashedResidualPolicy(SACPolicy):
@@ -51,6 +63,11 @@ class SquashedResidualPolicy(SACPolicy):
             nn.init.zeros_(linear.weight)
             nn.init.constant_(linear.bias, bias)
         return actor
+
+    def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> ContinuousCritic:
+        """Return a pair of critics, which see all and normalise their hidden layers."""
+        self.critic_kwargs["activation_fn"] = NormalisedReLU
+        return super().make_critic(features_extractor)
 
     def network(self) -> Network:
         """Return the NumPy twin: the same residual to 1e-6, the same exploration noise."""

@@ -10,6 +10,7 @@ from unjam.agents.episodic import Episodic
 
 Tensors = dict[str, torch.Tensor]
 
+VIRTUAL = "virtual/"
 REPLAY = ("observations", "next_observations", "actions", "rewards", "dones")
 REPLAY_PLACE = ("pos", "full")
 """where the next row goes, and whether the buffer is full"""
@@ -35,6 +36,9 @@ def learner_state(learner: Episodic) -> tuple[dict[str, Any], Tensors]:
     if isinstance(learner, SAC):
         counters |= {name: getattr(learner.replay_buffer, name) for name in REPLAY_PLACE}
         tensors |= _tensors_in_place(learner)
+    if learner.training.imagination is not None:
+        counters["virtual"], kept = learner.training.imagination.state()
+        tensors |= {f"{VIRTUAL}{name}": tensor for name, tensor in kept.items()}
     return counters, {name: tensor.detach().clone() for name, tensor in tensors.items()}
 
 
@@ -45,6 +49,9 @@ def restore_learner(learner: Episodic, counters: dict[str, Any], tensors: Tensor
     learner.iteration = counters["iteration"]
     learner.num_timesteps = counters["actual_steps"]
     learner._n_updates = counters["updates"]
+    if learner.training.imagination is not None:
+        kept = {n.removeprefix(VIRTUAL): tensor for n, tensor in tensors.items() if n.startswith(VIRTUAL)}
+        learner.training.imagination.restore(counters["virtual"], kept)
     if isinstance(learner, SAC):
         for name in REPLAY_PLACE:
             setattr(learner.replay_buffer, name, counters[name])

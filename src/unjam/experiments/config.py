@@ -17,6 +17,7 @@ from unjam.experiments.presets import PRESETS
 from unjam.parameters import STRICT, Count, CountOrNone, build
 from unjam.scenarios.registry import make_scenario
 from unjam.scenarios.scenario import Scenario
+from unjam.virtual.settings import VirtualSettings
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -59,6 +60,8 @@ class RunConfig:
     trpo: TRPOSettings = field(default_factory=TRPOSettings)
     ppo: PPOSettings = field(default_factory=PPOSettings)
     sac: SACSettings = field(default_factory=SACSettings)
+    virtual: VirtualSettings = field(default_factory=VirtualSettings)
+    """the virtual environment, in which the agent learns between actual episodes"""
     evaluation: EvaluationSettings = field(default_factory=EvaluationSettings)
     preset: str = ""
     """which preset this started from, for the record"""

@@ -9,6 +9,7 @@ import numpy as np
 
 from unjam.agents.algorithms import LEARNERS
 from unjam.agents.episodic import Iteration, Training
+from unjam.agents.imagination import Imagination
 from unjam.agents.state import learner_state, restore_learner
 from unjam.controller import controller_bytes
 from unjam.drivers.driver import Driver
@@ -43,6 +44,11 @@ class Run:
         self._validation_best = -np.inf
         self._expert_return = float("nan")
         settings = config.policy
+        imagination = None
+        if config.virtual.virtual_ratio > 0:
+            imagination = Imagination(
+                config.virtual, self.scenario, config.reward, self.expert, settings, config.seed
+            )
         training = Training(
             observation_size(settings.observe, self.expert),
             self.scenario,
@@ -50,6 +56,7 @@ class Run:
             config.seed,
             self._collect,
             self._after_iteration,
+            imagination,
         )
         self.learner = LEARNERS[config.agent](training, config.learner)
         checkpoint = load_checkpoint(folder / "checkpoint")
@@ -141,8 +148,8 @@ class Run:
             "iteration": iteration.number,
             "actual_steps": iteration.actual_steps,
             "virtual_steps": iteration.virtual_steps,
-            "k_star": None,  # no virtual environment yet
-            "eps_m": None,
+            "k_star": iteration.virtual.get("k_star"),
+            "eps_m": iteration.virtual.get("eps_m"),
             "return_mean": mean("return"),
             "return_expert": self._expert_return,
             "return_validation": validation,
@@ -152,6 +159,7 @@ class Run:
             "shield_override_share": mean("shield_override_share"),
             "collisions": sum(row["collisions"] for row in measured),
             "learner": iteration.log,
+            "virtual": iteration.virtual,
             "seconds": seconds,
         }
 
