@@ -76,10 +76,12 @@ def state_of(speed: object, leader_speed: object, gap: object) -> LocalState:
     return LocalState(own, leader, distance, own, distance, own * 0.0, own * 0.0 + 230.0)
 
 
-def random_network(inputs: int = 5, seed: int = 0, size: int = 16, scale: float = 0.3) -> Network:
-    """A network with random weights."""
+def random_network(
+    inputs: int = 5, seed: int = 0, size: int = 16, scale: float = 0.3, outputs: int = 1
+) -> Network:
+    """A network with random weights; with two outputs it sizes its own noise."""
     generator = np.random.default_rng(seed)
-    sizes = [inputs, size, size, 1]
+    sizes = [inputs, size, size, outputs]
     layers = tuple(
         (generator.normal(size=(rows, columns)) * scale, generator.normal(size=columns) * scale)
         for rows, columns in itertools.pairwise(sizes)

@@ -39,8 +39,8 @@ ALL_PARTS = ("local", "expert_acceleration", "expert_memory", "loop_length")
 ABOUT = {"scenario": "ring", "iteration": 3}
 
 
-def residual(expert: Driver, seed: int = 0, hold: int = 1) -> ResidualDriver:
-    network = random_network(observation_size(ALL_PARTS, expert), seed)
+def residual(expert: Driver, seed: int = 0, hold: int = 1, outputs: int = 1) -> ResidualDriver:
+    network = random_network(observation_size(ALL_PARTS, expert), seed, outputs=outputs)
     return ResidualDriver(expert, network, 1.0, ALL_PARTS, hold)
 
 
@@ -99,9 +99,10 @@ def with_manifest(change: Callable[[dict[str, Any]], object]) -> bytes:
         PISaturation(window=20),
         residual(PISaturation()),
         residual(FollowerStopper(), hold=7),
+        residual(PISaturation(), outputs=2),
         residual(residual(residual(PISaturation(), 1, hold=3), 2), 3, hold=5),
     ],
-    ids=["expert", "residual", "held residual", "residual of a residual of a residual"],
+    ids=["expert", "residual", "held residual", "residual of sac", "residual of a residual of a residual"],
 )
 def test_a_controller_acts_as_the_driver_it_was_made_of(tmp_path: Path, driver: Driver) -> None:
     loaded = load_controller(written(tmp_path, controller_bytes(driver, ABOUT)))
@@ -315,7 +316,7 @@ def test_a_recipe_of_endless_depth_is_refused(tmp_path: Path) -> None:
         {"1.weight": np.zeros((3, 16))},
         {"1.bias": np.zeros(3)},
         {"0.weight": np.zeros(16)},
-        {"2.weight": np.zeros((16, 2)), "2.bias": np.zeros(2)},
+        {"2.weight": np.zeros((16, 3)), "2.bias": np.zeros(3)},
         {"1.bias": np.full(16, np.nan)},
         {"1.bias": np.full(16, np.inf)},
         {"0.weight": np.zeros((3, 16))},

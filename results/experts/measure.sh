@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
-# Measures what the docs say of experts on the figure eight. Each JSON file here is the evaluation.json of one
-# `unjam drive`, its manifest included. A few minutes.
+# Measures what the docs say of experts on the figure eight, the merge, and networks that SUMO carries. Each JSON
+# file here is the evaluation.json of one `unjam drive`, its manifest included. Ten minutes.
 set -eu
 cd "$(dirname "$0")/../.."
 runs=runs/for-the-docs
@@ -14,7 +14,16 @@ for radius in 32 33 34 35; do
         --out "$runs/figure-eight-steady-$radius" \
         -d human -d pi:time_constant=0 -d pi -d pacer -d pacer:varying=true >/dev/null
 done
-for road in ring ring-warm ring-jammed figure-eight; do
+unjam drive merge --episodes 20 --out "$runs/merge" -d human -d pi:time_constant=0 >/dev/null
+unjam drive merge --episodes 20 --set actuation=flow --out "$runs/merge-flow" -d pi:time_constant=0 >/dev/null
+unjam drive merge --episodes 10 --set standing=0 --out "$runs/merge-empty" -d human -d pi >/dev/null
+mkdir -p runs
+rm -rf runs/game && cp -r "$(python -c 'import sumo; print(sumo.SUMO_HOME)')/tools/game" runs/game
+for road in ramp A10KW; do
+    unjam drive "runs/game/$road.sumocfg" --cav-share 0.1 --episodes 5 --set horizon=1500 --out "$runs/own-$road" \
+        -d human -d pi -d acc >/dev/null
+done
+for road in ring ring-warm ring-jammed figure-eight merge; do
     unjam drive $road --episodes 10 --out "$runs/all-on-$road" \
         -d human -d idm -d pi:time_constant=0 -d pi -d follower-stopper -d acc -d lacc -d bcm -d ovm -d pacer \
         -d constant -d constant:acceleration=0.1 >/dev/null
@@ -23,4 +32,4 @@ done
 for folder in "$runs"/*; do
     cp "$folder/evaluation.json" "results/experts/$(basename "$folder").json"
 done
-rm -r "$runs"
+rm -r "$runs" runs/game

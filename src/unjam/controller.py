@@ -9,6 +9,7 @@ import hashlib
 import io
 import json
 import lzma
+import re
 import zipfile
 import zlib
 from pathlib import Path
@@ -20,6 +21,7 @@ from safetensors.numpy import load, save
 from unjam import __version__
 from unjam.drivers.driver import Driver
 from unjam.drivers.from_file import is_file_reference
+from unjam.drivers.mixed import Mixed
 from unjam.drivers.registry import DRIVERS, driver_from_recipe, named_driver, recipe_of
 from unjam.drivers.residual import ResidualDriver, observation_size
 from unjam.errors import InputError
@@ -28,6 +30,8 @@ SUFFIX = ".unjam"
 FORMAT = 1
 LARGEST_PART = 64 * 2**20
 """bytes of one part, unpacked"""
+_SEVERAL = re.compile(r"\+(?=[^\W\d]|[./~])")
+"""between two drivers of a mixture; not the + of 1e+5"""
 MANIFEST, WEIGHTS = "manifest.json", "weights.safetensors"
 
 
@@ -108,13 +112,16 @@ def make_driver(text: str, time_step: float) -> Driver:
 
     Args:
         text: a name (`pi`), with parameters (`pi:time_constant=1,window=30`), your own (`path.py:name`), a
-            run folder, or a `.unjam` file.
+            run folder, or a `.unjam` file; or several of them joined by `+`, for CAVs side by side.
         time_step: time between two decisions of the road [s].
 
     Raises:
         InputError: there is no such driver, or a parameter is wrong.
     """
     path = Path(text)
+    parts = [] if path.exists() else _SEVERAL.split(text)
+    if len(parts) > 1:
+        return Mixed(tuple(make_driver(part, time_step) for part in parts))
     named = text.partition(":")[0] in DRIVERS or is_file_reference(text)
     if not named and (text.endswith(SUFFIX) or path.is_dir()):
         return load_controller(path)

@@ -1,12 +1,22 @@
+from dataclasses import fields
+
 import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from stable_baselines3.common.buffers import RolloutBuffer
+from stable_baselines3.common.buffers import ReplayBuffer, RolloutBuffer
 
-from unjam.agents.buffers import discounted_returns, fill_rollout_buffer
-from unjam.agents.policy import ResidualPolicy
+from unjam.agents.buffers import (
+    Rows,
+    add_to_replay_buffer,
+    discounted_returns,
+    fill_rollout_buffer,
+    join_rows,
+    rows_of,
+    shifted_rewards,
+)
+from unjam.agents.policy import ResidualPolicy, policy_spaces
 from unjam.drivers import LocalState
 from unjam.traffic.record import Trajectory
 
@@ -52,7 +62,7 @@ def fill(
 ) -> RolloutBuffer:
     spaces = policy.observation_space, policy.action_space
     buffer = RolloutBuffer(1, *spaces, device="cpu", gamma=gamma, gae_lambda=gae_lambda)
-    fill_rollout_buffer(buffer, policy, trajectories, extra or [()] * len(trajectories))
+    fill_rollout_buffer(buffer, policy, rows_of(trajectories, extra or [()] * len(trajectories)))
     return buffer
 
 
@@ -168,6 +178,24 @@ def test_the_value_after_the_end_is_that_of_the_trajectorys_own_road() -> None:
     assert buffer.returns[-1, 0] == pytest.approx(expected, rel=1e-5)
 
 
+def test_parts_that_are_joined_are_the_rows_of_all_their_trajectories() -> None:
+    trajectories = [make_trajectory(seed, 3 + seed, hold=2, terminated=seed == 1) for seed in range(4)]
+    extra = [(float(seed),) for seed in range(4)]
+    parts = [rows_of(trajectories[:1], extra[:1]), rows_of(trajectories[1:], extra[1:])]
+    joined, expected = join_rows(parts), rows_of(trajectories, extra)
+    for field in fields(Rows):
+        np.testing.assert_array_equal(getattr(joined, field.name), getattr(expected, field.name))
+        assert getattr(joined, field.name).dtype == getattr(expected, field.name).dtype
+
+
+def test_after_each_row_comes_the_next_of_its_trajectory_or_where_that_ended() -> None:
+    trajectories = [make_trajectory(0, 5, hold=2), make_trajectory(1, 1), make_trajectory(2, 3)]
+    rows = rows_of(trajectories, [()] * 3)
+    expected = np.concatenate([trajectory.observations[1:] for trajectory in trajectories])
+    np.testing.assert_array_equal(rows.next_observations, expected.astype(np.float32))
+    assert rows.lasts.tolist() == [2, 3, 6]
+
+
 def test_refuses_another_number_of_trajectories_than_of_their_roads() -> None:
     with pytest.raises(ValueError, match="shorter"):
         fill(random_policy(critic_inputs=1), [make_trajectory(0, 3), make_trajectory(1, 3)], [(0.0,)])
@@ -199,7 +227,7 @@ def test_the_ratio_is_one_in_the_shuffled_order_of_the_update_too() -> None:
 def test_a_buffer_takes_the_size_of_each_iteration() -> None:
     policy = random_policy()
     buffer = fill(policy, [make_trajectory(0, 50)])
-    fill_rollout_buffer(buffer, policy, [make_trajectory(1, 20)], [()])
+    fill_rollout_buffer(buffer, policy, rows_of([make_trajectory(1, 20)], [()]))
     assert len(buffer.rewards) == 20
     assert sum(len(rows.returns) for rows in buffer.get(7)) == 20
     np.testing.assert_array_equal(
@@ -226,10 +254,78 @@ def test_discounted_returns_are_the_sums_written_out(
         for t in range(len(earned)):
             within = sum(gamma ** (later - t) * earned[later] for later in range(t, len(earned)))
             expected.append(within + gamma ** (len(earned) - t) * after)
-    np.testing.assert_allclose(discounted_returns(trajectories, gamma), expected, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(
+        discounted_returns(rows_of(trajectories, [()] * len(trajectories)), gamma),
+        expected,
+        rtol=1e-9,
+        atol=1e-9,
+    )
 
 
 def test_a_cut_trajectory_that_always_earns_the_same_is_worth_the_same_everywhere() -> None:
     trajectory = make_trajectory(0, 30)
     trajectory.terms["one"][:], trajectory.terms["other"][:] = 1.5, 0.5
-    np.testing.assert_allclose(discounted_returns([trajectory], 0.95), 2.0 / 0.05)
+    np.testing.assert_allclose(discounted_returns(rows_of([trajectory], [()]), 0.95), 2.0 / 0.05)
+
+
+def replay_buffer(size: int) -> ReplayBuffer:
+    spaces = policy_spaces(INPUTS, 1, 2.0)
+    return ReplayBuffer(size, *spaces, device="cpu", handle_timeout_termination=False)
+
+
+def test_the_replay_buffer_holds_what_sb3_would_have_put_there_row_by_row() -> None:
+    ours, theirs = replay_buffer(20), replay_buffer(20)
+    for iteration in range(4):
+        trajectories = [
+            make_trajectory(10 * iteration + seed, 7 + seed, hold=2, terminated=seed == 1)
+            for seed in range(2)
+        ]
+        extra = [(0.5,), (-0.5,)]
+        rows = rows_of(trajectories, extra)
+        add_to_replay_buffer(ours, rows, 2.0, rows.rewards)
+        for trajectory, more in zip(trajectories, extra, strict=True):
+            seen = [np.append(row, more).astype(np.float32) for row in trajectory.observations]
+            residuals, earned = trajectory.looks
+            for look, (residual, reward) in enumerate(zip(residuals, earned, strict=True)):
+                done = trajectory.terminated and look == len(earned) - 1
+                action = np.array([np.float32(residual) / np.float32(2.0)])
+                theirs.add(seen[look], seen[look + 1], action, reward, np.array(done), [{}])
+        assert (ours.pos, ours.full) == (theirs.pos, theirs.full)
+        for name in ("observations", "next_observations", "actions", "rewards", "dones"):
+            np.testing.assert_array_equal(getattr(ours, name), getattr(theirs, name))
+    assert ours.full
+
+
+def test_more_rows_than_a_replay_buffer_takes_leave_the_newest() -> None:
+    buffer = replay_buffer(5)
+    rows = rows_of([make_trajectory(0, 13)], [(0.0,)])
+    add_to_replay_buffer(buffer, rows, 2.0, rows.rewards)
+    assert sorted(buffer.rewards[:, 0]) == sorted(rows.rewards[-5:].astype(np.float32))
+
+
+@given(
+    shapes=st.lists(st.tuples(st.integers(1, 12), st.booleans()), min_size=1, max_size=3),
+    gamma=st.floats(0.1, 0.99),
+    offset=st.floats(-20.0, 20.0),
+    after=st.floats(-50.0, 50.0),
+)
+def test_shifted_rewards_shift_all_that_follows_by_the_same(
+    shapes: list[tuple[int, bool]], gamma: float, offset: float, after: float
+) -> None:
+    rows = rows_of(
+        [make_trajectory(seed, size, 1, terminated) for seed, (size, terminated) in enumerate(shapes)],
+        [()] * len(shapes),
+    )
+
+    def worth(rewards: np.ndarray, beyond: float) -> np.ndarray:
+        """What follows each row, where a trajectory that was cut is worth `beyond` after its end."""
+        found = np.empty(len(rewards))
+        for first, last, terminated in zip(rows.starts, rows.lasts, rows.terminated, strict=True):
+            later = 0.0 if terminated else beyond
+            for row in range(last, first - 1, -1):
+                later = found[row] = rewards[row] + gamma * later
+        return found
+
+    missing = offset / (1.0 - gamma)
+    shifted = worth(shifted_rewards(rows, offset, gamma), after - missing)
+    np.testing.assert_allclose(shifted, worth(rows.rewards, after) - missing, rtol=1e-9, atol=1e-6)

@@ -35,7 +35,7 @@ def make_policy(
     )
 
 
-def shake(policy: ResidualPolicy, seed: int, scale: float = 1.0) -> None:
+def shake(policy: torch.nn.Module, seed: int, scale: float = 1.0) -> None:
     """Give every weight a random value that keeps the units of a layer about as large as its inputs."""
     generator = torch.Generator().manual_seed(seed)
     with torch.no_grad():
@@ -107,6 +107,17 @@ def test_the_twin_keeps_its_weights_when_the_policy_learns_on() -> None:
     shake(policy, 2)
     np.testing.assert_array_equal(network(rows), before)
     assert np.abs(policy.network()(rows) - before).max() > 1e-3
+
+
+def test_actor_and_critic_learn_at_rates_of_their_own() -> None:
+    policy = make_policy(critic_inputs=2)
+    policy.set_rates(actor=0.1, critic=0.2)
+    rates = {
+        id(parameter): group["lr"] for group in policy.optimizer.param_groups for parameter in group["params"]
+    }
+    for name, parameter in policy.named_parameters():
+        assert rates.pop(id(parameter)) == (0.2 if "value" in name else 0.1), name
+    assert not rates
 
 
 @pytest.mark.parametrize(("authority", "action_limit"), [(1.0, 1.0), (0.3, 1.0), (0.5, 2.0)])

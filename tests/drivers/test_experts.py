@@ -59,6 +59,7 @@ def test_plain_numbers_give_what_arrays_give(expert: Driver) -> None:
 
 
 def test_tensors_give_what_arrays_give(expert: Driver) -> None:
+    assert expert.tensors
     generator = np.random.default_rng(2)
     memory = expert.initial_memory(6)
     tensors = {key: torch.tensor(values) for key, values in memory.items()}

@@ -1,7 +1,8 @@
 import numpy as np
 import pytest
+import torch
 
-from unjam.drivers.network import network_arrays, network_from_arrays
+from unjam.drivers.network import Network, network_arrays, network_from_arrays
 from unjam.errors import InputError
 
 from ..conftest import random_network
@@ -26,6 +27,18 @@ def test_rows_at_once_equal_single_rows_and_plain_numbers() -> None:
         assert network(tuple(map(float, row))) == pytest.approx(expected, abs=1e-12)
 
 
+@pytest.mark.parametrize(("precision", "tolerance"), [(torch.float64, 1e-12), (torch.float32, 1e-6)])
+def test_tensors_give_what_arrays_give(precision: torch.dtype, tolerance: float) -> None:
+    network = random_network(5)
+    generator = np.random.default_rng(4)
+    observation, noise = generator.normal(size=(9, 5)), generator.normal(size=9)
+    tensor = torch.tensor(observation, dtype=precision)
+    found = network.explore(tensor, torch.tensor(noise, dtype=precision))
+    assert found.dtype == precision
+    np.testing.assert_allclose(found.numpy(), network.explore(observation, noise), atol=tolerance)
+    np.testing.assert_array_equal(tensor.numpy(), observation.astype(tensor.numpy().dtype))
+
+
 def test_output_stays_within_its_authority() -> None:
     network = random_network(5, scale=30.0)
     assert np.abs(network(np.random.default_rng(3).normal(size=(50, 5)))).max() <= 1.0
@@ -37,11 +50,38 @@ def test_exploration_adds_scaled_noise() -> None:
     np.testing.assert_allclose(network.explore(observation, noise) - network(observation), 0.2 * noise)
 
 
-def test_arrays_make_the_same_network_again() -> None:
-    network = random_network(5)
-    again = network_from_arrays(network_arrays(network), 1.0, 0.2)
-    observation = np.ones((2, 5))
+def test_noise_that_the_network_sizes_itself_comes_before_the_tanh() -> None:
+    network = random_network(5, outputs=2)
+    observation, noise = np.random.default_rng(1).normal(size=(2, 30, 5))
+    noise = noise[:, 0]
+    hidden = observation
+    for weight, bias in network.layers[:-1]:
+        hidden = np.maximum(0.0, hidden @ weight + bias)
+    weight, bias = network.layers[-1]
+    mean, log_std = (hidden @ weight + bias).T
+    np.testing.assert_allclose(network(observation), np.tanh(mean), atol=1e-12)
+    expected = np.tanh(mean + np.exp(log_std) * noise)
+    np.testing.assert_allclose(network.explore(observation, noise), expected, atol=1e-12)
+    assert np.ptp(log_std) > 0.1
+
+
+def test_exploring_rows_at_once_equal_single_rows_and_plain_numbers() -> None:
+    for network in (random_network(5), random_network(5, outputs=2)):
+        observation, noise = np.random.default_rng(2).normal(size=(2, 9, 5))
+        together = network.explore(observation, noise[:, 0])
+        for row, drawn, expected in zip(observation, noise[:, 0], together, strict=True):
+            assert network.explore(row[None], drawn[None])[0] == pytest.approx(expected, abs=1e-12)
+            single = network.explore(tuple(map(float, row)), float(drawn))
+            assert single == pytest.approx(expected, abs=1e-12)
+            assert type(single) is float
+
+
+@pytest.mark.parametrize("network", [random_network(5), random_network(5, outputs=2)])
+def test_arrays_make_the_same_network_again(network: Network) -> None:
+    again = network_from_arrays(network_arrays(network), network.authority, network.exploration_std)
+    observation, noise = np.ones((2, 5)), np.ones(2)
     np.testing.assert_array_equal(again(observation), network(observation))
+    np.testing.assert_array_equal(again.explore(observation, noise), network.explore(observation, noise))
 
 
 @pytest.mark.parametrize(
@@ -50,7 +90,7 @@ def test_arrays_make_the_same_network_again() -> None:
         ({"0.bias": np.zeros(3)}, "weight and bias do not fit"),
         ({"1.weight": np.zeros((3, 16))}, "3 inputs are not allowed; allowed: 16"),
         ({"1.bias": np.full(16, np.nan)}, "not finite"),
-        ({"2.weight": np.zeros((16, 2)), "2.bias": np.zeros(2)}, "one output"),
+        ({"2.weight": np.zeros((16, 3)), "2.bias": np.zeros(3)}, "one output, or two"),
         ({"0.weight": np.zeros(5)}, "do not fit"),
     ],
 )

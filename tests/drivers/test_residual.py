@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+import torch
 
 from unjam.drivers import IDM, LocalState, PISaturation, ResidualDriver, check_driver
 from unjam.drivers.check import random_state
@@ -59,6 +60,26 @@ def test_plain_numbers_give_what_arrays_give(hold: int) -> None:
         expected, memory = driver.act(state, memory)
         found, numbers = driver.act(LocalState(*(float(values[0]) for values in state)), numbers)
         assert found == pytest.approx(float(expected[0]), abs=1e-12)
+
+
+@pytest.mark.parametrize("hold", [1, 4])
+def test_tensors_give_what_arrays_give(hold: int) -> None:
+    inner = ResidualDriver(PISaturation(), random_network(), 1.0, hold=2)
+    network = random_network(observation_size(ALL_PARTS, inner))
+    driver = ResidualDriver(inner, network, 1.0, ALL_PARTS, hold)
+    assert driver.tensors
+    generator = np.random.default_rng(5)
+    memory = driver.initial_memory(6)
+    tensors = {key: torch.tensor(values) for key, values in memory.items()}
+    for _ in range(12):
+        state, noise = random_state(generator, 6), generator.normal(size=6)
+        expected = driver.decide(state, memory, noise)
+        memory = expected.memory
+        on_tensors = LocalState(*(torch.tensor(values) for values in state))
+        found = driver.decide(on_tensors, tensors, torch.tensor(noise))
+        tensors = found.memory
+        np.testing.assert_allclose(found.acceleration.numpy(), expected.acceleration, atol=1e-12)
+        np.testing.assert_allclose(found.observation.numpy(), expected.observation, atol=1e-12)
 
 
 def test_holds_its_residual_for_as_many_decisions_as_asked() -> None:

@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from unjam.agents.algorithms import LEARNERS
 from unjam.agents.settings import PolicySettings, TRPOSettings
 from unjam.drivers import PISaturation
 from unjam.drivers.constant import Constant
@@ -73,7 +74,10 @@ def test_merging_changes_neither_side() -> None:
         ({"trpo.gamma": float("nan")}, "trpo.gamma: nan is not allowed"),
         ({"trpo": 3}, "trpo: 3 is not allowed"),
         ({"trpo.gamma.x": 3}, "trpo.gamma: {'x': 3} is not allowed"),
-        ({"agent": "magic"}, "agent: 'magic' is not allowed; allowed: 'trpo'"),
+        ({"agent": "magic"}, "agent: 'magic' is not allowed; allowed: 'trpo', 'ppo' or 'sac'"),
+        ({"ppo.clip": 2.0}, "ppo.clip: 2.0 is not allowed; allowed: less than 1"),
+        ({"sac.start": "slowly"}, "sac.start: 'slowly' is not allowed; allowed: 'expert' or 'uniform'"),
+        ({"sac.gama": 0.9}, "sac.gama: unknown name"),
         ({"steps": 0}, "steps: 0 is not allowed"),
         ({"steps": 1.5}, "steps: 1.5 is not allowed"),
         ({"steps": "many"}, "steps: 'many' is not allowed"),
@@ -153,7 +157,7 @@ def test_the_toml_of_a_road_given_in_python_makes_it_again(tmp_path: Path) -> No
         expert=st.text(),
         reward=st.text(),
         steps=st.integers(1, 2**62),
-        seed=st.integers(0, 10**6),
+        seed=st.integers(0, 10**6 - 1),
         policy=st.builds(
             PolicySettings,
             hidden=st.lists(st.integers(1, 999), min_size=1).map(tuple),
@@ -168,6 +172,13 @@ def test_any_configuration_survives_being_written(made: RunConfig, tmp_path_fact
     path = tmp_path_factory.getbasetemp() / "any.toml"
     path.write_bytes(to_toml(made).encode())
     assert load_config(path) == made
+
+
+@pytest.mark.parametrize("agent", LEARNERS)
+def test_each_learner_has_its_own_settings(agent: str) -> None:
+    made = load_config(changes={"agent": agent, f"{agent}.gamma": 0.7, f"{agent}.batch_steps": 77})
+    assert (made.learner.gamma, made.learner.batch_steps) == (0.7, 77)
+    assert made.learner == getattr(made, agent)
 
 
 def test_every_key_is_written_out() -> None:

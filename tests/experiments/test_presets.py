@@ -35,7 +35,14 @@ def test_a_preset_changes_what_it_names_and_nothing_else(name: str) -> None:
 def test_the_papers_preset_has_the_papers_numbers() -> None:
     made = load_config(preset="paper")
     assert (made.trpo.gamma, made.trpo.gae_lambda, made.trpo.target_kl) == (0.995, 0.97, 0.01)
+    ppo, sac = made.ppo, made.sac
+    assert (ppo.gamma, ppo.epochs, ppo.clip, ppo.actor_rate, ppo.critic_rate) == (0.99, 80, 0.2, 3e-4, 1e-3)
+    assert (ppo.batch_steps, ppo.minibatches) == (6000, 1)
+    assert (sac.gamma, sac.tau, sac.rate, sac.temperature) == (0.99, 5e-3, 3e-4, 0.2)
+    assert (sac.start_steps, sac.start, sac.batch) == (10_000, "uniform", 256)
+    assert (sac.learn_temperature, sac.reward_scale) == (False, 1.0)
     assert (made.trpo.batch_steps, made.policy.hidden, made.policy.exploration_std) == (6000, (64, 64), 1.0)
     assert made.policy.observe == ("local",)
-    assert made.policy.hold == 1
+    assert made.policy.decisions_held(0.1) == 1
+    assert not made.spread
     assert made.make_expert() == PISaturation(time_constant=0)

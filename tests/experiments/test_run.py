@@ -34,6 +34,8 @@ def small_config(**changes: Any) -> RunConfig:
         "road": {"length": [120, 130], "vehicles": 8, "horizon": 100},
         "policy": {"hidden": [8]},
         "trpo": {"batch_steps": STEPS, "critic_epochs": 2, "critic_batch": 16},
+        "ppo": {"batch_steps": STEPS, "epochs": 3},
+        "sac": {"batch_steps": STEPS, "start_steps": 400, "updates_per_step": 0.02, "batch": 8},
         "evaluation": {"every": 1, "validation_episodes": 2, "episodes": 2, "baselines": ["human"]},
         "steps": 2 * STEPS,
         "workers": 1,
@@ -164,6 +166,31 @@ def test_a_run_that_was_stopped_ends_as_if_it_had_not_been(
     assert outcome(folder) == outcome(uninterrupted)
 
 
+@pytest.mark.parametrize("agent", ["ppo", "sac"])
+def test_a_run_of_any_learner_ends_as_if_it_had_not_been_stopped(
+    tmp_path: Path, agent: str, learn: Learn
+) -> None:
+    config = small_config(agent=agent, steps=4 * STEPS, policy__hidden=[8, 8])
+    learn(tmp_path / "one go", config)
+    for iterations in (1, 3):
+        with pytest.raises(Stop):
+            learn(tmp_path / "run", config, stop_after(iterations), resume=iterations > 1)
+    learn(tmp_path / "run", config, resume=True)
+    assert outcome(tmp_path / "run") == outcome(tmp_path / "one go")
+
+
+def test_each_learner_learns_its_own_way(uninterrupted: Path, tmp_path: Path, learn: Learn) -> None:
+    for agent, key in {"ppo": "clip_fraction", "sac": "critic_loss"}.items():
+        learn(tmp_path / agent, small_config(agent=agent))
+        rows = progress(tmp_path / agent)
+        assert rows[0]["return_expert"] == progress(uninterrupted)[0]["return_expert"]
+        assert key in rows[1]["learner"]
+        assert [row["actual_steps"] for row in rows] == [STEPS, 2 * STEPS]
+        loaded = load_controller(tmp_path / agent)
+        assert isinstance(loaded, ResidualDriver)
+        assert loaded.network.squashes_noise is (agent == "sac")
+
+
 def test_a_run_that_is_stopped_again_and_again_ends_as_if_it_had_not_been(
     uninterrupted: Path, tmp_path: Path, learn: Learn
 ) -> None:
@@ -274,7 +301,7 @@ def test_without_validation_the_last_policy_is_the_controller(tmp_path: Path, le
     assert {row["return_validation"] for row in progress(tmp_path / "run")} == {None}
     loaded = load_controller(tmp_path / "run")
     assert isinstance(loaded, ResidualDriver)
-    for found, expected in zip(loaded.network.layers, run.learner.policy.network().layers, strict=True):
+    for found, expected in zip(loaded.network.layers, run.learner.network().layers, strict=True):
         np.testing.assert_array_equal(found[0], expected[0])
         np.testing.assert_array_equal(found[1], expected[1])
     assert controller_manifest(tmp_path / "run")["iteration"] == 2
@@ -291,7 +318,7 @@ def test_episodes_of_an_iteration_are_spread_over_the_lengths_where_asked(
     tmp_path: Path, spread: bool, learn: Learn
 ) -> None:
     config = small_config(
-        trpo__spread=spread, trpo__batch_steps=11 * 20, steps=20, road__horizon=20, evaluation__every=0
+        spread=spread, trpo__batch_steps=11 * 20, steps=20, road__horizon=20, evaluation__every=0
     )
     run = learn(tmp_path / "run", config)
     lengths = [episode.drawn["length"] for episode in run.learner._episodes]
@@ -317,7 +344,7 @@ def test_training_explores_and_validation_does_not(tmp_path: Path, learn: Learn)
     run = learn(tmp_path / "run", small_config(policy__exploration_std=0.3))
     (trajectory,) = run.learner._episodes[0].trajectories
     assert np.std(trajectory.residual) > 0.1
-    again = run.driver(run.learner.policy.network())
+    again = run.driver(run.learner.network())
     assert run._validate(again) == progress(tmp_path / "run")[-1]["return_validation"]
 
 

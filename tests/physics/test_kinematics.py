@@ -4,6 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from unjam.physics import gap_on_loop, next_position, next_speed
+from unjam.physics.kinematics import distance_driven
 
 
 @given(st.floats(0, 40), st.floats(-20, 20), st.floats(0.01, 1))
@@ -17,6 +18,15 @@ def test_speed_changes_by_acceleration_and_never_turns_back(
 
 def test_position_moves_with_the_new_speed() -> None:
     assert next_position(10.0, 3.0, 0.1) == pytest.approx(10.3)
+
+
+@given(st.floats(10, 30), st.floats(-2, 2), st.integers(1, 6))
+def test_distance_is_that_of_the_steps_one_by_one(speed: float, acceleration: float, steps: int) -> None:
+    position, new_speed = 0.0, speed
+    for _ in range(steps):
+        new_speed = next_speed(new_speed, acceleration, 0.2)
+        position = next_position(position, new_speed, 0.2)
+    assert distance_driven(speed, new_speed, 0.2, steps) == pytest.approx(position, abs=1e-9)
 
 
 @given(st.floats(0, 1000), st.floats(5, 225))

@@ -1,84 +1,68 @@
-"""Learners of Stable-Baselines3, fed with whole episodes.
+"""The learners: Algorithm 1 over those of Stable-Baselines3. Each learns from the rows of an iteration."""
 
-They are extended at the two methods that are meant for it: `collect_rollouts` gets episodes from the
-workers, `train` is where the virtual environment has its place, before the update.
-"""
+import math
+from collections.abc import Callable
+from typing import Any, cast
 
-import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Any
-
-import gymnasium
-import numpy as np
+import sb3_contrib
+import stable_baselines3
 import torch
-from gymnasium import spaces
-from sb3_contrib import TRPO
-from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.buffers import ReplayBuffer, RolloutBuffer
+from torch.distributions import Normal
 
-from unjam.agents.buffers import discounted_returns, fill_rollout_buffer
-from unjam.agents.policy import ResidualPolicy, policy_spaces
-from unjam.agents.settings import PolicySettings, TRPOSettings
+from unjam.agents.buffers import (
+    MixedReplayBuffer,
+    Rows,
+    add_to_replay_buffer,
+    discounted_returns,
+    fill_rollout_buffer,
+    shifted_rewards,
+)
+from unjam.agents.divergence import Gaussians
+from unjam.agents.episodic import Episodic, Training
+from unjam.agents.policy import ResidualPolicy
+from unjam.agents.settings import PPOSettings, SACSettings, TRPOSettings
+from unjam.agents.squashed_policy import SquashedResidualPolicy, uniform_network
 from unjam.drivers.network import Network
-from unjam.scenarios.scenario import Scenario
-from unjam.traffic.record import Episode, Trajectory
 
-Collect = Callable[[Network, int], Sequence[Episode]]
-"""(policy, iteration) -> the episodes of this iteration, driven with exploration"""
-
-NEVER = 2**31
+SIZED_LATER = 2
+"""stands for the size of rollout buffer and batch until an iteration says how many rows it has"""
 
 
-@dataclass(frozen=True)
-class Iteration:
-    """What one iteration did: Algorithm 1, once around."""
+class OnPolicy(Episodic):
+    """What learners share that learn from the rows of the current policy alone."""
 
-    number: int
-    """from 1"""
-    episodes: Sequence[Episode]
-    actual_steps: int
-    """of all iterations so far"""
-    virtual_steps: int
-    """of all iterations so far"""
-    log: dict[str, float]
-    """what the learner says about its update"""
-    seconds: dict[str, float]
-    """wall time of each part"""
+    rollout_buffer: RolloutBuffer
+    gamma: float
 
+    def measure_units(self, rows: Rows) -> None:
+        """Scale the value head by the returns of actual rows."""
+        if self.training.policy.normalise_value:
+            returns = discounted_returns(rows, self.gamma)
+            policy = cast(ResidualPolicy, self.policy)
+            policy.scale_value(float(returns.mean()), float(max(returns.std(), 1e-3)))
 
-class SpacesOnly(gymnasium.Env[np.ndarray, np.ndarray]):
-    """The environment that Stable-Baselines3 asks for its spaces; nobody steps it."""
+    def gaussians(self, observations: torch.Tensor) -> Gaussians:
+        """Return mean and standard deviation of the residual."""
+        with torch.no_grad():
+            distribution = cast(ResidualPolicy, self.policy).get_distribution(observations).distribution
+        normal = cast(Normal, distribution)
+        return Gaussians(normal.mean.squeeze(1), normal.stddev.squeeze(1))
 
-    def __init__(self, observation_space: spaces.Box, action_space: spaces.Box) -> None:
-        self.observation_space = observation_space
-        self.action_space = action_space
-        self._nothing = np.zeros(observation_space.low.shape, np.float32)
-
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
-        """Return zeros: Stable-Baselines3 resets before it learns."""
-        return self._nothing, {}
+    def fill(self, rows: Rows) -> None:
+        """Put rows into the rollout buffer, in place of those before."""
+        fill_rollout_buffer(self.rollout_buffer, cast(ResidualPolicy, self.policy), rows)
 
 
-class EpisodicTRPO(TRPO):
-    """TRPO whose rollouts are whole episodes from worker processes."""
+class TRPO(OnPolicy, sb3_contrib.TRPO):
+    """Trust region policy optimisation from whole episodes."""
 
-    policy: ResidualPolicy  # pyright: ignore[reportIncompatibleVariableOverride]
-
-    def __init__(
-        self,
-        inputs: int,
-        scenario: Scenario,
-        policy: PolicySettings,
-        settings: TRPOSettings,
-        seed: int,
-        collect: Collect,
-        after_iteration: Callable[[Iteration], None],
-    ) -> None:
-        """Make the learner; `inputs` is how many numbers the policy sees."""
-        critic_inputs = len(scenario.drawn_ranges) if policy.critic_sees_road else 0
+    def __init__(self, training: Training, settings: TRPOSettings) -> None:
         super().__init__(
+            training,
             ResidualPolicy,
-            SpacesOnly(*policy_spaces(inputs, critic_inputs, policy.authority * scenario.action_limit)),
+            # SB3 drops its own eps when given arguments for the optimiser.
+            {"optimizer_kwargs": {"eps": 1e-5, "weight_decay": settings.value_l2}},
             learning_rate=settings.critic_rate,
             n_steps=settings.critic_batch,  # the buffer takes the size of the episodes, see buffers.py
             batch_size=settings.critic_batch,
@@ -88,73 +72,117 @@ class EpisodicTRPO(TRPO):
             cg_damping=settings.cg_damping,
             cg_max_steps=settings.cg_steps,
             n_critic_updates=settings.critic_epochs,
-            policy_kwargs={
-                "settings": policy,
-                "inputs": inputs,
-                "action_limit": scenario.action_limit,
-                # SB3 drops its own eps when given arguments for the optimiser.
-                "optimizer_kwargs": {"eps": 1e-5, "weight_decay": settings.value_l2},
-            },
-            seed=seed,
-            device="cpu",
         )
-        self.set_logger(Logger(None, []))
-        self.iteration = 0
-        """iterations done"""
-        self.run_seed = seed
-        self._scenario = scenario
-        self._critic_sees_road = policy.critic_sees_road
-        self._normalise_value = policy.normalise_value
-        self._collect = collect
-        self._after_iteration = after_iteration
-
-    def run(self, actual_steps: int) -> None:
-        """Learn until this many actual steps were made in all, earlier runs of this learner included."""
-        self.learn(actual_steps - self.num_timesteps, log_interval=NEVER, reset_num_timesteps=False)
-
-    def collect_rollouts(self, *arguments: Any, **named: Any) -> bool:
-        """Fill the rollout buffer with the episodes of one iteration."""
-        started = time.perf_counter()
-        self.iteration += 1
-        self._episodes = self._collect(self.policy.network(), self.iteration)
-        self.num_timesteps += sum(episode.steps for episode in self._episodes)
-        self._seconds = {"actual": time.perf_counter() - started}
-        return True
 
     def train(self) -> None:
         """Update policy and value network with the rows of this iteration."""
-        started = time.perf_counter()
-        seed_iteration(self.run_seed, self.iteration)
-        trajectories = [trajectory for episode in self._episodes for trajectory in episode.trajectories]
-        if self._normalise_value and self.iteration == 1:
-            self._scale_value(trajectories)
-        # Here the virtual environment will fit its model, imagine rollouts, and add their rows.
-        fill_rollout_buffer(self.rollout_buffer, self.policy, trajectories, self._critic_inputs())
-        super().train()
-        self._seconds["update"] = time.perf_counter() - started
-        log = {key.partition("/")[2]: float(value) for key, value in self.logger.name_to_value.items()}
-        self._after_iteration(
-            Iteration(self.iteration, self._episodes, self.num_timesteps, 0, log, self._seconds)
+        for update in self.updates():
+            self.fill(update.rows)
+            super().train()
+
+
+class PPO(OnPolicy, stable_baselines3.PPO):
+    """Proximal policy optimisation from whole episodes."""
+
+    def __init__(self, training: Training, settings: PPOSettings) -> None:
+        super().__init__(
+            training,
+            ResidualPolicy,
+            n_steps=SIZED_LATER,
+            batch_size=SIZED_LATER,
+            n_epochs=settings.epochs,
+            gamma=settings.gamma,
+            gae_lambda=settings.gae_lambda,
+            clip_range=settings.clip,
+            # SB3 clips the gradients of actor and critic together; they share no weight, and the critic's
+            # gradient, in the units of returns, would leave nothing of the actor's.
+            max_grad_norm=math.inf,
         )
+        self._minibatches = settings.minibatches
+        cast(ResidualPolicy, self.policy).set_rates(settings.actor_rate, settings.critic_rate)
 
-    def _critic_inputs(self) -> list[tuple[float, ...]]:
-        """Return, for each trajectory of the iteration, what the value network alone sees."""
-        return [
-            self._scenario.drawn_scaled(episode.drawn) if self._critic_sees_road else ()
-            for episode in self._episodes
-            for _ in episode.trajectories
-        ]
+    def train(self) -> None:
+        """Update policy and value network with the rows of this iteration."""
+        for update in self.updates():
+            rows = update.rows
+            self.fill(rows)
+            self.batch_size = math.ceil(len(rows.rewards) / self._minibatches)
+            super().train()
 
-    def _scale_value(self, trajectories: Sequence[Trajectory]) -> None:
-        returns = discounted_returns(trajectories, self.gamma)
-        self.policy.scale_value(float(returns.mean()), float(max(returns.std(), 1e-3)))
+    def _update_learning_rate(self, optimizers: Any) -> None:
+        """Leave the rates as they are: SB3 would set one for actor and critic."""
 
 
-def seed_iteration(run_seed: int, iteration: int) -> None:
-    """Seed every generator that an update uses, from the run's seed and the iteration alone.
+class SAC(Episodic, stable_baselines3.SAC):
+    """Soft actor-critic from whole episodes, and from those of earlier iterations."""
 
-    So a run that goes on from a checkpoint draws what the uninterrupted one would have drawn.
-    """
-    torch_seed, numpy_seed = np.random.SeedSequence([run_seed, iteration, 1]).generate_state(2)
-    torch.manual_seed(int(torch_seed))
-    np.random.seed(int(numpy_seed))
+    def __init__(self, training: Training, settings: SACSettings) -> None:
+        temperature = settings.temperature
+        super().__init__(
+            training,
+            SquashedResidualPolicy,
+            learning_rate=settings.rate,
+            replay_buffer_class=MixedReplayBuffer,
+            buffer_size=settings.buffer_rows,
+            learning_starts=0,  # see train
+            batch_size=settings.batch,
+            tau=settings.tau,
+            gamma=settings.gamma,
+            replay_buffer_kwargs={"handle_timeout_termination": False},  # a cut is no end in our rows
+            ent_coef=f"auto_{temperature}" if settings.learn_temperature else temperature,
+            target_entropy=settings.target_entropy,
+        )
+        self._settings = settings
+
+    @property
+    def _starting(self) -> bool:
+        return self.num_timesteps < self._settings.start_steps
+
+    def exploring_network(self) -> Network:
+        """Return the policy's twin; before the first update, what the settings say."""
+        if self._starting and self._settings.start == "uniform":
+            return uniform_network(self.training.inputs, cast(SquashedResidualPolicy, self.policy).authority)
+        return self.network()
+
+    def train(self, *arguments: Any, **named: Any) -> None:
+        """Add the rows of this iteration to the replay buffer, and update actor and critics from it."""
+        # Those of the start are made up for at its end: before it drives, the policy has seen them.
+        owed = round(self.num_timesteps * self._settings.updates_per_step) - self._n_updates
+        buffer = cast(MixedReplayBuffer, self.replay_buffer)
+        for update in self.updates():
+            if update.actual is not None:
+                self.fill(buffer, update.actual)
+            buffer.forget_virtual()
+            if update.virtual is not None:
+                self.fill(buffer.begin_virtual(len(update.virtual.rewards)), update.virtual)
+                buffer.real_ratio = 0.0 if update.actual is None else self._settings.real_ratio
+            if not self._starting:
+                steps = max(1, round(owed * update.share))
+                super().train(gradient_steps=steps, batch_size=self.batch_size)
+        buffer.forget_virtual()
+
+    @property
+    def wants_virtual(self) -> bool:
+        """Whether the start is over: before it, nothing is learned."""
+        return not self._starting
+
+    def measure_units(self, rows: Rows) -> None:
+        """Shift rewards by the mean of actual rows."""
+        if self.training.policy.normalise_value:
+            cast(SquashedResidualPolicy, self.policy).reward_offset.fill_(rows.rewards.mean())
+
+    def gaussians(self, observations: torch.Tensor) -> Gaussians:
+        """Return mean and standard deviation of the residual before the tanh."""
+        with torch.no_grad():
+            mean, log_std, _ = self.actor.get_action_dist_params(observations)
+        return Gaussians(mean.squeeze(1), log_std.squeeze(1).exp())
+
+    def fill(self, buffer: ReplayBuffer, rows: Rows) -> None:
+        """Add rows to a replay buffer, their rewards shifted and scaled."""
+        policy = cast(SquashedResidualPolicy, self.policy)
+        rewards = shifted_rewards(rows, policy.reward_offset.item(), self.gamma)
+        add_to_replay_buffer(buffer, rows, policy.authority, rewards * self._settings.reward_scale)
+
+
+LEARNERS: dict[str, Callable[[Training, Any], Episodic]] = {"trpo": TRPO, "ppo": PPO, "sac": SAC}
+"""every learner by name: made of what it learns on and its own settings"""

@@ -108,19 +108,32 @@ class ResidualPolicy(ActorCriticPolicy):
             self.register_buffer("log_std", log_std)
         self.optimizer = self.optimizer_class(self.parameters(), lr=lr_schedule(1), **self.optimizer_kwargs)  # pyright: ignore[reportCallIssue]
 
+    def set_rates(self, actor: float, critic: float) -> None:
+        """Give actor and critic learning rates of their own, in a new optimiser."""
+        groups: dict[bool, list[nn.Parameter]] = {False: [], True: []}
+        for name, parameter in self.named_parameters():
+            groups["value" in name].append(parameter)
+        self.optimizer = torch.optim.Adam(
+            [{"params": groups[False], "lr": actor}, {"params": groups[True], "lr": critic}], eps=1e-5
+        )
+
     def scale_value(self, mean: float, std: float) -> None:
         """Fix the units of the value head."""
         self.value_net.scale.copy_(torch.tensor([mean, std]))  # pyright: ignore[reportCallIssue]
 
     def network(self) -> Network:
         """Return the NumPy twin: the same residual to 1e-6, and the same exploration noise."""
-        actor = [*self.mlp_extractor.policy_net, *self.action_net]  # pyright: ignore[reportGeneralTypeIssues]
-        layers = tuple(
-            (_array(layer.weight).T.copy(), _array(layer.bias))
-            for layer in actor
-            if isinstance(layer, nn.Linear)
-        )
+        layers = network_layers(nn.Sequential(self.mlp_extractor.policy_net, self.action_net))  # pyright: ignore[reportArgumentType]
         return Network(layers, self.authority, float(torch.exp(self.log_std.detach()).item()))
+
+
+def network_layers(module: nn.Module) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
+    """Return weight and bias of each linear layer as a `Network` takes them: float64 copies, inputs first."""
+    return tuple(
+        (_array(layer.weight).T.copy(), _array(layer.bias))
+        for layer in module.modules()
+        if isinstance(layer, nn.Linear)
+    )
 
 
 def _array(tensor: torch.Tensor) -> np.ndarray:

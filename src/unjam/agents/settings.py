@@ -1,12 +1,12 @@
 """What decides how an agent learns. Free of torch, so that a wrong value is refused at once."""
 
-from typing import Annotated
+from typing import Annotated, Literal
 
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from unjam.drivers.local_state import ObservationPart
-from unjam.parameters import STRICT, Count, NotNegative, Positive
+from unjam.parameters import STRICT, Count, CountOrNone, NotNegative, Positive
 
 Discount = Annotated[float, Field(gt=0, lt=1)]
 Share = Annotated[float, Field(ge=0, le=1)]
@@ -29,28 +29,36 @@ class PolicySettings:
     exploration_std: Positive = 0.1
     """standard deviation of the exploration noise at the start, as a share of the action limit"""
     learn_exploration: bool = True
-    """whether the standard deviation is learned, or stays what it is at the start"""
-    hold: Count = 10
-    """decisions for which one residual is held: on the ring a second, over which noise adds up to a change
-    of speed instead of cancelling itself"""
+    """whether the standard deviation is learned, or stays what it is at the start (sac always learns it)"""
+    hold: NotNegative = 1.0
+    """how long one residual is held [s], rounded to whole decisions, at least one: over a second noise adds
+    up to a change of speed instead of cancelling itself"""
     critic_sees_road: bool = True
     """whether the value network also sees what the episode has drawn (the ring's length); without it, it
     takes a large gap for a longer and faster ring, and the policy learns to fall back"""
     normalise_value: bool = True
-    """scale the value network by the returns of the first iteration: one that starts at zero needs tens of
-    iterations to reach values of 150"""
+    """scale the value network by the returns of the first iteration (sac: shift by its mean reward): one that
+    starts at zero needs tens of iterations to reach values of 150"""
+
+    def decisions_held(self, decision_step: float) -> int:
+        """Return for how many decisions a residual is held where one takes `decision_step` seconds."""
+        return max(1, round(self.hold / decision_step))
 
 
 @dataclass(frozen=True, config=STRICT)
-class TRPOSettings:
-    """Trust region policy optimisation; the preset `paper` has the values of Table B5 where these differ."""
+class LearnerSettings:
+    """What every learner has."""
 
     batch_steps: Count = 12_000
     """actual steps in an iteration, rounded up to whole episodes"""
-    spread: bool = True
-    """whether the episodes of an iteration cover the range of what they draw (the ring's lengths) evenly"""
     gamma: Discount = 0.99
     """discount from one look of the network to the next"""
+
+
+@dataclass(frozen=True, config=STRICT)
+class TRPOSettings(LearnerSettings):
+    """Trust region policy optimisation; the preset `paper` has the values of Table B5 where these differ."""
+
     gae_lambda: Share = 0.97
     target_kl: Positive = 0.03
     cg_damping: Positive = 0.1
@@ -59,3 +67,47 @@ class TRPOSettings:
     critic_batch: Count = 250
     critic_rate: Positive = 1e-3
     value_l2: NotNegative = 1e-3
+
+
+@dataclass(frozen=True, config=STRICT)
+class PPOSettings(LearnerSettings):
+    """Proximal policy optimisation; its defaults are the values of Table B3, but for larger iterations."""
+
+    gae_lambda: Share = 0.97
+    clip: Annotated[float, Field(gt=0, lt=1)] = 0.2
+    """how far the ratio of new to old probability may move an update"""
+    epochs: Count = 80
+    minibatches: Count = 1
+    """parts of an iteration's rows, each a gradient step in each epoch; 1: full batches"""
+    actor_rate: Positive = 3e-4
+    critic_rate: Positive = 1e-3
+
+
+@dataclass(frozen=True, config=STRICT)
+class SACSettings(LearnerSettings):
+    """Soft actor-critic; the preset `paper` has the values of Table B4 where these differ."""
+
+    batch_steps: Count = 6_000
+    tau: Annotated[float, Field(gt=0, le=1)] = 0.005
+    """share by which the target critics move towards the critics in a gradient step"""
+    rate: Positive = 3e-4
+    temperature: Positive = 0.2
+    """weight of the policy's entropy, in units of scaled rewards"""
+    learn_temperature: bool = False
+    """whether the temperature is learned, from its start on, so that the entropy becomes `target_entropy`"""
+    target_entropy: Annotated[float, Field(lt=0.69)] = -1.0
+    """of the residual as a share of its authority: -1 is that of noise with a standard deviation of 0.09"""
+    reward_scale: Positive = 0.1
+    """factor of what is earned from one look to the next: the temperature is weighed against it"""
+    batch: Count = 256
+    updates_per_step: Positive = 0.25
+    """gradient steps per actual step, those of the start included"""
+    start_steps: CountOrNone = 10_000
+    """actual steps before the first gradient step"""
+    start: Literal["expert", "uniform"] = "expert"
+    """how these are driven: `expert`, with the little noise of `policy.exploration_std`; `uniform` residuals
+    over the whole authority"""
+    real_ratio: Share = 0.5
+    """share of actual rows in a batch, where there are virtual ones"""
+    buffer_rows: Count = 200_000
+    """newest rows, one per look, that are learned from"""

@@ -35,7 +35,8 @@ def drive(
             "--driver",
             "-d",
             help="Who drives the CAVs: a name, name:parameter=value, your own path.py:name, a run folder, or "
-            "a .unjam file. Given several times, they are compared on the same traffic.",
+            "a .unjam file; joined by + they share the CAVs. Given several times, they are compared on "
+            "the same traffic.",
         ),
     ],
     episodes: EpisodesOption = 5,

@@ -70,7 +70,7 @@ def scenarios(
 
 
 def _draw(scenario: Any, name: str, path: Path) -> None:
-    """Write a picture of the road that seed 0 draws: at the start, where vehicles come and go a minute later."""
+    """Write a picture of the road that seed 0 draws: at the start, or a minute later where vehicles come."""
     from io import BytesIO
 
     from unjam.files import check_folder, write_whole

@@ -42,7 +42,7 @@ def train(
     ] = None,
     steps: Annotated[int | None, typer.Option(min=1, help="Actual simulator steps to train for.")] = None,
     seed: Annotated[int | None, typer.Option(min=0, help="Seed of the whole run.")] = None,
-    agent: Annotated[str | None, typer.Option(help="Learner: trpo.")] = None,
+    agent: Annotated[str | None, typer.Option(help="Learner: trpo, ppo, sac.")] = None,
     expert: Annotated[
         str | None,
         typer.Option(help="Driver that the residual is added to, as in drive --driver; none: no expert."),
@@ -68,6 +68,8 @@ def train(
     Examples:
 
       unjam train ring --preset demo
+
+      unjam train ring --agent sac --steps 120000
 
       unjam train ring-jammed --expert follower-stopper --steps 500000 --seed 3
 

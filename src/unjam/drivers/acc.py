@@ -20,6 +20,7 @@ class ACC(Driver):
     """
 
     plain_numbers: ClassVar[bool] = True
+    tensors: ClassVar[bool] = True
 
     time_gap: Positive = 1.1
     """wanted gap over own speed [s]"""
@@ -51,6 +52,7 @@ class LACC(Driver):
     """
 
     plain_numbers: ClassVar[bool] = True
+    tensors: ClassVar[bool] = True
 
     gap_gain: NotNegative = 0.3
     """k_1 [1/s2]"""

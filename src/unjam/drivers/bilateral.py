@@ -19,6 +19,7 @@ class BCM(Driver):
     """
 
     plain_numbers: ClassVar[bool] = True
+    tensors: ClassVar[bool] = True
 
     gap_gain: NotNegative = 1.0
     """k_d [1/s2]"""

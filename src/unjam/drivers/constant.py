@@ -15,6 +15,7 @@ class Constant(Driver):
     """Asks for the same acceleration in every step; only the shield keeps it from the car ahead."""
 
     plain_numbers: ClassVar[bool] = True
+    tensors: ClassVar[bool] = True
 
     acceleration: float = 0.0
     """[m/s2]"""

@@ -25,6 +25,10 @@ class Driver:
     """True where `act` also takes a single CAV in plain numbers (see `single_row` for its memory): it then
     answers a float, several times faster than with arrays of one row."""
 
+    tensors: ClassVar[bool] = False
+    """True where `act` also takes torch tensors, as in the virtual environment; otherwise it is asked there
+    through NumPy, which is slower."""
+
     native: ClassVar[bool] = False
     """True where the simulator itself drives (a human driver): `act` is then not asked."""
 

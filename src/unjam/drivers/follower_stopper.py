@@ -23,6 +23,7 @@ class FollowerStopper(Driver):
     """
 
     plain_numbers: ClassVar[bool] = True
+    tensors: ClassVar[bool] = True
 
     desired_speed: Annotated[float, Field(ge=0)] | None = None
     """U [m/s]; None: mean speed of the leader over the window"""

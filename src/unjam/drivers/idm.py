@@ -22,6 +22,7 @@ class IDM(IDMParameters, Driver):
     """
 
     plain_numbers: ClassVar[bool] = True
+    tensors: ClassVar[bool] = True
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
         """Return the IDM acceleration; nothing is remembered."""
@@ -38,6 +39,7 @@ class Human(Driver):
 
     native: ClassVar[bool] = True
     plain_numbers: ClassVar[bool] = True
+    tensors: ClassVar[bool] = True
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
         """Return what the paper's IDM would do; the simulator does not ask."""

@@ -8,44 +8,87 @@ import numpy as np
 from numpy.typing import NDArray
 
 from unjam.errors import InputError
+from unjam.physics.arrays import Array, namespace
 
 Floats = NDArray[np.float64]
+
+LOG_STD_RANGE = (-20.0, 2.0)
+"""bounds of a log standard deviation that the network gives itself: those of SB3's SAC"""
 
 
 @dataclass(frozen=True, eq=False)
 class Network:
     """A perceptron with ReLU layers and a bounded output: `authority * tanh(last layer)`.
 
+    It explores with noise of `exploration_std` beside that. Where the last layer has a second output, this is
+    the log of the noise's standard deviation, and the noise is added before the tanh: `authority *
+    tanh(first output + noise)` (soft actor-critic).
+
     Weights are float64, so that n rows at once equal n single rows to 1e-12 and the trained float32
     network to 1e-6.
     """
 
     layers: tuple[tuple[Floats, Floats], ...] = field(repr=False)
-    """(weight of shape (inputs, outputs), bias of shape (outputs,)) of each layer; one output at the end"""
+    """(weight of shape (inputs, outputs), bias of shape (outputs,)) of each layer; one output at the end,
+    or two"""
     authority: float
     """largest residual acceleration [m/s2]"""
     exploration_std: float = 0.0
-    """standard deviation of the exploration noise [m/s2]"""
-    _folded: tuple[Floats, ...] = field(init=False, repr=False, compare=False)
+    """standard deviation of the exploration noise [m/s2], where the network does not give it"""
+    squashes_noise: bool = field(init=False)
+    """whether the network gives its noise's log standard deviation, and adds the noise before the tanh"""
+    _hidden: tuple[Floats, ...] = field(init=False, repr=False, compare=False)
+    _last: Floats = field(init=False, repr=False, compare=False)
+    _residual: Floats = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "_folded", _fold_biases(self.layers))
+        *hidden, last = _fold_biases(self.layers)
+        object.__setattr__(self, "squashes_noise", self.layers[-1][1].shape == (2,))
+        object.__setattr__(self, "_hidden", tuple(hidden))
+        object.__setattr__(self, "_last", last)
+        object.__setattr__(self, "_residual", np.ascontiguousarray(last[:, 0]))
 
     def __call__(self, observation: Any) -> Any:
-        """Return the residual acceleration [m/s2]: shape (n,) for (n, inputs), a float for a tuple."""
-        single = isinstance(observation, tuple)
-        if single:
-            hidden = np.array((*observation, 1.0))
-        else:
-            hidden = np.hstack([observation, np.ones((len(observation), 1))])
-        hidden = hidden.dot(self._folded[0])
-        for weight in self._folded[1:]:
-            hidden = np.maximum(hidden, 0.0, out=hidden).dot(weight)
-        return self.authority * (math.tanh(hidden) if single else np.tanh(hidden))
+        """Return the residual acceleration [m/s2]: shape (n,) for (n, inputs), a float for a tuple.
+
+        Torch tensors are answered with tensors, in their own precision and on their own device.
+        """
+        if isinstance(observation, tuple):
+            return self.authority * math.tanh(self._outputs(observation, self._residual))
+        if isinstance(observation, np.ndarray):
+            return self.authority * np.tanh(self._outputs(observation, self._residual))
+        return self.authority * self._outputs_on_tensors(observation)[:, 0].tanh()
 
     def explore(self, observation: Any, noise: Any) -> Any:
         """Return the residual with exploration; `noise` is standard normal, shaped like the residual."""
-        return self(observation) + self.exploration_std * noise
+        if not self.squashes_noise:
+            return self(observation) + self.exploration_std * noise
+        if isinstance(observation, (tuple, np.ndarray)):
+            mean, log_std = self._outputs(observation, self._last[:, :2]).T
+        else:
+            mean, log_std = self._outputs_on_tensors(observation).T
+        xp = np if isinstance(observation, tuple) else namespace(observation)
+        found = self.authority * xp.tanh(mean + xp.exp(log_std.clip(*LOG_STD_RANGE)) * noise)
+        return float(found) if isinstance(observation, tuple) else found
+
+    def _outputs_on_tensors(self, observation: Array) -> Array:
+        """Return the last layer's outputs, shape (n, outputs)."""
+        xp, hidden = namespace(observation), observation
+        for index, layer in enumerate(self.layers):
+            weight, bias = (xp.as_tensor(part, dtype=hidden.dtype, device=hidden.device) for part in layer)
+            hidden = xp.addmm(bias, hidden.relu_() if index else hidden, weight)
+        return hidden
+
+    def _outputs(self, observation: Any, last: Floats) -> Any:
+        """Return what the weights `last` make of the last hidden layer."""
+        if isinstance(observation, tuple):
+            hidden = np.array((*observation, 1.0))
+        else:
+            hidden = np.hstack([observation, np.ones((len(observation), 1))])
+        for weight in self._hidden:
+            hidden = hidden.dot(weight)
+            np.maximum(hidden, 0.0, out=hidden)
+        return hidden.dot(last)
 
     @property
     def inputs(self) -> int:
@@ -54,7 +97,7 @@ class Network:
 
 
 def _fold_biases(layers: tuple[tuple[Floats, Floats], ...]) -> tuple[Floats, ...]:
-    """Return the layers with their biases inside the weights, the last one as a vector.
+    """Return the layers with their biases inside the weights.
 
     The input and each hidden layer get one unit more, which is always 1. It saves a NumPy call a layer.
     """
@@ -64,7 +107,7 @@ def _fold_biases(layers: tuple[tuple[Floats, Floats], ...]) -> tuple[Floats, ...
         keep_one = np.zeros((len(with_bias), 1))
         keep_one[-1] = 1.0
         folded.append(np.hstack([with_bias, keep_one]))
-    return (*folded[:-1], np.ascontiguousarray(folded[-1][:, 0]))
+    return tuple(folded)
 
 
 def network_arrays(network: Network) -> dict[str, Floats]:
@@ -91,6 +134,6 @@ def network_from_arrays(arrays: dict[str, Floats], authority: float, exploration
         if not (np.isfinite(weight).all() and np.isfinite(bias).all()):
             raise InputError(f"network layer {index}: a weight is not finite")
         layers.append((np.asarray(weight, np.float64), np.asarray(bias, np.float64)))
-    if not layers or layers[-1][0].shape[1] != 1:
-        raise InputError("network: the last layer must have one output")
+    if not layers or layers[-1][0].shape[1] not in (1, 2):
+        raise InputError("network: the last layer must have one output, or two with that of its noise")
     return Network(tuple(layers), authority, exploration_std)

@@ -19,6 +19,7 @@ class OVM(Driver):
     """
 
     plain_numbers: ClassVar[bool] = True
+    tensors: ClassVar[bool] = True
 
     gap_gain: NotNegative = 1.0
     """alpha [1/s]"""

@@ -25,6 +25,7 @@ class PISaturation(Driver):
     """
 
     plain_numbers: ClassVar[bool] = True
+    tensors: ClassVar[bool] = True
 
     window: Positive = 38.0
     """time over which the own speed is averaged [s]"""

@@ -17,6 +17,7 @@ from unjam.drivers.follower_stopper import FollowerStopper
 from unjam.drivers.from_file import FileDriver, is_file_reference
 from unjam.drivers.idm import IDM, Human
 from unjam.drivers.local_state import ObservationPart
+from unjam.drivers.mixed import Mixed
 from unjam.drivers.network import network_arrays, network_from_arrays
 from unjam.drivers.ovm import OVM
 from unjam.drivers.pacer import Pacer
@@ -44,7 +45,7 @@ Recipe = dict[str, Any]
 
 def driver_names() -> str:
     """Return what `--driver` allows, for messages."""
-    return ", ".join([*DRIVERS, "path.py:name", "a run folder", "a .unjam file"])
+    return ", ".join([*DRIVERS, "path.py:name", "a run folder", "a .unjam file", "several joined by +"])
 
 
 def split_parameters(text: str) -> tuple[str, dict[str, Any]]:
@@ -118,6 +119,10 @@ def recipe_of(driver: Driver, prefix: str = "") -> tuple[Recipe, dict[str, np.nd
             "exploration_std": driver.network.exploration_std,
         }
         return recipe, {**arrays, **network}
+    if isinstance(driver, Mixed):
+        parts = [recipe_of(part, f"{prefix}{number}.") for number, part in enumerate(driver.drivers)]
+        arrays = {name: array for _, own in parts for name, array in own.items()}
+        return {"kind": "mixed", "drivers": [recipe for recipe, _ in parts]}, arrays
     if isinstance(driver, FileDriver):
         recipe = {
             "kind": "file",
@@ -141,6 +146,10 @@ def driver_from_recipe(recipe: Recipe, arrays: dict[str, np.ndarray], prefix: st
         return build(DRIVERS[recipe["name"]], recipe["parameters"], f"driver {recipe['name']}")
     if kind == "file":
         return FileDriver(Path(recipe["path"]), recipe["name"], recipe["parameters"], recipe["time_step"])
+    if kind == "mixed":
+        parts = enumerate(recipe["drivers"])
+        made = (driver_from_recipe(part, arrays, f"{prefix}{number}.") for number, part in parts)
+        return Mixed(tuple(made))
     if kind == "residual":
         expert_prefix = f"{prefix}expert."
         own = {
@@ -156,13 +165,15 @@ def driver_from_recipe(recipe: Recipe, arrays: dict[str, np.ndarray], prefix: st
             found.parts,
             found.hold,
         )
-    raise wrong("driver recipe", kind, "named, file, residual")
+    raise wrong("driver recipe", kind, "named, file, residual, mixed")
 
 
 def describe(driver: Driver) -> str:
     """Return a driver in a few words: its name and the parameters that differ from the defaults."""
     if isinstance(driver, ResidualDriver):
         return f"{describe(driver.expert)} + residual"
+    if isinstance(driver, Mixed):
+        return "+".join(map(describe, driver.drivers))
     if isinstance(driver, FileDriver):
         return ":".join([driver.path.name, driver.name, *_listed(driver.parameters)])
     recipe, _ = recipe_of(driver)

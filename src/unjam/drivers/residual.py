@@ -82,6 +82,11 @@ class ResidualDriver(Driver):
         """Whether the expert takes plain numbers."""
         return self.expert.plain_numbers
 
+    @property
+    def tensors(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Whether the expert takes tensors; the network does."""
+        return getattr(self.expert, "tensors", False)
+
     @cached_property
     def _keys(self) -> tuple[str, str]:
         """Names of the held residual and its age in the memory: others than those of an expert like this."""

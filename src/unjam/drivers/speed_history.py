@@ -1,12 +1,67 @@
 """The mean speed over a time window, as explicit memory: a sliding window for each row."""
 
 from array import array
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from unjam.physics.arrays import Array, clip, namespace
 
-Window = dict[str, Array]
+Window = dict[str, Any]
+
+SPARE_STEPS = 64
+"""a tape is never written anew more often than after so many steps"""
+
+
+@dataclass
+class _Tape:
+    """Speeds of rows, step after step; memories that follow each other share one."""
+
+    speeds: Array
+    """[m/s], shape (steps, n)"""
+    written: int
+    """steps of it that have a speed"""
+
+
+@dataclass(frozen=True)
+class PastSpeeds:
+    """A window of torch rows, oldest speed first: a stretch of a tape.
+
+    To slide it, the newest speed is written behind it on the tape. So nothing is copied and the older
+    window stays what it was, until the tape is full or its next place is taken by another memory that
+    began from the same window.
+    """
+
+    tape: _Tape
+    start: int
+    steps: int
+
+    def slide(self, speed: Array) -> tuple["PastSpeeds", Array]:
+        """Return the window moved on by one step, and the speed that it left behind, shape (n,)."""
+        tape, start = self.tape, self.start
+        if tape.written != start + self.steps or tape.written == len(tape.speeds):
+            tape, start = _new_tape(tape.speeds[start : start + self.steps]), 0
+        oldest = tape.speeds[start]
+        tape.speeds[tape.written] = speed
+        tape.written += 1
+        return PastSpeeds(tape, start + 1, self.steps), oldest
+
+
+def _new_tape(speeds: Array) -> _Tape:
+    """Return a tape that begins with `speeds`, shape (steps, n), and has room for more."""
+    steps, n = speeds.shape
+    longer = speeds.new_empty((steps + max(steps, SPARE_STEPS), n))
+    longer[:steps] = speeds
+    return _Tape(longer, steps)
+
+
+def _past_speeds(window: Array, seen: Array) -> PastSpeeds:
+    """Return the window of torch rows, shape (n, steps) as `empty_window` makes it, oldest speed first."""
+    xp = namespace(window)
+    steps = window.shape[1]
+    order = (seen[:, None] + xp.arange(steps, device=window.device)) % steps
+    return PastSpeeds(_new_tape(window.take_along_dim(order.long(), 1).T), 0, steps)
 
 
 def empty_window(n: int, window: float, time_step: float) -> Window:
@@ -21,25 +76,34 @@ def empty_window(n: int, window: float, time_step: float) -> Window:
 
 
 def slide(memory: Window, speed: Array) -> Window:
-    """Return the window moved on by one step, `speed` [m/s] of shape (n,) being the newest; new arrays."""
-    seen = memory["seen"]
+    """Return the window moved on by one step, `speed` [m/s] of shape (n,) being the newest.
+
+    The old window stays as it is; that of torch rows becomes `PastSpeeds`.
+    """
+    window, seen = memory["window"], memory["seen"]
     if type(speed) is float:
-        window = memory["window"][:]
+        window = window[:]
         place = int(seen) % len(window)
         oldest = window[place]
-    else:
-        xp = namespace(speed)
-        window = xp.asarray(memory["window"], copy=True)
-        place = (xp.arange(len(window)), xp.asarray(seen % window.shape[1], dtype=xp.int64))
+        window[place] = speed
+    elif isinstance(speed, np.ndarray):
+        window = window.copy()
+        place = (np.arange(len(window)), (seen % window.shape[1]).astype(np.int64))
         oldest = window[place]
-    window[place] = speed
+        window[place] = speed
+    else:
+        past = window if isinstance(window, PastSpeeds) else _past_speeds(window, seen)
+        window, oldest = past.slide(speed)
     return {"window": window, "total": memory["total"] + speed - oldest, "seen": seen + 1.0}
 
 
 def mean_speed(memory: Window) -> Array:
     """Return the mean of what was seen [m/s], shape (n,); zero where nothing was."""
     window = memory["window"]
-    steps = len(window) if isinstance(window, array) else window.shape[-1]
+    if isinstance(window, PastSpeeds):
+        steps = window.steps
+    else:
+        steps = len(window) if isinstance(window, array) else window.shape[-1]
     return memory["total"] / clip(memory["seen"], 1.0, float(steps))
 
 

@@ -9,7 +9,7 @@ import tomli_w
 from pydantic import Field, field_validator, model_validator
 from pydantic.dataclasses import dataclass
 
-from unjam.agents.settings import PolicySettings, TRPOSettings
+from unjam.agents.settings import LearnerSettings, PolicySettings, PPOSettings, SACSettings, TRPOSettings
 from unjam.drivers.constant import Constant
 from unjam.drivers.driver import Driver
 from unjam.errors import InputError, wrong_name
@@ -17,6 +17,7 @@ from unjam.experiments.presets import PRESETS
 from unjam.parameters import STRICT, Count, CountOrNone, build
 from unjam.scenarios.registry import make_scenario
 from unjam.scenarios.scenario import Scenario
+from unjam.virtual.settings import VirtualSettings
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -40,7 +41,8 @@ class RunConfig:
     scenario: str = "ring"
     road: dict[str, Any] = field(default_factory=dict)
     """changes to the scenario's parameters"""
-    agent: Literal["trpo"] = "trpo"
+    agent: Literal["trpo", "ppo", "sac"] = "trpo"
+    """who learns; its settings are in the table of its name"""
     expert: str = "pi"
     """driver that the residual is added to: a name, `path.py:name`, a run folder, a .unjam file; `none`:
     the network drives alone"""
@@ -51,8 +53,15 @@ class RunConfig:
     seed: Annotated[int, Field(ge=0, lt=1_000_000)] = 0
     """of the whole run; numbers from a million on are those of the episodes that judge"""
     workers: Count = 2
+    spread: bool = True
+    """whether the episodes of an iteration, and of a validation, cover the range of what they draw (the
+    ring's lengths) evenly"""
     policy: PolicySettings = field(default_factory=PolicySettings)
     trpo: TRPOSettings = field(default_factory=TRPOSettings)
+    ppo: PPOSettings = field(default_factory=PPOSettings)
+    sac: SACSettings = field(default_factory=SACSettings)
+    virtual: VirtualSettings = field(default_factory=VirtualSettings)
+    """the virtual environment, in which the agent learns between actual episodes"""
     evaluation: EvaluationSettings = field(default_factory=EvaluationSettings)
     preset: str = ""
     """which preset this started from, for the record"""
@@ -67,6 +76,11 @@ class RunConfig:
     def _possible(self) -> "RunConfig":
         self.make_scenario()
         return self
+
+    @property
+    def learner(self) -> LearnerSettings:
+        """The settings of the learner that was chosen."""
+        return getattr(self, self.agent)
 
     def make_scenario(self) -> Scenario:
         """Return the scenario with its changes."""

@@ -3,18 +3,38 @@
 from typing import Any
 
 PRESETS: dict[str, dict[str, Any]] = {
-    # What the paper says, where it says something: Tables B2 and B5, section 4.1.
+    # What the paper says, where it says something: Tables B2 to B5, section 4.1.
     "paper": {
         "expert": "pi:time_constant=0",
         "steps": 4_000_000,
+        "spread": False,
         "policy": {
             "observe": ["local"],
             "exploration_std": 1.0,
-            "hold": 1,
+            "hold": 0,
             "critic_sees_road": False,
             "normalise_value": False,
         },
-        "trpo": {"batch_steps": 6000, "spread": False, "gamma": 0.995, "target_kl": 0.01},
+        "trpo": {"batch_steps": 6000, "gamma": 0.995, "target_kl": 0.01},
+        "ppo": {
+            "batch_steps": 6000,
+            "gamma": 0.99,
+            "clip": 0.2,
+            "epochs": 80,
+            "actor_rate": 3e-4,
+            "critic_rate": 1e-3,
+        },
+        "sac": {
+            "gamma": 0.99,
+            "tau": 5e-3,
+            "rate": 3e-4,
+            "temperature": 0.2,
+            "learn_temperature": False,
+            "reward_scale": 1.0,
+            "batch": 256,
+            "start_steps": 10_000,
+            "start": "uniform",
+        },
     },
     # Ends within about five minutes on two cores, evaluation included.
     "demo": {"steps": 960_000},

@@ -7,7 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from unjam.agents.algorithms import EpisodicTRPO, Iteration
+from unjam.agents.algorithms import LEARNERS
+from unjam.agents.episodic import Iteration, Training
+from unjam.agents.imagination import Imagination
 from unjam.agents.state import learner_state, restore_learner
 from unjam.controller import controller_bytes
 from unjam.drivers.driver import Driver
@@ -42,15 +44,21 @@ class Run:
         self._validation_best = -np.inf
         self._expert_return = float("nan")
         settings = config.policy
-        self.learner = EpisodicTRPO(
+        imagination = None
+        if config.virtual.virtual_ratio > 0:
+            imagination = Imagination(
+                config.virtual, self.scenario, config.reward, self.expert, settings, config.seed
+            )
+        training = Training(
             observation_size(settings.observe, self.expert),
             self.scenario,
             settings,
-            config.trpo,
             config.seed,
             self._collect,
             self._after_iteration,
+            imagination,
         )
+        self.learner = LEARNERS[config.agent](training, config.learner)
         checkpoint = load_checkpoint(folder / "checkpoint")
         if checkpoint is not None:
             state, tensors = checkpoint
@@ -63,20 +71,20 @@ class Run:
         """Learn until the configured number of actual steps; a stop loses at most the running iteration."""
         if self.learner.iteration == 0:
             self._expert_return = self._validate(self.expert)
-            self._keep_controller(self.learner.policy.network())
+            self._keep_controller(self.learner.network())
             self._validation_best = self._expert_return
         if self.learner.num_timesteps < self.config.steps:
             self.learner.run(self.config.steps)
 
     def driver(self, network: Network) -> ResidualDriver:
         """Return the full policy: the expert plus this residual."""
-        policy = self.config.policy
-        return ResidualDriver(self.expert, network, self.scenario.action_limit, policy.observe, policy.hold)
+        policy, limit = self.config.policy, self.scenario.action_limit
+        hold = policy.decisions_held(self.scenario.decision_step)
+        return ResidualDriver(self.expert, network, limit, policy.observe, hold)
 
     def _collect(self, network: Network, iteration: int) -> Sequence[Episode]:
-        driver, steps = self.driver(network), self.config.trpo.batch_steps
-        count = -(-steps // self.scenario.horizon)
-        return self._run_spread(driver, count, (self.config.seed, iteration), explore=True)
+        count = -(-self.config.learner.batch_steps // self.scenario.horizon)
+        return self._run_spread(self.driver(network), count, (self.config.seed, iteration), explore=True)
 
     def _validate(self, driver: Driver) -> float:
         episodes = self._run_spread(driver, self.config.evaluation.validation_episodes, (VALIDATION,))
@@ -86,7 +94,7 @@ class Run:
         self, driver: Driver, count: int, seed: tuple[int, ...], explore: bool = False
     ) -> list[Episode]:
         """Run `count` episodes that cover the range of what the scenario draws; raise where one failed."""
-        scenario, spread = self.scenario, self.config.trpo.spread
+        scenario, spread = self.scenario, self.config.spread
         episodes = self.workers.run(
             [
                 EpisodeTask(
@@ -108,13 +116,13 @@ class Run:
         validation, every = None, self.config.evaluation.every
         last = iteration.actual_steps >= self.config.steps
         if every and (iteration.number % every == 0 or last):
-            network = self.learner.policy.network()
+            network = self.learner.network()
             validation = self._validate(self.driver(network))
             if validation > self._validation_best:
                 self._validation_best = validation
                 self._keep_controller(network)
         elif not every and last:
-            self._keep_controller(self.learner.policy.network())
+            self._keep_controller(self.learner.network())
         seconds = {**iteration.seconds, "validation": time.perf_counter() - started}
         row = self._row(iteration, validation, seconds)
         append_line(self.folder / "progress.jsonl", to_json(row))
@@ -140,8 +148,8 @@ class Run:
             "iteration": iteration.number,
             "actual_steps": iteration.actual_steps,
             "virtual_steps": iteration.virtual_steps,
-            "k_star": None,  # no virtual environment yet
-            "eps_m": None,
+            "k_star": iteration.virtual.get("k_star"),
+            "eps_m": iteration.virtual.get("eps_m"),
             "return_mean": mean("return"),
             "return_expert": self._expert_return,
             "return_validation": validation,
@@ -151,6 +159,7 @@ class Run:
             "shield_override_share": mean("shield_override_share"),
             "collisions": sum(row["collisions"] for row in measured),
             "learner": iteration.log,
+            "virtual": iteration.virtual,
             "seconds": seconds,
         }
 

@@ -30,7 +30,7 @@ TRACI_STEPS = 200
 SIZES = {22: 3000, 220: 800, 2200: 200}
 """vehicles on the ring, one CAV in 22, and decisions driven"""
 METRES_PER_VEHICLE = 245 / 22
-OTHER_ROADS = ("figure-eight",)
+OTHER_ROADS = ("figure-eight", "merge")
 """roads beside the ring on which `run_episode` is compared with SUMO alone"""
 
 
@@ -67,7 +67,8 @@ def measure_speed(rounds: int = ROUNDS, told: Callable[[str], None] | None = Non
 
 
 def _measure(rounds: int, say: Callable[[str], None]) -> dict[str, Any]:
-    ring, driver = SCENARIOS["ring"], neural_driver(PolicySettings().hold)
+    ring = SCENARIOS["ring"]
+    driver = neural_driver(PolicySettings().decisions_held(ring.decision_step))
     every_step = neural_driver(1)
     found: dict[str, list[float]] = {"bare": [], "episode": [], "every_step": [], "loop": [], "traci": []}
     others: dict[str, dict[str, list[float]]] = {name: {"bare": [], "episode": []} for name in OTHER_ROADS}
@@ -86,7 +87,8 @@ def _measure(rounds: int, say: Callable[[str], None]) -> dict[str, Any]:
             for name, rates in others.items():
                 road = SCENARIOS[name]
                 make_traffic(road, (number,), simulation)
-                rates["bare"].append(_rate(partial(_step, simulation, road.horizon), road.horizon))
+                steps = road.horizon * road.steps_per_decision
+                rates["bare"].append(_rate(partial(_step, simulation, steps), road.horizon))
                 run = partial(run_episode, road, driver, (number,), explore=True, simulation=simulation)
                 rates["episode"].append(_rate(run, road.horizon))
         with Simulation("traci") as simulation:

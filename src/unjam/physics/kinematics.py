@@ -21,6 +21,15 @@ def next_position(position: Array, new_speed: Array, time_step: float) -> Array:
     return position + new_speed * time_step
 
 
+def distance_driven(speed: Array, new_speed: Array, time_step: float, steps: int) -> Array:
+    """Return how far a vehicle gets in `steps` steps in which its speed changes evenly to `new_speed`.
+
+    Each step is the Euler step of `next_position`, so that one step gives v' dt.
+    Shapes: any, broadcast together. Units: m/s, s; the answer in m.
+    """
+    return time_step * (steps * speed + (steps + 1) / 2 * (new_speed - speed))
+
+
 def gap_on_loop(position: Array, leader_position: Array, loop_length: float, leader_length: float) -> Array:
     """Return the bumper-to-bumper gap to the leader on a closed road.
 

@@ -1,0 +1,1 @@
+"""The virtual environment: IDM plus residual networks, in which the policy learns between actual episodes."""

@@ -1,0 +1,101 @@
+"""What is known before anything is learned: physics, how people follow, and what a reward is made of."""
+
+from collections.abc import Callable
+from dataclasses import asdict
+from math import nan
+
+from unjam.drivers.acc import ACC
+from unjam.drivers.driver import Driver
+from unjam.drivers.idm import IDM
+from unjam.drivers.local_state import LARGEST_GAP, LocalState
+from unjam.drivers.ovm import OVM
+from unjam.physics.arrays import Array, as_column, namespace, stack_columns
+from unjam.physics.kinematics import next_position, next_speed
+from unjam.scenarios.scenario import Scenario
+from unjam.traffic.reward import Outcome, Reward, time_headway
+
+BASES: dict[str, Callable[[Scenario], Driver] | None] = {
+    "idm": lambda scenario: IDM(**asdict(scenario.humans)),
+    "acc": lambda scenario: ACC(set_speed=scenario.humans.desired_speed),
+    "ovm": lambda scenario: OVM(largest_speed=scenario.humans.desired_speed),
+    "none": None,
+}
+"""Who is taken to drive behind the CAV, a driver without memory; None: nothing is known."""
+
+
+def largest_gap(state: LocalState) -> Array:
+    """Return the largest gap that there can be [m], shape (n,): on a closed road its length."""
+    xp = namespace(state.speed)
+    return xp.where(xp.isnan(state.loop_length), LARGEST_GAP, state.loop_length)
+
+
+def absent(state: LocalState) -> tuple[Array, Array]:
+    """Return whether nobody is ahead, and whether nobody is behind, each of shape (n,)."""
+    largest = largest_gap(state)
+    return state.leader_gap >= largest, state.follower_gap >= largest
+
+
+def base_step(base: str, scenario: Scenario, state: LocalState, applied: Array) -> LocalState:
+    """Return the state after one decision as the base model has it; Eq. 2 of the paper.
+
+    The CAV moves by its acceleration and the follower by the base's car-following model; the leader, whose
+    own leader is not seen, keeps its speed. All take `scenario.steps_per_decision` Euler steps, as SUMO
+    moves them. Where nobody is ahead (behind), nobody will be. The base `none` expects no change.
+
+    Args:
+        base: a name in BASES.
+        scenario: whose steps and people these are.
+        state: n rows.
+        applied: the acceleration that was commanded, within the action limit [m/s2], shape (n,).
+
+    Returns:
+        The state, its place on the route as before.
+    """
+    make = BASES[base]
+    if make is None:
+        return state
+    xp, step, behind = namespace(state.speed), scenario.simulation_step, make(scenario)
+    speed, follower_speed = state.speed, state.follower_speed
+    leader_gap, follower_gap = state.leader_gap, state.follower_gap
+    for _ in range(scenario.steps_per_decision):
+        seen = state._replace(speed=follower_speed, leader_speed=speed, leader_gap=follower_gap)
+        following, _ = behind.act(seen, {})
+        speed = next_speed(speed, applied, step)
+        follower_speed = next_speed(follower_speed, following, step)
+        leader_gap = next_position(leader_gap, state.leader_speed - speed, step)
+        follower_gap = next_position(follower_gap, speed - follower_speed, step)
+    nobody_ahead, nobody_behind = absent(state)
+    return state._replace(
+        speed=speed,
+        leader_speed=xp.where(nobody_ahead, speed, state.leader_speed),
+        leader_gap=xp.where(nobody_ahead, state.leader_gap, leader_gap),
+        follower_speed=xp.where(nobody_behind, speed, follower_speed),
+        follower_gap=xp.where(nobody_behind, state.follower_gap, follower_gap),
+    )
+
+
+def base_reward(base: str, reward: Reward, following: LocalState, applied: Array, crashed: Array) -> Array:
+    """Return the reward of a decision as far as the next state tells it, shape (n,).
+
+    The mean speed of all vehicles is approximated by that of the three that are seen. The base `none`
+    knows nothing of it.
+
+    Args:
+        base: a name in BASES.
+        reward: of the road.
+        following: the next state, n rows.
+        applied: the acceleration that was commanded [m/s2], shape (n,).
+        crashed: whether the decision ended in a collision, shape (n,).
+    """
+    if BASES[base] is None:
+        return applied * 0.0
+    xp = namespace(applied)
+    nobody_ahead, nobody_behind = absent(following)
+    speeds = (
+        following.speed,
+        xp.where(nobody_ahead, nan, following.leader_speed),
+        xp.where(nobody_behind, nan, following.follower_speed),
+    )
+    headway = time_headway(following.leader_gap, following.speed)
+    outcome = Outcome(stack_columns(speeds), as_column(applied), as_column(headway), crashed)
+    return sum(reward(outcome).values())

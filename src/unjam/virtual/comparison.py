@@ -1,0 +1,120 @@
+"""Virtual beside actual: the same accelerations from the same start, and the same policy in the loop."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from unjam.drivers.constant import Constant
+from unjam.drivers.local_state import LocalState
+from unjam.drivers.residual import ResidualDriver
+from unjam.scenarios.scenario import Scenario
+from unjam.traffic.record import Floats
+from unjam.virtual.data import ActualData
+from unjam.virtual.model import NUMBERS, EnvironmentModel, torch_generator
+from unjam.virtual.rollout import begin, imagine
+from unjam.virtual.world import VirtualWorld, World
+
+
+class OpenLoop(NamedTuple):
+    """Virtual against actual states under the same accelerations; H decisions."""
+
+    error: dict[str, Floats]
+    """root mean square of the error of a member, by number of the state [m/s, m], shape (H,)"""
+    spread: dict[str, Floats]
+    """standard deviation of the members about their mean [m/s, m], shape (H,); zero for one member"""
+    change: dict[str, Floats]
+    """root mean square of what happened: how far the actual state is from its start, shape (H,)"""
+
+
+@torch.no_grad()
+def open_loop(
+    model: EnvironmentModel, data: ActualData, looks: NDArray[np.int64], decisions: int, scenario: Scenario
+) -> OpenLoop:
+    """Replay recorded accelerations in the virtual environment, without noise, each member by itself.
+
+    Args:
+        model: fitted, or new: then it is the base alone.
+        data: actual data.
+        looks: where to begin, rows (recording, decision); at least `decisions` recorded ones must follow.
+        decisions: H.
+        scenario: the road.
+    """
+    device = model.input_mean.device
+    starts = begin(data, looks, Constant(), device)
+    members = torch.arange(model.members, device=device)
+    generator = torch_generator((0,), device)  # nothing is drawn from it
+    world = VirtualWorld(model, scenario, "", generator, noise=False, members=members)
+    state = LocalState(*(values.repeat(model.members) for values in starts.state))
+    drawn = starts.drawn.repeat(model.members, 1)
+    recordings = [data.recordings[place] for place in looks[:, 0]]
+    windows = [slice(at, at + decisions + 1) for at in looks[:, 1]]
+    applied = np.stack([r.applied[at][:decisions] for r, at in zip(recordings, windows, strict=True)])
+    actual = {
+        name: np.stack([getattr(r.states, name)[at] for r, at in zip(recordings, windows, strict=True)])
+        for name in NUMBERS
+    }
+    found: dict[str, list[Floats]] = {name: [] for name in NUMBERS}
+    for column in torch.as_tensor(applied.T, dtype=torch.float32, device=device):
+        state = world.step(state, column.repeat(model.members), drawn).state
+        for name in NUMBERS:
+            found[name].append(getattr(state, name).view(model.members, -1).cpu().numpy())
+    error, spread, change = {}, {}, {}
+    for name in NUMBERS:
+        virtual = np.stack(found[name], -1)  # (members, rows, H)
+        error[name] = np.sqrt(np.square(virtual - actual[name][:, 1:]).mean((0, 1)))
+        spread[name] = np.sqrt(virtual.var(0).mean(0))
+        change[name] = np.sqrt(np.square(actual[name][:, 1:] - actual[name][:, :1]).mean(0))
+    return OpenLoop(error, spread, change)
+
+
+class ReturnGap(NamedTuple):
+    """Mean return of virtual rollouts beside the actual one of the same rows, over as many decisions."""
+
+    virtual: float
+    actual: float
+    difference: float
+    """virtual less actual"""
+    standard_error: float
+    """of the difference, rows taken as independent"""
+    decisions: int
+
+
+def return_gap(
+    driver: ResidualDriver,
+    world: World,
+    data: ActualData,
+    looks: NDArray[np.int64],
+    decisions: int,
+    seed: Sequence[int],
+    device: torch.device | str = "cpu",
+) -> ReturnGap:
+    """Drive from actual rows in the virtual environment, and compare with what was earned there.
+
+    The comparison is fair where `driver` is who drove the recordings, with exploration. Returns are sums of
+    the rewards, not discounted, until the last decision or a crash.
+
+    Args:
+        driver: the full policy.
+        world: the virtual environment.
+        data: actual data.
+        looks: where to begin, rows (recording, decision); at least `decisions` recorded ones must follow.
+        decisions: rounded down to whole looks of the policy.
+        seed: of the exploration noise.
+        device: where the world is.
+    """
+    starts = begin(data, looks, driver.expert, device)
+    rollouts = imagine(driver, world, starts, decisions, torch_generator(seed, device))
+    driven = decisions // driver.hold * driver.hold
+    virtual = rollouts.rewards.sum(1).double().cpu().numpy()
+    actual = np.array([data.recordings[place].reward[at : at + driven].sum() for place, at in looks])
+    difference = virtual - actual
+    return ReturnGap(
+        virtual=float(virtual.mean()),
+        actual=float(actual.mean()),
+        difference=float(difference.mean()),
+        standard_error=float(difference.std() / np.sqrt(len(difference))),
+        decisions=driven,
+    )

@@ -1,0 +1,191 @@
+"""Fitting the virtual environment to actual data, and how wrong it is afterwards: eps_m of Eq. 15."""
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from unjam.errors import UnjamError
+from unjam.scenarios.scenario import Scenario
+from unjam.traffic.record import Floats
+from unjam.traffic.reward import make_reward
+from unjam.virtual.base import base_reward, base_step
+from unjam.virtual.data import Transitions
+from unjam.virtual.model import NOISE_ROWS, NUMBERS, TARGETS, EnvironmentModel
+from unjam.virtual.model_error import SMALLEST_CHANGE, OneStep, one_step, total_variation, unexplained
+from unjam.virtual.settings import VirtualSettings
+
+
+@dataclass(frozen=True)
+class Fit:
+    """What came of a fit."""
+
+    errors: dict[str, float]
+    """the model error eps_m by estimator
+
+    `unexplained`: mean square of the holdout error over the variance of the change, mean of the five numbers
+    of the state. `total_variation`: between the distributions of the next state of a random member and of
+    the ensemble's mean, erf(d / (2 sqrt 2)), averaged over the holdout, where d is how far a member is from
+    the mean over the standard deviation of the noise; NaN with a single member. `released`: mean square
+    of the training error in the last pass, in units of the targets' standard deviation, as in the authors'
+    code.
+    """
+    one_step: dict[str, OneStep]
+    """by name of TARGETS"""
+    learned: tuple[str, ...]
+    """what the networks predict better than the base; of the rest the base is used alone"""
+    rows: int
+    """that each network learned from"""
+    held_out: int
+    """rows that none learned from"""
+    epochs: int
+    """passes over the rows"""
+
+
+def fit(
+    model: EnvironmentModel,
+    actual: Transitions,
+    settings: VirtualSettings,
+    scenario: Scenario,
+    reward: str,
+    seed: Sequence[int],
+) -> Fit:
+    """Fit `model`, going on from what it is, to what the base leaves of the actual data.
+
+    Every network learns from rows of its own, drawn with replacement once in a fit, and ends with the
+    weights that were best on the holdout. The result depends on the arguments alone.
+
+    Raises:
+        UnjamError: a loss is not finite.
+    """
+    generator = np.random.default_rng(np.random.SeedSequence(list(seed)))
+    device = model.input_mean.device
+    inputs = torch.as_tensor(inputs_of(actual)).to(device)
+    targets = torch.as_tensor(targets_of(actual, model.base, scenario, reward)).to(device)
+    training = _some(~actual.held_out, settings.fit_rows, generator)
+    holdout = _some(actual.held_out, max(1, round(settings.fit_rows * settings.holdout)), generator)
+    model.normalise(inputs[training], targets[training], SMALLEST_CHANGE)
+    model.reward_range.copy_(torch.stack([targets[:, -1].min(), targets[:, -1].max()]))
+
+    bootstrap = training[generator.integers(len(training), size=(model.members, len(training)))]
+    last_loss, epochs = _descend(
+        model,
+        (_seen(model, inputs[bootstrap]), _wanted(model, targets[bootstrap])),
+        (_seen(model, inputs[holdout]), _wanted(model, targets[holdout])),
+        settings,
+        generator,
+    )
+
+    wanted, predicted = targets[holdout].cpu().numpy(), _predicted(model, inputs[holdout])
+    learned = np.square(wanted - predicted).mean((0, 1)) < np.square(wanted).mean(0)
+    predicted = predicted * learned  # where the base is better, it is used alone
+    left = wanted - predicted.mean(0)
+    noise = left[generator.integers(len(left), size=NOISE_ROWS)] - left.mean(0)
+    model.learned.copy_(torch.as_tensor(learned))
+    model.noise.copy_(torch.as_tensor(noise))
+
+    changed = [getattr(actual.following, name) - getattr(actual.states, name) for name in NUMBERS]
+    changed = np.column_stack([*changed, actual.reward])[holdout]
+    steps = {
+        name: one_step(wanted[:, i], predicted[:, :, i], changed[:, i]) for i, name in enumerate(TARGETS)
+    }
+    errors = {
+        "unexplained": unexplained([steps[name] for name in NUMBERS]),
+        "total_variation": total_variation(predicted[:, :, :-1], left[:, :-1].std(0)),
+        "released": last_loss,
+    }
+    names = tuple(itertools.compress(TARGETS, learned))
+    return Fit(errors, steps, names, len(training), len(holdout), epochs)
+
+
+def inputs_of(actual: Transitions) -> Floats:
+    """Return what the networks see of actual decisions, as `model_inputs` does of virtual ones."""
+    numbers = [getattr(actual.states, name) for name in NUMBERS]
+    return np.column_stack([*numbers, actual.applied, actual.drawn])
+
+
+def targets_of(actual: Transitions, base: str, scenario: Scenario, reward: str) -> Floats:
+    """Return by how much what happened differs from what the base says, shape (rows, 6), SI units."""
+    known = base_step(base, scenario, actual.states, actual.applied)
+    earned = make_reward(reward or scenario.reward)
+    known_reward = base_reward(base, earned, actual.following, actual.applied, actual.crashed)
+    left = [getattr(actual.following, name) - getattr(known, name) for name in NUMBERS]
+    return np.column_stack([*left, actual.reward - known_reward])
+
+
+def _some(chosen: NDArray[np.bool_], most: int, generator: np.random.Generator) -> NDArray[np.int64]:
+    """Return the indices of at most so many of the chosen rows."""
+    rows = np.flatnonzero(chosen)
+    return generator.permutation(rows)[:most]
+
+
+def _seen(model: EnvironmentModel, inputs: Tensor) -> Tensor:
+    """Return inputs in SI units as the networks take them."""
+    return ((inputs - model.input_mean) / model.input_scale).float()
+
+
+def _wanted(model: EnvironmentModel, targets: Tensor) -> Tensor:
+    """Return targets in SI units as the networks are to answer them."""
+    return ((targets - model.target_mean) / model.target_scale).float()
+
+
+@torch.no_grad()
+def _predicted(model: EnvironmentModel, inputs: Tensor) -> Floats:
+    """Return what each member answers to the same rows, SI units, shape (members, rows, 6)."""
+    answers = _answers(model, _seen(model, inputs)) * model.target_scale + model.target_mean
+    return answers.double().cpu().numpy()
+
+
+def _descend(
+    model: EnvironmentModel,
+    training: tuple[Tensor, Tensor],
+    holdout: tuple[Tensor, Tensor],
+    settings: VirtualSettings,
+    generator: np.random.Generator,
+) -> tuple[float, int]:
+    """Train until the holdout does not improve; return the last training loss and the passes made."""
+    seen, wanted = training
+    device, rows = seen.device, seen.shape[1]
+    parameters = [*model.weights, *model.biases]
+    optimizer = torch.optim.Adam(parameters, lr=settings.rate, fused=True)
+    best = [parameter.detach().clone() for parameter in parameters]
+    best_loss, waited, passes, last_loss = _losses(model, *holdout), 0, 0, float("nan")
+    while passes < settings.epochs and waited < settings.patience:
+        order = torch.as_tensor(generator.permutation(rows)).to(device)
+        total = torch.zeros((), device=device)
+        for batch in order.split(settings.batch):
+            loss = (model(seen[:, batch]) - wanted[:, batch]).square().mean((1, 2)).sum()
+            optimizer.zero_grad()
+            loss.backward()
+            optimizer.step()
+            total += loss.detach() * len(batch)
+        passes += 1
+        last_loss = total.item() / (rows * model.members)
+        found = _losses(model, *holdout)
+        if not (np.isfinite(last_loss) and found.isfinite().all()):
+            raise UnjamError(f"virtual environment: the loss in pass {passes} of its fit is not finite")
+        better = found < best_loss
+        best_loss = torch.where(better, found, best_loss)
+        waited = 0 if better.any() else waited + 1
+        for kept, parameter in zip(best, parameters, strict=True):
+            kept.copy_(torch.where(better[:, None, None], parameter.detach(), kept))
+    with torch.no_grad():
+        for kept, parameter in zip(best, parameters, strict=True):
+            parameter.copy_(kept)
+    return last_loss, passes
+
+
+@torch.no_grad()
+def _losses(model: EnvironmentModel, seen: Tensor, wanted: Tensor) -> Tensor:
+    """Return each member's mean squared error, shape (members,)."""
+    return (_answers(model, seen) - wanted).square().mean((1, 2))
+
+
+@torch.no_grad()
+def _answers(model: EnvironmentModel, seen: Tensor) -> Tensor:
+    """Return what every member answers to the same rows, shape (members, rows, 6)."""
+    return model(seen.expand(model.members, -1, -1))

@@ -1,0 +1,60 @@
+"""What decides how the virtual environment learns and how far it is trusted. Free of torch."""
+
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+from pydantic.dataclasses import dataclass
+
+from unjam.parameters import STRICT, Count, CountOrNone, NotNegative, Positive
+
+BaseName = Literal["idm", "acc", "ovm", "none"]
+ErrorName = Literal["unexplained", "total_variation", "released"]
+
+
+@dataclass(frozen=True, config=STRICT)
+class VirtualSettings:
+    """The virtual environment: its model, how it is fitted, and the length of its rollouts."""
+
+    base: BaseName = "idm"
+    """what is known before learning: how the follower drives; `none`: nothing, all is learned"""
+    members: Count = 5
+    """networks in the ensemble"""
+    hidden: Annotated[tuple[Count, ...], Field(min_length=1)] = (64, 64)
+    """units of the hidden layers of each network"""
+    rows: Count = 100_000
+    """actual decisions that are kept, the newest, rounded up to whole episodes"""
+    fit_rows: Count = 20_000
+    """at most so many of them are drawn for each fit: neighbouring rows, 0.1 s apart, hardly differ"""
+    holdout: Annotated[float, Field(gt=0, lt=1)] = 0.2
+    """share of the episodes that no network learns from"""
+    epochs: Count = 12
+    """most passes over the rows in a fit, which goes on from the fit before"""
+    patience: Count = 3
+    """passes without progress on the holdout after which a fit ends"""
+    rate: Positive = 3e-3
+    """learning rate of Adam"""
+    batch: Count = 512
+    """rows of each network in a gradient step"""
+    noise: bool = True
+    """whether virtual steps are as noisy as the model's errors on the holdout, or the mean of each network"""
+    k_max: CountOrNone = 500
+    """longest rollout [decisions]"""
+    kappa: Positive = 2.0
+    """rollout length times model error, Eq. 15"""
+    error: ErrorName = "unexplained"
+    """estimator of the model error eps_m that sets the rollout length, see unjam.virtual.fitting"""
+    virtual_ratio: NotNegative = 1.0
+    """virtual decisions for each actual one that the agent learns from; 0: model-free"""
+    update: Literal["union", "sequential"] = "union"
+    """how the agent learns from both: from all of them at once; or first from the actual ones, then `updates`
+    times from virtual ones alone, each time with those of the newest policy, as the released code"""
+    updates: Count = 5
+    """updates on virtual rows of `sequential`"""
+    device: Literal["cpu", "cuda"] = "cpu"
+    """where the virtual environment runs"""
+
+    @model_validator(mode="after")
+    def _can_be_estimated(self) -> "VirtualSettings":
+        if self.error == "total_variation" and self.members < 2:
+            raise ValueError(f"members: {self.members} is not allowed with total_variation; allowed: >= 2")
+        return self

@@ -1,0 +1,148 @@
+"""The virtual environment itself: thousands of rows stepped at once, free of the simulator."""
+
+from typing import NamedTuple, Protocol
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from unjam.drivers.from_file import is_file_reference
+from unjam.drivers.local_state import LocalState
+from unjam.physics.kinematics import distance_driven
+from unjam.scenarios.scenario import Scenario
+from unjam.traffic.reward import Outcome, Reward, make_reward
+from unjam.virtual.base import base_reward, base_step, largest_gap
+from unjam.virtual.model import (
+    NOISE_ROWS,
+    NUMBERS,
+    SPEEDS,
+    EnvironmentModel,
+    model_inputs,
+    predict,
+    random_members,
+)
+
+GAP_ROWS = slice(len(SPEEDS), len(NUMBERS))
+"""where the gaps are among NUMBERS"""
+BOUNDS = ("speed", "gap", "reward")
+"""what is kept within physical bounds"""
+
+
+class Step(NamedTuple):
+    """What a virtual decision led to; n rows of torch tensors."""
+
+    state: LocalState
+    reward: Tensor
+    crashed: Tensor
+    """whether the gap ahead or behind was used up, shape (n,)"""
+    bounded: Tensor
+    """which of BOUNDS had to be enforced, shape (3, n)"""
+
+
+class World(Protocol):
+    """What a policy can drive in, row by row."""
+
+    def step(self, state: LocalState, applied: Tensor, drawn: Tensor) -> Step:
+        """Return what `applied` [m/s2], shape (n,), leads to; `drawn`, (n, m), is what the episode drew."""
+        ...
+
+
+def reward_on_tensors(text: str) -> Reward:
+    """Return the reward for a name or for `path.py:name`; a user's function is asked through NumPy."""
+    reward = make_reward(text)
+    if not is_file_reference(text):
+        return reward
+
+    def asked(outcome: Outcome) -> dict[str, Tensor]:
+        terms = reward(Outcome(*(values.cpu().numpy() for values in outcome)))
+        like = outcome.speeds
+        return {
+            name: torch.as_tensor(np.asarray(term), dtype=like.dtype, device=like.device)
+            for name, term in terms.items()
+        }
+
+    return asked
+
+
+class VirtualWorld:
+    """IDM plus residual networks; Eq. 4, for state and reward.
+
+    In each step a random member of the ensemble answers for each row. Noise is an error that the model made
+    somewhere on the holdout, drawn anew for each row and step: so it has the errors' standard deviations,
+    the correlations between them, and their tails. Noise alone never makes a crash.
+    """
+
+    def __init__(
+        self,
+        model: EnvironmentModel,
+        scenario: Scenario,
+        reward: str,
+        generator: torch.Generator,
+        noise: bool = True,
+        members: Tensor | None = None,
+    ) -> None:
+        """Make the world of `scenario` as `model` has it, on the generator's device.
+
+        With `members`, those answer in every step, each for an equal share of the rows in turn.
+        """
+        self._base = model.base
+        self._members = model.members
+        self._layers = model.layers()
+        self._noise = model.noise if noise else None
+        self._lowest, self._highest = model.reward_range
+        self._scenario = scenario
+        self._reward = reward_on_tensors(reward or scenario.reward)
+        self._generator = generator
+        self._fixed_members = members
+
+    def step(self, state: LocalState, applied: Tensor, drawn: Tensor) -> Step:
+        """Return what `applied` leads to: next state, reward, and whether that is a crash."""
+        scenario = self._scenario
+        known = base_step(self._base, scenario, state, applied)
+        expected = torch.stack([getattr(known, name) for name in NUMBERS])
+        left = self._left(state, applied, drawn, expected[GAP_ROWS]).T
+        numbers = expected + left[: len(NUMBERS)]
+        wanted_speeds, wanted_gaps = numbers[: len(SPEEDS)], numbers[GAP_ROWS]
+        crashed = (wanted_gaps <= 0.0).any(0)
+        largest = largest_gap(state)
+        speeds = wanted_speeds.clip(0.0, scenario.humans.desired_speed)
+        gaps = wanted_gaps.clip(0.0).minimum(largest)
+        left_of_reward = left[-1].clip(self._lowest, self._highest)
+        nobody = gaps >= largest
+        speed = speeds[0]
+        position = state.route_position + distance_driven(
+            state.speed, speed, scenario.simulation_step, scenario.steps_per_decision
+        )
+        following = LocalState(
+            speed=speed,
+            leader_speed=torch.where(nobody[0], speed, speeds[1]),
+            leader_gap=gaps[0],
+            follower_speed=torch.where(nobody[1], speed, speeds[2]),
+            follower_gap=gaps[1],
+            route_position=torch.where(state.loop_length.isnan(), position, position % state.loop_length),
+            loop_length=state.loop_length,
+        )
+        earned = base_reward(self._base, self._reward, following, applied, crashed)
+        bounded = torch.stack(
+            [(speeds != wanted_speeds).any(0), (gaps != wanted_gaps).any(0), left_of_reward != left[-1]]
+        )
+        return Step(following, earned + left_of_reward * ~crashed, crashed, bounded)
+
+    def _left(self, state: LocalState, applied: Tensor, drawn: Tensor, expected_gaps: Tensor) -> Tensor:
+        """Return what the networks add to the base, with noise, shape (n, 6).
+
+        `expected_gaps`, shape (2, n), are those of the base.
+        """
+        rows, members = len(applied), self._fixed_members
+        if members is None:
+            members = random_members(self._members, rows, self._generator)
+        left = predict(self._layers, model_inputs(state, applied, drawn), members)
+        if self._noise is not None:
+            chosen = torch.randint(
+                NOISE_ROWS, (rows,), generator=self._generator, device=self._generator.device
+            )
+            noisy = left + self._noise.index_select(0, chosen)
+            # A vehicle that changes lanes or merges makes a gap jump: it does so only where it fits.
+            closes = (expected_gaps + noisy.T[GAP_ROWS] <= 0.0).any(0)
+            left = torch.where(closes[:, None], left, noisy)
+        return left

@@ -1,0 +1,67 @@
+import numpy as np
+import pytest
+import torch
+
+from unjam.controller import make_driver
+from unjam.drivers import IDM, FollowerStopper, PISaturation
+from unjam.drivers.check import random_state
+from unjam.drivers.mixed import Mixed
+from unjam.drivers.registry import describe, driver_from_recipe, recipe_of
+from unjam.errors import InputError
+from unjam.scenarios import Merge, Ring
+from unjam.traffic.episode import run_episode
+from unjam.traffic.simulation import Simulation
+
+PI, STOPPER = PISaturation(), FollowerStopper()
+
+
+def test_each_row_drives_as_its_own_driver_would() -> None:
+    mixed, memory = Mixed((PI, STOPPER)), Mixed((PI, STOPPER)).initial_memory(5)
+    alone = [PI.initial_memory(5), STOPPER.initial_memory(5)]
+    for moment in range(4):
+        state = random_state(np.random.default_rng(moment), 5)
+        found, memory = mixed.act(state, memory)
+        expected = []
+        for number, driver in enumerate((PI, STOPPER)):
+            wanted, alone[number] = driver.act(state, alone[number])
+            expected.append(wanted)
+        np.testing.assert_array_equal(found, np.where(np.arange(5) % 2 == 0, *expected))
+
+
+def test_it_drives_tensors_as_it_drives_arrays() -> None:
+    mixed, state = Mixed((PI, IDM())), random_state(np.random.default_rng(1), 4)
+    assert mixed.tensors
+    expected, _ = mixed.act(state, mixed.initial_memory(4))
+    tensors = type(state)(*(torch.as_tensor(values) for values in state))
+    memory = {name: torch.as_tensor(rows) for name, rows in mixed.initial_memory(4).items()}
+    np.testing.assert_allclose(mixed.act(tensors, memory)[0].numpy(), expected, atol=1e-12)
+
+
+def test_the_first_cav_has_the_first_driver_and_the_second_the_second(simulation: Simulation) -> None:
+    ring = Ring(length=(260, 260), cavs=2, horizon=80)
+    driver = make_driver("pi+constant:acceleration=0.3", 0.1)
+    first, second = run_episode(ring, driver, (0,), simulation=simulation).trajectories
+    np.testing.assert_array_equal(second.applied, 0.3)
+    assert np.ptp(first.applied) > 0.1
+
+
+def test_where_cavs_come_and_go_drivers_take_turns_as_they_enter(simulation: Simulation) -> None:
+    driver = make_driver("constant:acceleration=0.1+constant:acceleration=0.2", 1.0)
+    episode = run_episode(Merge(horizon=90), driver, (0,), simulation=simulation)
+    entered = sorted(episode.trajectories, key=lambda stay: (stay.start, -stay.states.route_position[0]))
+    assert len(entered) > 2
+    for number, stay in enumerate(entered):
+        assert set(stay.applied) == {0.1 if number % 2 == 0 else 0.2}
+
+
+def test_a_mixture_is_named_and_written_down_like_any_driver() -> None:
+    mixed = make_driver("pi:window=1e+1+follower-stopper+idm", 0.1)
+    assert describe(mixed) == "pi:window=10.0+follower-stopper+idm"
+    assert driver_from_recipe(*recipe_of(mixed)) == mixed
+
+
+@pytest.mark.parametrize(("text", "words"), [("pi+human", "human"), ("pi+nobody", "nobody")])
+def test_what_cannot_be_mixed_is_told_in_one_line(text: str, words: str) -> None:
+    with pytest.raises(InputError, match=words) as caught:
+        make_driver(text, 0.1)
+    assert "\n" not in str(caught.value)

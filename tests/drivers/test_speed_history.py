@@ -1,0 +1,57 @@
+import numpy as np
+import pytest
+import torch
+
+from unjam.drivers.speed_history import SPARE_STEPS, empty_window, mean_speed, slide
+
+ROWS = 3
+
+
+def tensors(memory: dict) -> dict:
+    return {key: torch.tensor(values) for key, values in memory.items()}
+
+
+def watched(steps: int, speeds: np.ndarray) -> dict:
+    memory = empty_window(ROWS, float(steps), 1.0)
+    for speed in speeds:
+        memory = slide(memory, speed)
+    return memory
+
+
+@pytest.mark.parametrize("steps", [1, 7, 100])
+@pytest.mark.parametrize("before", [0, 3, 250])
+def test_tensors_remember_what_arrays_do(steps: int, before: int) -> None:
+    generator = np.random.default_rng(0)
+    expected = watched(steps, generator.uniform(0, 9, (before, ROWS)))
+    found = tensors(expected)
+    for speed in generator.uniform(0, 9, (3 * (steps + SPARE_STEPS), ROWS)):
+        expected, found = slide(expected, speed), slide(found, torch.tensor(speed))
+        np.testing.assert_allclose(mean_speed(found).numpy(), mean_speed(expected), atol=1e-10)
+
+
+def test_rows_of_different_age_keep_their_own_windows() -> None:
+    generator = np.random.default_rng(1)
+    ages = [2, 5, 12]
+    alone = [watched(5, generator.uniform(0, 9, (age, ROWS))) for age in ages]
+    together = {key: np.stack([memory[key][0] for memory in alone]) for key in alone[0]}
+    found = tensors(together)
+    for speed in generator.uniform(0, 9, (20, ROWS)):
+        together, found = slide(together, speed), slide(found, torch.tensor(speed))
+        np.testing.assert_allclose(mean_speed(found).numpy(), mean_speed(together), atol=1e-12)
+
+
+@pytest.mark.parametrize("after", [0, 1, SPARE_STEPS - 1, SPARE_STEPS, 2 * SPARE_STEPS])
+def test_two_memories_may_follow_from_the_same(after: int) -> None:
+    """What one of them sees changes neither the other nor what they came from."""
+    generator = np.random.default_rng(2)
+    memory = slide(tensors(empty_window(ROWS, 9.0, 1.0)), torch.ones(ROWS, dtype=torch.float64))
+    for speed in generator.uniform(0, 9, (after, ROWS)):
+        memory = slide(memory, torch.tensor(speed))
+    expected = slide(memory, torch.full((ROWS,), 3.0, dtype=torch.float64))
+    other = slide(memory, torch.full((ROWS,), 8.0, dtype=torch.float64))
+    for _ in range(30):
+        other = slide(other, torch.full((ROWS,), 8.0, dtype=torch.float64))
+    again = slide(memory, torch.full((ROWS,), 3.0, dtype=torch.float64))
+    for speed in generator.uniform(0, 9, (30, ROWS)):
+        expected, again = (slide(one, torch.tensor(speed)) for one in (expected, again))
+        np.testing.assert_array_equal(mean_speed(again).numpy(), mean_speed(expected).numpy())

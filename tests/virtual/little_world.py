@@ -1,0 +1,107 @@
+"""A little car-following world whose dynamics are known: the truth that models are compared with."""
+
+import numpy as np
+
+from unjam.drivers import IDM, LocalState
+from unjam.drivers.check import random_state
+from unjam.drivers.residual import ResidualDriver
+from unjam.physics.arrays import Array, as_column, namespace, stack_columns
+from unjam.scenarios import Ring
+from unjam.traffic.reward import Outcome, released
+from unjam.virtual.data import ActualData, Recording
+from unjam.virtual.world import Step
+
+LOOP = 230.0
+RING = Ring(length=(int(LOOP), int(LOOP)))
+
+
+class LittleWorld:
+    """IDM behind; ahead a vehicle that settles at a speed that depends on its gap to the CAV.
+
+    `leader` 0: it keeps its speed, so that the base model `idm` is all there is to know.
+    """
+
+    def __init__(self, leader: float = 1.0, bonus: float = 1.0) -> None:
+        self.leader = leader
+        self.bonus = bonus
+
+    def step(self, state: LocalState, applied: Array, drawn: Array) -> Step:
+        """Move all three by 0.1 s; the reward has a share that no seen speed tells."""
+        step = 0.1
+        behind = state._replace(
+            speed=state.follower_speed, leader_speed=state.speed, leader_gap=state.follower_gap
+        )
+        following, _ = IDM().act(behind, {})
+        push = self.leader * (0.4 * (5.0 - state.leader_speed) + 0.1 * (12.0 - state.leader_gap)).clip(-1, 1)
+        speed = (state.speed + step * applied).clip(0.0, None)
+        follower_speed = (state.follower_speed + step * following).clip(0.0, None)
+        leader_speed = (state.leader_speed + step * push).clip(0.0, None)
+        leader_gap = state.leader_gap + step * (leader_speed - speed)
+        follower_gap = state.follower_gap + step * (speed - follower_speed)
+        crashed = (leader_gap <= 0.0) | (follower_gap <= 0.0)
+        reached = LocalState(
+            speed=speed,
+            leader_speed=leader_speed,
+            leader_gap=leader_gap,
+            follower_speed=follower_speed,
+            follower_gap=follower_gap,
+            route_position=(state.route_position + step * speed) % state.loop_length,
+            loop_length=state.loop_length,
+        )
+        speeds = stack_columns((speed, leader_speed, follower_speed))
+        headways = as_column(leader_gap / speed.clip(1e-3, None))
+        terms = released(Outcome(speeds, as_column(applied), headways, crashed))
+        reward = sum(terms.values()) + self.bonus * 0.1 * (state.leader_gap / 20.0) * ~crashed
+        xp = namespace(speed)
+        nothing = xp.zeros_like(speed)
+        return Step(reached, reward, crashed, xp.stack([nothing, nothing, nothing]))
+
+
+def drive(
+    world: LittleWorld,
+    driver: ResidualDriver,
+    seed: int,
+    decisions: int,
+    explore: bool = True,
+    episode: int = 0,
+) -> Recording:
+    """Drive from a random start to the last decision or a crash, and record it."""
+    generator = np.random.default_rng(seed)
+    state = random_state(generator, 1)._replace(
+        leader_gap=generator.uniform(10, 30, 1), follower_gap=generator.uniform(10, 30, 1)
+    )
+    state = state._replace(leader_speed=state.speed + 0.1, follower_speed=state.speed * 0.9)
+    memory = driver.initial_memory(1)
+    began = {key: values[0] for key, values in driver.expert_memory(memory).items()}
+    states, applied, rewards, crashed = [state], [], [], False
+    while len(applied) < decisions and not crashed:
+        noise = generator.standard_normal(1) if explore else None
+        decision = driver.decide(state, memory, noise)
+        memory = decision.memory
+        step = world.step(state, decision.acceleration, np.zeros((1, 0)))
+        state, crashed = step.state, bool(step.crashed[0])
+        states.append(state)
+        applied.append(decision.acceleration[0])
+        rewards.append(step.reward[0])
+    return Recording(
+        states=LocalState(*(np.concatenate(values) for values in zip(*states, strict=True))),
+        applied=np.array(applied),
+        reward=np.array(rewards),
+        memory=began,
+        hold=driver.hold,
+        terminated=crashed,
+        drawn=np.array([0.3]),
+        episode=episode,
+    )
+
+
+def actual_data(
+    world: LittleWorld, driver: ResidualDriver, episodes: int, decisions: int, explore: bool = True
+) -> ActualData:
+    """Return the data of some episodes, one trajectory each."""
+    data = ActualData(episodes * decisions)
+    data.recordings = [
+        drive(world, driver, seed, decisions, explore, episode=seed) for seed in range(episodes)
+    ]
+    data.episodes = episodes
+    return data

@@ -1,0 +1,85 @@
+import numpy as np
+import pytest
+
+from unjam.drivers import IDM, ResidualDriver
+from unjam.virtual.comparison import open_loop, return_gap
+from unjam.virtual.data import ActualData
+from unjam.virtual.fitting import fit
+from unjam.virtual.model import NUMBERS, EnvironmentModel
+from unjam.virtual.settings import VirtualSettings
+
+from ..conftest import random_network
+from .little_world import RING, LittleWorld, actual_data
+
+DRIVER = ResidualDriver(IDM(), random_network(), 1.0, hold=3)
+SETTINGS = VirtualSettings(members=3, hidden=(32,), epochs=20, batch=128, rate=1e-2)
+
+
+def alone() -> EnvironmentModel:
+    return EnvironmentModel(SETTINGS, 1, (1,))
+
+
+def known_ahead(world: LittleWorld) -> ActualData:
+    return actual_data(world, DRIVER, 30, 60)
+
+
+def test_a_model_that_is_the_truth_is_never_off() -> None:
+    data = known_ahead(LittleWorld(leader=0.0))
+    found = open_loop(alone(), data, data.looks(40), 40, RING)
+    for name in NUMBERS:
+        assert found.error[name].shape == found.spread[name].shape == (40,)
+        assert found.error[name].max() < 1e-3, name
+        assert found.spread[name].max() < 1e-5
+    assert found.change["leader_gap"][-1] > 1.0
+
+
+def test_errors_are_those_of_the_base_written_out() -> None:
+    """The base believes that the leader keeps its speed."""
+    data = known_ahead(LittleWorld())
+    looks = data.looks(30)
+    found = open_loop(alone(), data, looks, 30, RING)
+    for step in (1, 10, 30):
+        off, moved = [], []
+        for place, at in looks:
+            speeds = data.recordings[place].states.leader_speed
+            off.append(speeds[at + step] - speeds[at])
+            gaps = data.recordings[place].states.leader_gap
+            moved.append(gaps[at + step] - gaps[at])
+        assert found.error["leader_speed"][step - 1] == pytest.approx(
+            np.sqrt(np.mean(np.square(off))), abs=1e-5
+        )
+        assert found.change["leader_gap"][step - 1] == pytest.approx(np.sqrt(np.mean(np.square(moved))))
+
+
+def test_learning_brings_virtual_and_actual_together() -> None:
+    data = known_ahead(LittleWorld())
+    looks, model = data.looks(30), alone()
+    before = open_loop(model, data, looks, 30, RING)
+    fit(model, data.transitions(0.2), SETTINGS, RING, "", (2,))
+    after = open_loop(model, data, looks, 30, RING)
+    for name in ("leader_speed", "leader_gap"):
+        assert after.error[name][-1] < 0.6 * before.error[name][-1]
+        assert 0.0 < after.spread[name][-1] < 2 * after.error[name][-1]
+    assert after.error["speed"].max() < 1e-3
+
+
+def test_in_the_true_world_there_is_no_gap_between_returns() -> None:
+    world = LittleWorld()
+    data = actual_data(world, DRIVER, 6, 60, explore=False)
+    quiet = ResidualDriver(IDM(), random_network(), 1.0, hold=3)
+    object.__setattr__(quiet.network, "exploration_std", 0.0)
+    found = return_gap(quiet, world, data, data.looks(20), 20, (1,))
+    assert found.decisions == 18
+    assert found.difference == pytest.approx(0.0, abs=2e-3)
+    looks = data.looks(20)
+    actual = [data.recordings[place].reward[at : at + 18].sum() for place, at in looks]
+    assert found.actual == pytest.approx(np.mean(actual))
+    assert found.virtual == pytest.approx(found.actual, abs=2e-3)
+    assert found.standard_error < 1e-3
+
+
+def test_a_world_that_pays_more_has_a_gap() -> None:
+    data = actual_data(LittleWorld(), DRIVER, 6, 60)
+    found = return_gap(DRIVER, LittleWorld(bonus=5.0), data, data.looks(20), 20, (1,))
+    assert found.difference > 5 * found.standard_error
+    assert found.difference == pytest.approx(found.virtual - found.actual)

@@ -1,0 +1,154 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from unjam.drivers import IDM, ResidualDriver
+from unjam.errors import UnjamError
+from unjam.virtual.data import ActualData, Transitions
+from unjam.virtual.fitting import Fit, fit, inputs_of, targets_of
+from unjam.virtual.model import NOISE_ROWS, TARGETS, EnvironmentModel, predict
+from unjam.virtual.settings import VirtualSettings
+
+from ..conftest import random_network
+from .little_world import RING, LittleWorld, actual_data
+
+SETTINGS = VirtualSettings(members=3, hidden=(32,), epochs=25, patience=6, batch=128, rate=1e-2)
+DRIVER = ResidualDriver(IDM(), random_network(), 1.0)
+
+
+@pytest.fixture(scope="module")
+def data() -> ActualData:
+    return actual_data(LittleWorld(), DRIVER, 40, 50)
+
+
+@pytest.fixture(scope="module")
+def actual(data: ActualData) -> Transitions:
+    return data.transitions(0.2)
+
+
+def fitted(actual: Transitions, settings: VirtualSettings = SETTINGS) -> tuple[EnvironmentModel, Fit]:
+    model = EnvironmentModel(settings, actual.drawn.shape[1], (1,))
+    return model, fit(model, actual, settings, RING, "", (2,))
+
+
+@pytest.fixture(scope="module")
+def known(actual: Transitions) -> tuple[EnvironmentModel, Fit]:
+    return fitted(actual)
+
+
+def test_what_the_base_knows_is_not_left_to_learn(actual: Transitions) -> None:
+    targets = targets_of(actual, "idm", RING, "")
+    left = dict(zip(TARGETS, np.abs(targets).max(0), strict=True))
+    assert left["speed"] == left["follower_speed"] == left["follower_gap"] == pytest.approx(0, abs=1e-12)
+    assert left["leader_speed"] > 0.01
+    np.testing.assert_allclose(targets[:, -1], 0.1 * actual.states.leader_gap / 20.0, atol=1e-9)
+
+
+def test_finds_a_known_residual(known: tuple[EnvironmentModel, Fit], actual: Transitions) -> None:
+    model, found = known
+    assert set(found.learned) == {"leader_speed", "leader_gap", "reward"}
+    for name in found.learned:
+        assert found.one_step[name].model < 0.35 * found.one_step[name].base, name
+    assert found.one_step["speed"].model == found.one_step["speed"].base == pytest.approx(0, abs=1e-12)
+    rows = np.flatnonzero(actual.held_out)
+    inputs = torch.tensor(inputs_of(actual)[rows]).float()
+    answer = predict(model.layers(), inputs, torch.tensor([1]))[:, -1]
+    expected = 0.1 * actual.states.leader_gap[rows] / 20.0
+    assert np.abs(answer.numpy() - expected).mean() < 0.01
+
+
+def test_rows_are_counted(known: tuple[EnvironmentModel, Fit], actual: Transitions) -> None:
+    _, found = known
+    assert found.rows == int((~actual.held_out).sum())
+    assert found.held_out == int(actual.held_out.sum())
+    limited = fitted(actual, replace(SETTINGS, fit_rows=100, epochs=2))[1]
+    assert (limited.rows, limited.held_out, limited.epochs) == (100, 20, 2)
+
+
+def test_a_better_base_leaves_less_unexplained(
+    known: tuple[EnvironmentModel, Fit], actual: Transitions
+) -> None:
+    _, nothing_known = fitted(actual, replace(SETTINGS, base="none"))
+    assert known[1].errors["unexplained"] < nothing_known.errors["unexplained"]
+    assert known[1].one_step["leader_gap"].base < nothing_known.one_step["leader_gap"].base
+    assert set(nothing_known.learned) == set(TARGETS)
+
+
+def test_the_base_is_used_where_nothing_can_be_learned(actual: Transitions) -> None:
+    noise = np.random.default_rng(0).normal(size=len(actual.applied))
+    following = actual.following._replace(follower_speed=actual.following.follower_speed + noise)
+    known = actual.reward - targets_of(actual, "idm", RING, "")[:, -1]
+    model, found = fitted(actual._replace(following=following, reward=known))
+    assert "follower_speed" not in found.learned
+    assert "reward" not in found.learned
+    assert "leader_speed" in found.learned
+    assert found.one_step["follower_speed"].model == pytest.approx(found.one_step["follower_speed"].base)
+    answers = predict(model.layers(), torch.tensor(inputs_of(actual)[:50]).float(), torch.tensor([0]))
+    assert (answers[:, TARGETS.index("follower_speed")] == 0.0).all()
+
+
+def test_noise_is_what_the_holdout_was_off_by(actual: Transitions) -> None:
+    generator = np.random.default_rng(1)
+    error = generator.normal(size=len(actual.applied))
+    following = actual.following._replace(
+        follower_speed=actual.following.follower_speed + 0.5 * error,
+        follower_gap=actual.following.follower_gap - 0.1 * error,
+    )
+    model, _ = fitted(actual._replace(following=following))
+    assert model.noise.shape == (NOISE_ROWS, len(TARGETS))
+    noise = dict(zip(TARGETS, model.noise.double().numpy().T, strict=True))
+    assert noise["follower_speed"].std() == pytest.approx(0.5, rel=0.15)
+    assert noise["follower_speed"].mean() == pytest.approx(0.0, abs=0.03)
+    assert np.corrcoef(noise["follower_speed"], noise["follower_gap"])[0, 1] == pytest.approx(-1, abs=1e-3)
+    assert np.abs(noise["speed"]).max() < 1e-9
+
+
+def test_the_learned_part_of_the_reward_has_the_range_of_the_data(
+    known: tuple[EnvironmentModel, Fit], actual: Transitions
+) -> None:
+    left = 0.1 * actual.states.leader_gap / 20.0
+    np.testing.assert_allclose(known[0].reward_range.numpy(), [left.min(), left.max()], rtol=1e-5)
+
+
+def test_the_same_seed_gives_the_same_bits(known: tuple[EnvironmentModel, Fit], actual: Transitions) -> None:
+    torch.rand(7)
+    np.random.rand(3)
+    model, found = fitted(actual)
+    assert found == known[1]
+    for name, tensor in model.state_dict().items():
+        assert torch.equal(tensor, known[0].state_dict()[name]), name
+    other = EnvironmentModel(SETTINGS, 1, (1,))
+    assert fit(other, actual, SETTINGS, RING, "", (3,)).errors != found.errors
+
+
+def test_a_second_fit_goes_on_from_the_first(actual: Transitions) -> None:
+    short = replace(SETTINGS, epochs=1)
+    model, first = fitted(actual, short)
+    last = [fit(model, actual, short, RING, "", (5, again)) for again in range(3)][-1]
+    assert last.one_step["leader_speed"].model < 0.9 * first.one_step["leader_speed"].model
+
+
+def test_bad_steps_are_taken_back(actual: Transitions, known: tuple[EnvironmentModel, Fit]) -> None:
+    model = EnvironmentModel(SETTINGS, 1, (1,))
+    model.load_state_dict(known[0].state_dict())
+    wild = replace(SETTINGS, rate=1.0, epochs=2)
+    found = fit(model, actual, wild, RING, "", (6,))
+    assert found.one_step["reward"].model == pytest.approx(known[1].one_step["reward"].model, rel=1e-3)
+    assert found.errors["released"] > known[1].errors["released"]
+
+
+def test_a_loss_that_is_not_finite_is_told(actual: Transitions) -> None:
+    broken = actual.following.leader_gap.copy()
+    broken[:] = np.inf
+    with pytest.raises(UnjamError, match="loss in pass 1 of its fit is not finite"):
+        fitted(actual._replace(following=actual.following._replace(leader_gap=broken)))
+
+
+def test_every_estimator_is_there(known: tuple[EnvironmentModel, Fit]) -> None:
+    errors = known[1].errors
+    assert set(errors) == {"unexplained", "total_variation", "released"}
+    assert 0 < errors["unexplained"] < 0.1
+    assert 0 < errors["total_variation"] < 1
+    assert 0 < errors["released"] < 0.1

@@ -1,0 +1,49 @@
+import math
+
+import numpy as np
+import pytest
+
+from unjam.virtual.model_error import OneStep, one_step, total_variation, unexplained
+
+
+def test_errors_one_step_ahead_are_root_mean_squares() -> None:
+    wanted = np.array([3.0, -4.0])
+    predicted = np.array([[3.0, -4.0], [3.0, -2.0]])
+    assert one_step(wanted, predicted, np.array([1.0, 3.0])) == OneStep(math.sqrt(12.5), 1.0, 1.0)
+
+
+def test_unexplained_is_the_mean_share_of_the_variance() -> None:
+    steps = [OneStep(9.0, 0.1, 1.0), OneStep(9.0, 0.5, 1.0), OneStep(0.0, 0.0, 0.0)]
+    assert unexplained(steps) == pytest.approx((0.01 + 0.25 + 0.0) / 3)
+
+
+def overlap(distance: float) -> float:
+    """Half the integral of |difference| of two unit Gaussians in one dimension."""
+    x = np.linspace(-12, 12 + distance, 200_001)
+    difference = np.abs(np.exp(-(x**2) / 2) - np.exp(-((x - distance) ** 2) / 2)) / math.sqrt(2 * math.pi)
+    return float(np.trapezoid(difference, x) / 2)
+
+
+@pytest.mark.parametrize("distance", [0.1, 1.0, 3.0])
+def test_total_variation_is_that_of_two_gaussians(distance: float) -> None:
+    members = np.array([0.0, math.sqrt(2.0)]) * distance * 0.5  # sample standard deviation: distance / 2
+    predicted = members[:, None, None] + np.zeros((2, 4, 1))
+    assert total_variation(predicted, np.array([0.5])) == pytest.approx(overlap(distance), abs=1e-6)
+
+
+def test_a_tenth_of_the_noise_makes_a_rollout_of_fifty() -> None:
+    predicted = np.array([0.0, math.sqrt(2.0)])[:, None, None] * 0.01 + np.zeros((2, 4, 1))
+    assert 2.0 / total_variation(predicted, np.array([0.1])) == pytest.approx(50, abs=0.5)
+
+
+def test_numbers_add_up_and_one_that_all_agree_on_counts_nothing() -> None:
+    spread = np.array([0.0, math.sqrt(2.0)])[:, None, None]
+    two = np.concatenate([spread * 0.3, spread * 0.4, spread * 0.0], 2) + np.zeros((2, 4, 1))
+    one = spread * 0.5 + np.zeros((2, 4, 1))
+    assert total_variation(two, np.array([1.0, 1.0, 0.0])) == pytest.approx(
+        total_variation(one, np.array([1.0]))
+    )
+
+
+def test_of_a_single_member_nobody_can_tell() -> None:
+    assert math.isnan(total_variation(np.zeros((1, 4, 2)), np.ones(2)))
