@@ -31,7 +31,7 @@ class Vehicle:
 
 
 def leader_of(vehicle: Vehicle, others: list[Vehicle]) -> Vehicle | None:
-    """The nearest ahead on the way that the vehicle takes: its own branch, and all beyond the meeting place."""
+    """The nearest ahead on the way that it takes: its own branch, and all beyond the meeting place."""
     ahead = [
         other
         for other in others
@@ -122,7 +122,8 @@ def test_the_first_of_both_ways_follow_the_last_beyond_the_meeting_place() -> No
     assert streams.leaders().tolist() == [-1, 0, 1, 2, 1]
     states = streams.states()
     np.testing.assert_allclose(states.leader_gap, [100.0, 30.0, 10.0, 15.0, 20.0])
-    np.testing.assert_allclose(states.follower_gap, [30.0, 10.0, 15.0, 100.0, 100.0])  # c is nearer to b than e
+    # Of b's two followers c is the nearer one.
+    np.testing.assert_allclose(states.follower_gap, [30.0, 10.0, 15.0, 100.0, 100.0])
 
 
 def test_who_enters_beyond_the_meeting_place_is_there() -> None:
