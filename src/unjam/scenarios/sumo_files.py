@@ -14,6 +14,12 @@ from unjam.errors import InputError
 
 DEFAULT_TYPE = "DEFAULT_VEHTYPE"
 """SUMO's type of vehicles that name none"""
+OTHER_DEFAULT_TYPES = {
+    "DEFAULT_BIKETYPE": "bicycle",
+    "DEFAULT_TAXITYPE": "taxi",
+    "DEFAULT_RAILTYPE": "rail",
+}
+"""vehicle classes of SUMO's other types that no file need define"""
 DEMAND = ("vehicle", "trip", "flow")
 UNITS = (1.0, 60.0, 3600.0, 86400.0)
 """seconds, minutes, hours and days [s]: SUMO's times may be 1:30:00"""
@@ -64,7 +70,11 @@ def _read(path: Path, changed: tuple[tuple[int, int], ...]) -> SumoFiles:
         _read_demand(file, demand)
     if not demand.wanted:
         raise InputError(f"{path.name}: its route and additional files have no vehicle, trip or flow")
+    used = frozenset().union(*(demand.mixtures.get(name, {name}) for name in demand.wanted))
     demand.types.setdefault(DEFAULT_TYPE, {})
+    for name, kind in OTHER_DEFAULT_TYPES.items():
+        if name in used:
+            demand.types.setdefault(name, {"vClass": kind})
     begin = _seconds(path, options, "begin", 0.0) or 0.0
     ends = _seconds(path, options, "end", None)
     if ends is not None and ends <= begin:
@@ -77,7 +87,7 @@ def _read(path: Path, changed: tuple[tuple[int, int], ...]) -> SumoFiles:
         ends,
         _seconds(path, options, "step-length", 1.0) or 1.0,
         demand.types,
-        frozenset().union(*(demand.mixtures.get(name, {name}) for name in demand.wanted)),
+        used,
     )
 
 
