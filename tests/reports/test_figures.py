@@ -10,6 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from PIL import Image
 
 from unjam.reports.figures import (
@@ -49,6 +50,10 @@ def shown_of(
         "positions": positions.astype(np.float32),
         "gaps": np.full_like(speeds, 7.5, np.float32) + np.arange(vehicles, dtype=np.float32),
         "outline": np.column_stack([angles * radius, radius * np.cos(angles), radius * np.sin(angles)]),
+        "branches": [],
+        "waiting": np.zeros(0, np.float32),
+        "lines": np.zeros((0, 2), np.float32),
+        "places": np.zeros((0, 0, 3), np.float32),
     }
     return Shown(driver=driver, **{**values, **changes})
 
@@ -60,6 +65,11 @@ def panels_of(figure: Figure) -> list[Axes]:
 
 def lines_of(axes: Axes) -> list[LineCollection]:
     return [found for found in axes.collections if isinstance(found, LineCollection)]
+
+
+def drawn_lines(axes: Axes) -> list[Line2D]:
+    """The lines of a panel, without those that only the legend needs."""
+    return [line for line in axes.lines if len(np.asarray(line.get_xdata()))]
 
 
 def drivers(count: int) -> list[Shown]:
@@ -170,15 +180,13 @@ def test_space_time_of_rings_of_different_length_shows_all_of_each() -> None:
 
 def test_over_time_has_a_line_of_each_driver_in_each_panel() -> None:
     shown = drivers(3)
-    speed, gap, wave = panels_of(over_time(shown))
+    panels = [drawn_lines(axes) for axes in panels_of(over_time(shown))]
     for number, episode in enumerate(shown):
         cav = episode.cavs[0]
-        for axes, values in ((speed, episode.speeds[:, cav]), (gap, episode.gaps[:, cav])):
-            np.testing.assert_allclose(np.asarray(axes.lines[number].get_ydata()), values)
-        np.testing.assert_allclose(
-            np.asarray(wave.lines[number].get_ydata()), episode.speeds.std(axis=1), rtol=1e-4
-        )
-        assert {axes.lines[number].get_color() for axes in (speed, gap, wave)} == {LINES[number]}
+        expected = (episode.speeds[:, cav], episode.gaps[:, cav], episode.speeds.std(axis=1))
+        for lines, values in zip(panels, expected, strict=True):
+            np.testing.assert_allclose(np.asarray(lines[number].get_ydata()), values, rtol=1e-4)
+            assert lines[number].get_color() == LINES[number]
 
 
 def test_over_time_names_the_drivers_and_the_limit() -> None:
