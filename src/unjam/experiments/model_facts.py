@@ -20,7 +20,7 @@ from unjam.reports.results import MODEL_FILE, read_model, read_progress
 from unjam.scenarios.scenario import Scenario
 from unjam.traffic.record import Floats
 from unjam.virtual.comparison import OneStepErrors, one_step_errors, open_loop, recorded, replay
-from unjam.virtual.data import ActualData, chosen_of
+from unjam.virtual.data import ActualData
 from unjam.virtual.model import NUMBERS, TARGETS, EnvironmentModel
 from unjam.virtual.model_error import root_mean_square
 
@@ -89,7 +89,7 @@ def measure_model(folder: Path, config: RunConfig) -> dict[str, Any]:
     data, model = imagination.data, imagination.model
     generator = np.random.default_rng(config.seed)
     actual = data.transitions(settings.holdout)
-    held_out = chosen_of(actual, generator.permutation(np.flatnonzero(actual.held_out))[:ROWS])
+    held_out = actual.chosen(generator.permutation(np.flatnonzero(actual.held_out))[:ROWS])
     errors = one_step_errors(model, held_out, scenario, config.reward)
     return _rounded(
         {

@@ -56,6 +56,18 @@ class Transitions(NamedTuple):
     held_out: NDArray[np.bool_]
     """rows that no network learns from, shape (R,)"""
 
+    def chosen(self, rows: NDArray[np.int64]) -> "Transitions":
+        """Return the decisions with these indices."""
+        return Transitions(
+            states=LocalState(*(values[rows] for values in self.states)),
+            applied=self.applied[rows],
+            drawn=self.drawn[rows],
+            following=LocalState(*(values[rows] for values in self.following)),
+            reward=self.reward[rows],
+            crashed=self.crashed[rows],
+            held_out=self.held_out[rows],
+        )
+
 
 class ActualData:
     """The newest trajectories: at least `rows` decisions of whole episodes, once there are as many."""
@@ -144,15 +156,6 @@ class ActualData:
             for into, values in zip(found, self.recordings[place].states, strict=True):
                 into[rows] = values[looks[rows, 1]]
         return found
-
-
-def chosen_of(actual: Transitions, rows: NDArray[Any]) -> Transitions:
-    """Return the rows that `rows`, indices or a mask, chooses."""
-    parts = (
-        LocalState(*(v[rows] for v in part)) if isinstance(part, LocalState) else part[rows]
-        for part in actual
-    )
-    return Transitions(*parts)
 
 
 def is_held_out(episode: int, share: float) -> bool:
