@@ -137,7 +137,7 @@ def _some(chosen: NDArray[np.bool_], most: int, generator: np.random.Generator) 
 
 def _seen(model: EnvironmentModel, inputs: Tensor) -> Tensor:
     """Return inputs in SI units as the networks take them."""
-    return ((inputs - model.input_mean) / model.input_scale).float()
+    return (inputs.float() - model.input_mean) / model.input_scale
 
 
 def _wanted(model: EnvironmentModel, targets: Tensor) -> Tensor:
