@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from unjam.agents.imagination import Imagination
@@ -37,6 +38,8 @@ MOMENTS = 100
 BINS = 10
 """of equally many decisions, by gap and by speed"""
 BINNED = ("leader_gap", "speed")
+LENGTHS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000)
+"""of rollouts, for which the bound is computed [decisions]"""
 SHOWN = ("leader_gap", "leader_speed")
 """numbers of the examples"""
 
@@ -49,7 +52,7 @@ def newest_model_facts(folder: Path, config: RunConfig) -> dict[str, Any]:
     """
     _check_virtual(folder, config)
     kept, progress = read_model(folder), read_progress(folder)
-    if kept is None or not progress or kept["iteration"] != progress[-1]["iteration"]:
+    if kept is None or not progress or kept.get("iteration") != progress[-1]["iteration"]:
         write_model_facts(folder, config)
         kept = read_model(folder)
     assert kept is not None
@@ -79,6 +82,7 @@ def measure_model(folder: Path, config: RunConfig) -> dict[str, Any]:
         raise InputError(
             f"run: {str(folder)!r} has no checkpoint yet; go on with: unjam train --resume {folder}"
         )
+    torch.set_num_threads(1)  # for small networks more are slower
     state, tensors = checkpoint
     scenario = config.make_scenario()
     settings = replace(config.virtual, device="cpu")
@@ -88,6 +92,7 @@ def measure_model(folder: Path, config: RunConfig) -> dict[str, Any]:
     restore_imagination(imagination, state, tensors)
     data, model = imagination.data, imagination.model
     generator = np.random.default_rng(config.seed)
+    newest = read_progress(folder)[-1]
     actual = data.transitions(settings.holdout)
     held_out = actual.chosen(generator.permutation(np.flatnonzero(actual.held_out))[:ROWS])
     errors = one_step_errors(model, held_out, scenario, config.reward)
@@ -97,11 +102,12 @@ def measure_model(folder: Path, config: RunConfig) -> dict[str, Any]:
             "base": settings.base,
             "members": settings.members,
             "decision_step": scenario.decision_step,
+            "k_star": newest["k_star"],
             "held_out": int(actual.held_out.sum()),
             "one_step": {name: found._asdict() for name, found in errors.by_number().items()},
             "where": {name: _by_bins(getattr(held_out.states, name), errors) for name in BINNED},
             "replay": _replayed(imagination, scenario, generator),
-            "bound": _bounds(imagination, folder, config.learner.gamma),
+            "bound": _bounds(imagination, newest, config.learner.gamma),
         }
     )
 
@@ -193,23 +199,20 @@ def _examples(
     ]
 
 
-def _bounds(imagination: Imagination, folder: Path, gamma: float) -> dict[str, Any] | None:
-    """Return the bound C of the newest iteration by the length of rollouts; None without an eps_m."""
-    progress = read_progress(folder)
-    newest = progress[-1] if progress else {}
-    eps_m = newest.get("virtual", {}).get("eps_m_by_estimator", {}).get("total_variation")
+def _bounds(imagination: Imagination, newest: dict[str, Any], gamma: float) -> dict[str, Any] | None:
+    """Return the bound C by the length of rollouts for the newest row of progress; None without an eps_m."""
+    eps_m = newest["virtual"]["eps_m_by_estimator"]["total_variation"]
     if eps_m is None:
         return None
     eps_pi = newest["learner"]["eps_pi_max"]
-    lengths = [1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000]
     discount = imagination.decision_discount(gamma)
     return {
         "eps_pi": eps_pi,
         "eps_m": eps_m,
         "largest_reward": imagination.largest_reward,
         "largest_return": imagination.largest_reward / (1.0 - discount),
-        "k": lengths,
-        "C": [imagination.bound_at(k, eps_pi, eps_m, gamma) for k in lengths],
+        "k": LENGTHS,
+        "C": [imagination.bound_at(k, eps_pi, eps_m, gamma) for k in LENGTHS],
     }
 
 

@@ -138,9 +138,10 @@ def read_progress(folder: Path) -> list[dict[str, Any]]:
 def read_model(folder: Path) -> dict[str, Any] | None:
     """Return what a run's `model.json` says; None where there is none, or none that can be read."""
     try:
-        return json.loads(_text(folder / MODEL_FILE))
+        found = json.loads(_text(folder / MODEL_FILE))
     except ValueError:
         return None
+    return found if isinstance(found, dict) else None
 
 
 def _text(path: Path) -> str:
