@@ -151,8 +151,8 @@ def model_section(result: Results) -> dict[str, Any] | None:
         "about": (
             "Between actual episodes the agent also learns in a virtual environment: "
             f"{_BASES_IN_WORDS[facts['base']]}, plus an ensemble of {facts['members']} networks for what "
-            f"that leaves. All that follows is measured on {facts['held_out']:,} decisions of episodes that no "
-            "network learned from."
+            f"that leaves. All that follows is measured on {facts['held_out']:,} decisions of episodes that "
+            "no network learned from."
         ),
         "examples": (
             "The recorded accelerations, driven again from the same states in the virtual environment, "
