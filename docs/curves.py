@@ -1,4 +1,4 @@
-"""Learning curves with the virtual environment and without it, from the measured files under results/model/."""
+"""Learning curves with the virtual environment and without it, from files under results/model/."""
 
 import json
 
@@ -66,7 +66,7 @@ def reached(kind: str, level: float) -> list[float]:
 
 
 def judged() -> pd.DataFrame:
-    """Return a table of all runs: gain beyond the expert, and steps to what runs without it reach on average."""
+    """Return a table of all runs: gain beyond the expert, steps to what runs without it reach on average."""
     level = float(validations("without")[1].max(1).mean())
     table = []
     for kind, label in LABELS.items():
