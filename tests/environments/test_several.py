@@ -1,4 +1,5 @@
 import warnings
+from contextlib import closing
 from typing import Any
 
 import numpy as np
@@ -52,3 +53,79 @@ def test_the_same_seed_gives_the_same_observations() -> None:
 
 def test_passes_the_seed_test_of_pettingzoo() -> None:
     parallel_seed_test(lambda: unjam.parallel_env("ring", **SHORT), num_cycles=10)
+
+
+MERGE: Any = {"horizon": 60, "penetration": 0.3}
+
+
+def test_the_merge_passes_the_checks_of_pettingzoo_without_warnings(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        # Of those who might be CAVs only some are: which, is drawn anew in each episode.
+        warnings.filterwarnings("ignore", "No agents present but not all possible_agents are terminated")
+        with closing(unjam.parallel_env("merge", **MERGE)) as environment:
+            parallel_api_test(environment, num_cycles=100)
+        parallel_seed_test(lambda: unjam.parallel_env("merge", **MERGE), num_cycles=10)
+
+
+def test_agents_of_the_merge_enter_and_leave_as_in_the_very_episode_that_run_episode_runs() -> None:
+    scenario = make_scenario("merge", {**MERGE, "horizon": 100, "standing": 0})
+    expected = run_episode(scenario, Constant(acceleration=0.2), (4,))
+    stays = {each.vehicle: each for each in expected.trajectories}
+    environment = unjam.parallel_env("merge", **{**MERGE, "horizon": 100, "standing": 0})
+    last, _ = environment.reset(seed=4)
+    left, earned = [], {name: [] for name in stays}
+    while environment.agents:
+        acting = environment.agents
+        seen, rewards, terminated, truncated, _ = environment.step(dict.fromkeys(acting, np.array([0.2])))
+        moment = environment._road.traffic.decisions
+        assert not any(terminated.values())
+        assert set(seen) == set(rewards) == set(terminated) == set(truncated) >= set(acting)
+        for name in acting:
+            if name not in environment.agents and moment < 100:
+                left.append(name)
+                assert truncated[name]
+                np.testing.assert_array_equal(seen[name], last[name])  # what it saw before it left
+                assert stays[name].start + len(stays[name].applied) == moment - 1
+            else:
+                earned[name].append(rewards[name])
+        for name in set(environment.agents) - set(acting):
+            assert stays[name].start == moment
+            assert (rewards[name], truncated[name]) == (0.0, False)
+        last = seen
+    assert all(truncated.values())
+    environment.close()
+    assert len(left) > 3
+    for name, trajectory in stays.items():
+        np.testing.assert_allclose(earned[name], trajectory.reward, atol=1e-12)
+
+
+def test_time_goes_on_by_itself_until_the_first_agent_enters_and_ends_with_the_last() -> None:
+    environment = unjam.parallel_env("merge", cavs=2, standing=0, horizon=300)
+    environment.reset(seed=1)
+    assert len(environment.agents) == 1
+    assert environment._road.traffic.decisions > 0
+    gaps = 0
+    while environment.agents:
+        before = environment._road.traffic.decisions
+        environment.step(dict.fromkeys(environment.agents, np.array([0.5])))
+        gaps += environment._road.traffic.decisions > before + 1
+    assert gaps <= 1
+    assert environment._road.traffic.decisions < 300
+    assert environment.step({}) == ({}, {}, {}, {}, {})
+    environment.close()
+
+
+def test_a_collision_terminates_everybody_who_is_there() -> None:
+    environment = unjam.parallel_env("merge", penetration=1.0, actuation="raw", standing=0)
+    environment.reset(seed=0)
+    terminated: dict[str, bool] = {}
+    while environment.agents:
+        actions = dict.fromkeys(environment.agents, np.array([1.0]))
+        _, _, terminated, truncated, _ = environment.step(actions)
+    environment.close()
+    assert len(terminated) > 3
+    assert all(terminated.values())
+    assert not any(truncated.values())

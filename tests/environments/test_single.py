@@ -42,7 +42,7 @@ def test_passes_the_checks_of_gymnasium_and_stable_baselines3_without_warnings(
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("warmup", [0, 50])
 def test_steps_the_very_episode_that_run_episode_runs(name: str, warmup: int) -> None:
-    changes: Any = {"horizon": 120, "warmup": warmup}
+    changes: Any = {"horizon": 120, "warmup": warmup, "cavs": 1}
     scenario = make_scenario(NAMES[name], changes)
     expected = run_episode(scenario, Constant(acceleration=0.3), (7,))
     environment = gymnasium.make(name, **changes)
@@ -56,8 +56,14 @@ def test_steps_the_very_episode_that_run_episode_runs(name: str, warmup: int) ->
         rewards.append(reward)
         assert sum(info["terms"].values()) == reward
     environment.close()
-    np.testing.assert_array_equal(speeds, expected.speeds[1:])
-    np.testing.assert_allclose(rewards, expected.trajectories[0].reward, atol=1e-12)
+    (stay,) = expected.trajectories
+    decided = len(stay.applied)
+    left_early = stay.start + decided < scenario.horizon
+    assert len(rewards) == decided + left_early  # the decision in which it left is no part of its stay
+    np.testing.assert_allclose(rewards[:decided], stay.reward, atol=1e-12)
+    in_order = np.sort if name == "unjam/Merge-v0" else np.array  # of entry, or along the road
+    for found, recorded in zip(speeds, expected.speeds[1 + stay.start :], strict=False):
+        np.testing.assert_array_equal(in_order(found), in_order(recorded[~np.isnan(recorded)]))
 
 
 def test_actions_are_added_to_an_expert(environment: gymnasium.Env) -> None:
@@ -74,11 +80,36 @@ def test_actions_are_added_to_an_expert(environment: gymnasium.Env) -> None:
     np.testing.assert_array_equal(speeds, expected.speeds[1:])
 
 
-def test_the_horizon_truncates_and_does_not_terminate(environment: gymnasium.Env) -> None:
+@pytest.mark.parametrize("name", NAMES)
+def test_the_horizon_truncates_and_does_not_terminate(name: str) -> None:
+    horizon = 20 if name == "unjam/Merge-v0" else 60
+    environment = gymnasium.make(name, horizon=horizon)
     environment.reset(seed=1)
-    ends = [environment.step(np.zeros(1))[2:4] for _ in range(60)]
-    assert ends[:-1] == [(False, False)] * 59
+    decided = environment.unwrapped._road.traffic.decisions  # pyright: ignore[reportAttributeAccessIssue]
+    ends = [environment.step(np.zeros(1))[2:4] for _ in range(horizon - decided)]
+    environment.close()
+    assert len(ends) > 5
+    assert ends[:-1] == [(False, False)] * (len(ends) - 1)
     assert ends[-1] == (False, True)
+
+
+@pytest.mark.parametrize("expert", ["", "pi"])
+def test_on_the_merge_the_episode_ends_when_the_cav_leaves(expert: str) -> None:
+    environment = RoadEnv("merge", cavs=1, horizon=200, expert=expert)
+    observation, _ = environment.reset(seed=1)
+    seen, ends = [observation], []
+    while not ends or ends[-1] == (False, False):
+        observation, _, terminated, truncated, _ = environment.step(np.zeros(1))
+        seen.append(observation)
+        ends.append((terminated, truncated))
+    traffic = environment._road.traffic
+    assert not traffic.cavs
+    assert traffic.decisions < 200
+    assert ends[-1] == (False, True)
+    np.testing.assert_array_equal(seen[-1], seen[-2])  # what it saw before it left
+    with pytest.raises(InputError, match="cavs"):
+        RoadEnv("merge")
+    environment.close()
 
 
 def test_a_collision_terminates_and_does_not_truncate() -> None:

@@ -1,6 +1,7 @@
 import base64
 import io
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
@@ -10,6 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from PIL import Image
 
 from unjam.reports.figures import (
@@ -24,6 +26,8 @@ from unjam.reports.figures import (
     time_split,
 )
 from unjam.reports.results import Shown
+
+from .open_roads import merge_episode, own_episode, shown_from
 
 LENGTH = 120.0
 CAV_COLOUR = "#d7263d"
@@ -49,6 +53,10 @@ def shown_of(
         "positions": positions.astype(np.float32),
         "gaps": np.full_like(speeds, 7.5, np.float32) + np.arange(vehicles, dtype=np.float32),
         "outline": np.column_stack([angles * radius, radius * np.cos(angles), radius * np.sin(angles)]),
+        "branches": [],
+        "waiting": np.zeros(0, np.float32),
+        "lines": np.zeros((0, 2), np.float32),
+        "places": np.zeros((0, 0, 3), np.float32),
     }
     return Shown(driver=driver, **{**values, **changes})
 
@@ -60,6 +68,11 @@ def panels_of(figure: Figure) -> list[Axes]:
 
 def lines_of(axes: Axes) -> list[LineCollection]:
     return [found for found in axes.collections if isinstance(found, LineCollection)]
+
+
+def drawn_lines(axes: Axes) -> list[Line2D]:
+    """The lines of a panel, without those that only the legend needs."""
+    return [line for line in axes.lines if len(np.asarray(line.get_xdata()))]
 
 
 def drivers(count: int) -> list[Shown]:
@@ -170,15 +183,13 @@ def test_space_time_of_rings_of_different_length_shows_all_of_each() -> None:
 
 def test_over_time_has_a_line_of_each_driver_in_each_panel() -> None:
     shown = drivers(3)
-    speed, gap, wave = panels_of(over_time(shown))
+    panels = [drawn_lines(axes) for axes in panels_of(over_time(shown))]
     for number, episode in enumerate(shown):
         cav = episode.cavs[0]
-        for axes, values in ((speed, episode.speeds[:, cav]), (gap, episode.gaps[:, cav])):
-            np.testing.assert_allclose(np.asarray(axes.lines[number].get_ydata()), values)
-        np.testing.assert_allclose(
-            np.asarray(wave.lines[number].get_ydata()), episode.speeds.std(axis=1), rtol=1e-4
-        )
-        assert {axes.lines[number].get_color() for axes in (speed, gap, wave)} == {LINES[number]}
+        expected = (episode.speeds[:, cav], episode.gaps[:, cav], episode.speeds.std(axis=1))
+        for lines, values in zip(panels, expected, strict=True):
+            np.testing.assert_allclose(np.asarray(lines[number].get_ydata()), values, rtol=1e-4)
+            assert lines[number].get_color() == LINES[number]
 
 
 def test_over_time_names_the_drivers_and_the_limit() -> None:
@@ -288,3 +299,71 @@ def test_a_drawing_is_an_svg() -> None:
     head, data = content(data_uri(time_split(RUN), "svg"))
     assert head == "data:image/svg+xml;base64"
     assert ElementTree.fromstring(data).tag == "{http://www.w3.org/2000/svg}svg"
+
+
+def segments_of(axes: Axes) -> np.ndarray:
+    """Everything that a panel shows of vehicles: (time, position) of both ends, shape (n, 2, 2)."""
+    coloured = [lines for lines in lines_of(axes) if lines.get_array() is not None]
+    return np.concatenate([np.array(lines.get_segments()).reshape(-1, 2, 2) for lines in coloured])
+
+
+@pytest.mark.parametrize("count", [1, 2, 4])
+@pytest.mark.parametrize("wide", [True, False])
+def test_space_time_of_the_merge_has_panels_of_highway_and_ramp(count: int, wide: bool) -> None:
+    shown = [shown_from(merge_episode(), f"driver {number}") for number in range(count)]
+    figure = space_time(shown, wide)
+    figure.draw_without_rendering()
+    panels = panels_of(figure)
+    assert len(panels) == 2 * count
+    titles = [axes.get_title(loc="left") for axes in panels]
+    assert sorted(title for title in titles if title) == [f"driver {number}" for number in range(count)]
+    labels = {axes.get_ylabel() for axes in panels if axes.get_ylabel()}
+    assert labels == {"highway [m]", "ramp [m]"}
+    mains = [axes for axes, title in zip(panels, titles, strict=True) if title]
+    ramps = [axes for axes, title in zip(panels, titles, strict=True) if not title]
+    for main, ramp in zip(mains, ramps, strict=True):
+        assert segments_of(main)[..., 1].min() < -600
+        assert 80 < segments_of(main)[..., 1].max() <= 105
+        assert -230 < segments_of(ramp)[..., 1].min() < -200
+        assert segments_of(ramp)[..., 1].max() < 0
+        assert main.get_xlim() == ramp.get_xlim() == pytest.approx((0, 100))
+
+
+def test_each_vehicle_of_the_merge_is_on_one_panel_at_a_time() -> None:
+    shown = shown_from(merge_episode(), "pi")
+    panels = panels_of(space_time([shown]))
+    drawn = sum(len(segments_of(axes)) for axes in panels)
+    there = ~np.isnan(shown.positions)
+    together = there[1:] & there[:-1]
+    ramp = np.array(shown.branches) == "ramp"
+    crossing = together & ramp & (shown.positions[1:] >= 0) & (shown.positions[:-1] < 0)
+    assert crossing.any()
+    assert drawn == together.sum() - crossing.sum()
+
+
+def test_cavs_of_the_merge_are_marked(tmp_path: Path) -> None:
+    shown = shown_from(merge_episode(), "pi")
+    main, ramp = panels_of(space_time([shown]))
+    assert sum(lines.get_array() is None for lines in lines_of(main)) == len(shown.cavs)
+    marked = [lines for lines in lines_of(ramp) if lines.get_array() is None]
+    assert not any(len(lines.get_segments()) for lines in marked)
+
+
+def test_space_time_of_your_own_network_shows_the_route(tmp_path: Path) -> None:
+    shown = shown_from(own_episode(tmp_path), "pi")
+    (panel,) = panels_of(space_time([shown]))
+    assert panel.get_ylabel() == "position along the road [m]"
+    assert segments_of(panel)[..., 1].min() == pytest.approx(np.nanmin(shown.positions), abs=5)
+    low, high = panel.get_ylim()
+    assert (low, high) == pytest.approx((np.nanmin(shown.positions), np.nanmax(shown.positions)))
+
+
+def test_over_time_of_a_road_with_ends_shows_mean_speed_waves_and_who_waits() -> None:
+    shown = [shown_from(merge_episode(driver=driver), driver) for driver in ("human", "pi")]
+    panels = panels_of(over_time(shown))
+    assert [axes.get_ylabel().split()[0] for axes in panels] == ["mean", "speed", "vehicles"]
+    for number, episode in enumerate(shown):
+        expected = (np.nanmean(episode.speeds, 1), np.nanstd(episode.speeds, 1), episode.waiting)
+        for axes, values in zip(panels, expected, strict=True):
+            found = np.asarray(drawn_lines(axes)[number].get_ydata())
+            np.testing.assert_allclose(found, values, rtol=1e-4)

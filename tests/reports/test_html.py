@@ -14,8 +14,9 @@ from unjam.errors import DiskError, InputError
 from unjam.experiments.evaluate import Evaluation, save_evaluation
 from unjam.files import to_json
 from unjam.reports.figures import learning_curve
-from unjam.reports.html import REPLAY_SECONDS, write_report
+from unjam.reports.html import write_report
 from unjam.reports.metrics import METRICS, measure
+from unjam.reports.replay import REPLAY_SECONDS
 from unjam.reports.results import read_results
 from unjam.traffic.record import Episode, failed_episode
 
@@ -250,7 +251,7 @@ def test_the_replay_holds_the_positions_and_speeds_that_were_driven(
         assert replay["frames"] == len(episode.positions[::every])
         assert driver["cavs"] == episode.cavs == [0]
         assert driver["loop_length"] == LENGTH
-        np.testing.assert_allclose(driver["outline"], episode.outline, atol=0.006)
+        np.testing.assert_allclose(driver["lines"], [episode.outline], atol=0.006)
     fastest = max(episode.speeds.max() for episode in shown.values())
     assert fastest <= replay["fastest"] < fastest + 1
 

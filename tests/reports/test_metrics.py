@@ -10,10 +10,10 @@ from hypothesis.extra.numpy import arrays
 from numpy.typing import ArrayLike
 
 from unjam.drivers import LocalState
-from unjam.reports.metrics import METRICS, measure, measure_all, outcome_of
+from unjam.reports.metrics import METRICS, measure, measure_all
 from unjam.scenarios.scenario import VEHICLE_LENGTH
 from unjam.traffic.neighbours import loop_neighbours, loop_state
-from unjam.traffic.record import Episode, Floats, Trajectory, failed_episode
+from unjam.traffic.record import Episode, Floats, Trajectory, failed_episode, outcome_of
 
 LENGTH = 200.0
 LIMIT = 8.0
@@ -274,12 +274,12 @@ def test_fuel_that_was_not_recorded_is_not_a_number() -> None:
     assert np.isnan(metric("fuel_ml_per_km", episode_of(steady(4.0))))
 
 
-def test_return_is_the_sum_of_all_terms_and_the_mean_over_cavs() -> None:
-    states = seen(speed=[5.0] * 4)
-    first = trajectory_of(states, terms={"a": np.array([1.0, 2.0, 3.0]), "b": np.array([-1.0, 0.0, 0.0])})
-    second = trajectory_of(states, terms={"a": np.array([1.0, 1.0, 1.0])})
-    episode = episode_of(steady(5.0, 3), trajectories=(first, second))
-    assert metric("return", episode) == pytest.approx((5.0 + 3.0) / 2)
+def test_return_is_the_sum_of_all_terms_once_however_many_cavs_share_it() -> None:
+    terms = {"a": np.array([1.0, 2.0, 3.0]), "b": np.array([-1.0, 0.0, 0.0])}
+    shares = tuple(trajectory_of(seen(speed=[5.0] * 4), terms=terms) for _ in range(2))
+    for cavs in ((), shares[:1], shares):
+        episode = episode_of(steady(5.0, 3), trajectories=cavs, terms=terms)
+        assert metric("return", episode) == pytest.approx(5.0)
 
 
 def test_return_by_eq16_pays_for_speed_and_charges_for_push_and_closeness() -> None:
@@ -303,8 +303,9 @@ def test_a_collision_is_measured_up_to_its_end() -> None:
     assert row["status"] == "collision"
     assert row["collisions"] == 2.0
     assert row["mean_speed"] == pytest.approx(4.0)
-    assert np.flatnonzero(outcome_of(episode).crashed).tolist() == [20 - 1]
-    assert not outcome_of(episode_of(steady(4.0, 20))).crashed.any()
+    crashed, calm = (outcome_of(episode.speeds, episode.trajectories, end) for end in (True, False))
+    assert np.flatnonzero(crashed.crashed).tolist() == [20 - 1]
+    assert not calm.crashed.any()
 
 
 def test_a_collision_in_the_first_step_is_measured_without_complaint() -> None:

@@ -11,6 +11,7 @@ from unjam.reports.road_picture import CAV_COLOUR, SIZE
 from unjam.reports.video import FRAMES_PER_SECOND, check_format, write_video
 from unjam.traffic.record import Episode
 
+from .open_roads import merge_episode
 from .test_metrics import episode_of
 
 SECONDS = 20.0
@@ -121,3 +122,16 @@ def test_another_kind_of_file_is_refused(tmp_path: Path, name: str) -> None:
 def test_a_film_that_cannot_be_written_gets_one_clear_line(tmp_path: Path, suffix: str) -> None:
     with pytest.raises(DiskError, match="cannot write"):
         write_video(driven(1.0), tmp_path / "nowhere" / f"wave{suffix}", "pi")
+
+
+def test_a_film_of_the_merge_shows_who_is_there_at_each_moment(tmp_path: Path) -> None:
+    path = tmp_path / "merge.webp"
+    episode = merge_episode(20)
+    write_video(episode, path, "pi", pace=100.0)
+    frames = frames_of(path)
+    assert len(frames) == 1 + 20 // 5
+    there = (~np.isnan(episode.speeds[::5])).sum(1)
+    vehicles = [
+        int((frame[150:].sum(-1) < 600).sum()) for frame in frames
+    ]  # below the words; lanes are light
+    assert np.corrcoef(there, vehicles)[0, 1] > 0.9

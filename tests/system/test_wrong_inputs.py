@@ -32,7 +32,7 @@ WRONG: dict[str, tuple[str, list[str]]] = {
     "no horizon": ("horizon: 0", ["drive ring --driver pi --set horizon=0"]),
     "unknown way of actuation": ("actuation: 'wild'", ["drive ring --driver pi --set actuation=wild"]),
     "setting without a value": ("key=value", ["drive ring --driver pi --set horizon"]),
-    "unknown reward": ("released, eq16", ["drive ring --driver pi --reward gold"]),
+    "unknown reward": ("released, released-merge, eq16", ["drive ring --driver pi --reward gold"]),
     "reward that is not in the file": ("has no 'ghost'", ["drive ring --driver pi --reward mine.py:ghost"]),
     "reward that is NaN": (
         "reward: step 0: term 'speed' is nan",

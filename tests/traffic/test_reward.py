@@ -15,19 +15,25 @@ from unjam.traffic.reward import REWARDS, Outcome, make_reward, released, time_h
 
 @st.composite
 def outcomes(draw: st.DrawFn) -> Outcome:
-    """What some decisions led to; a few vehicles are not on the road, but never all."""
+    """What some decisions led to; a few vehicles and CAVs are not on the road, or nobody at all."""
     rows, vehicles = draw(st.integers(1, 5)), draw(st.integers(1, 6))
     cavs = draw(st.integers(1, vehicles))
     speeds = draw(hnp.arrays(np.float64, (rows, vehicles), elements=st.floats(0, 70)))
-    missing = draw(hnp.arrays(np.bool_, (rows, vehicles)))
-    missing[:, draw(st.integers(0, vehicles - 1))] = False
-    speeds[missing] = np.nan
-    return Outcome(
-        speeds,
-        draw(hnp.arrays(np.float64, (rows, cavs), elements=st.floats(-3, 3))),
-        draw(hnp.arrays(np.float64, (rows, cavs), elements=st.floats(-1, 1e5))),
-        draw(hnp.arrays(np.bool_, rows)),
-    )
+    speeds[draw(hnp.arrays(np.bool_, (rows, vehicles)))] = np.nan
+    accelerations = draw(hnp.arrays(np.float64, (rows, cavs), elements=st.floats(-3, 3)))
+    headways = draw(hnp.arrays(np.float64, (rows, cavs), elements=st.floats(-1, 1e5)))
+    away = draw(hnp.arrays(np.bool_, (rows, cavs)))
+    accelerations[away] = headways[away] = np.nan
+    return Outcome(speeds, accelerations, headways, draw(hnp.arrays(np.bool_, rows)))
+
+
+def there(values: np.ndarray) -> list[float]:
+    """Those of a row that are on the road."""
+    return [value for value in values.tolist() if not math.isnan(value)]
+
+
+def mean(values: list[float]) -> float:
+    return sum(values) / len(values) if values else 0.0
 
 
 def one(speeds: list[float], accelerations: list[float], crashed: bool = False) -> Outcome:
@@ -66,21 +72,53 @@ def test_released_gives_nothing_for_a_crash() -> None:
 def test_released_is_four_times_mean_speed_over_twenty_less_four_times_mean_effort(outcome: Outcome) -> None:
     found = total(released(outcome))
     for row, crashed in enumerate(outcome.crashed):
-        there = [speed for speed in outcome.speeds[row] if not math.isnan(speed)]
-        effort = [abs(push) for push in outcome.accelerations[row]]
-        expected = 4.0 * sum(there) / len(there) / 20.0 - 4.0 * sum(effort) / len(effort)
+        effort = [abs(push) for push in there(outcome.accelerations[row])]
+        expected = 4.0 * mean(there(outcome.speeds[row])) / 20.0 - 4.0 * mean(effort)
         assert found[row] == pytest.approx(0.0 if crashed else expected, abs=1e-9)
+
+
+@given(outcomes())
+def test_released_merge_is_one_less_the_distance_from_twenty_and_lacking_headways(outcome: Outcome) -> None:
+    for numbers in (outcome, Outcome(*(torch.from_numpy(values) for values in outcome))):
+        terms = REWARDS["released-merge"](numbers)
+        assert set(terms) == {"speed", "headway", "floor"}
+        for row, crashed in enumerate(outcome.crashed):
+            speeds = there(outcome.speeds[row])
+            missed = math.hypot(*(20.0 - speed for speed in speeds))
+            wanted = math.hypot(*(20.0 for _ in speeds))
+            lacking = sum(min(time - 1.0, 0.0) for time in there(outcome.headways[row]))
+            expected = max(1.0 - missed / wanted + 0.1 * lacking, 0.0) if speeds and not crashed else 0.0
+            assert float(total(terms)[row]) == pytest.approx(expected, abs=1e-9)
+            assert float(terms["headway"][row]) == pytest.approx(0.0 if crashed else 0.1 * lacking, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("speeds", "headways", "crashed", "expected"),
+    [
+        ([20.0, 20.0], [5.0], False, 1.0),
+        ([10.0, 10.0], [5.0], False, 0.5),
+        ([20.0, np.nan], [0.5], False, 0.95),
+        ([60.0, 60.0], [5.0], False, 0.0),
+        ([0.0, 0.0], [0.1], False, 0.0),
+        ([20.0, 20.0], [5.0], True, 0.0),
+        ([np.nan, np.nan], [np.nan], False, 0.0),
+    ],
+)
+def test_released_merge_by_hand(
+    speeds: list[float], headways: list[float], crashed: bool, expected: float
+) -> None:
+    outcome = Outcome(np.array([speeds]), np.zeros((1, 1)), np.array([headways]), np.array([crashed]))
+    assert total(REWARDS["released-merge"](outcome))[0] == pytest.approx(expected)
 
 
 @given(outcomes(), st.sampled_from(["eq16", "eq16-as-printed"]))
 def test_equation_16_term_by_term(outcome: Outcome, name: str) -> None:
     terms = REWARDS[name](outcome)
     for row in range(len(outcome.crashed)):
-        there = [speed for speed in outcome.speeds[row] if not math.isnan(speed)]
-        mean = sum(there) / len(there)
-        speed = max(30.0 - abs(30.0 - mean), 0.0) if name == "eq16" else max(30.0 - mean, 0.0)
-        headway = -0.1 * sum(max(1.0 - time, 0.0) for time in outcome.headways[row])
-        acceleration = -0.1 * sum(abs(push) for push in outcome.accelerations[row])
+        average = mean(there(outcome.speeds[row]))
+        speed = max(30.0 - abs(30.0 - average), 0.0) if name == "eq16" else max(30.0 - average, 0.0)
+        headway = -0.1 * sum(max(1.0 - time, 0.0) for time in there(outcome.headways[row]))
+        acceleration = -0.1 * sum(abs(push) for push in there(outcome.accelerations[row]))
         expected = {"speed": speed, "headway": headway, "acceleration": acceleration}
         assert {key: values[row] for key, values in terms.items()} == pytest.approx(expected, abs=1e-9)
 
@@ -96,8 +134,13 @@ def test_vehicles_that_are_not_on_the_road_are_left_out(outcome: Outcome, name: 
     found = REWARDS[name](outcome)
     for row in range(len(outcome.crashed)):
         alone = Outcome(*(values[row : row + 1] for values in outcome))
-        there = alone._replace(speeds=alone.speeds[:, ~np.isnan(alone.speeds[0])])
-        for term, values in REWARDS[name](there).items():
+        on_road = ~np.isnan(alone.accelerations[0])
+        present = alone._replace(
+            speeds=alone.speeds[:, ~np.isnan(alone.speeds[0])],
+            accelerations=alone.accelerations[:, on_road],
+            headways=alone.headways[:, on_road],
+        )
+        for term, values in REWARDS[name](present).items():
             assert values[0] == pytest.approx(found[term][row], abs=1e-12)
 
 

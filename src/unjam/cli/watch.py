@@ -77,7 +77,7 @@ def watch(
         check_folder(video)
         aside.print("driving")
         with Workers(1) as workers:
-            episode = workers.run([EpisodeTask(road, driven, (seed,))])[0]
+            episode = workers.run([EpisodeTask(road, driven, (seed,), full=True)])[0]
     row = measure(episode)
     if episode.ok and video is not None:
         aside.print("drawing")

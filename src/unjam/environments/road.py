@@ -42,7 +42,7 @@ class Step:
     terminated: bool
     """whether there was a collision"""
     truncated: bool
-    """whether the horizon is reached, or nobody will be on the road any more"""
+    """whether the horizon is reached, or no CAV will be on the road any more"""
 
 
 class SteppedRoad:
@@ -130,21 +130,21 @@ class SteppedRoad:
         outcome = Outcome(speeds[None], applied[stayed][None], headways[None], np.array([traffic.crashed]))
         terms = {name: float(values[0]) for name, values in self._reward(outcome).items()}
         left = {name: self._seen[row] for row, name in enumerate(before) if row not in stayed}
-        self._await_cav()
-        truncated = self._ended() and not traffic.crashed
+        terminated = traffic.crashed
+        self._await_cav()  # a crash of people meanwhile ends the episode, but is nobody's doing
+        truncated = not terminated and (self._ended() or traffic.crashed or not traffic.cavs)
         observations = self._look()
-        return Step(
-            list(traffic.cavs), observations, left, sum(terms.values()), terms, traffic.crashed, truncated
-        )
+        return Step(list(traffic.cavs), observations, left, sum(terms.values()), terms, terminated, truncated)
 
     def _ended(self) -> bool:
         return self.traffic.decisions >= self.scenario.horizon or self.traffic.over
 
     def _await_cav(self) -> None:
-        """Let the road go on until a CAV is on it, or the episode ends."""
-        while not (self.traffic.cavs or self._ended() or self.traffic.crashed):
-            self.traffic.advance(np.zeros(0))
-            self._memory = self.traffic.carry(self._memory, self._expert)
+        """Let the road go on until a CAV is on it, or none will be before the episode ends."""
+        traffic = self.traffic
+        while traffic.expects_cavs and not (traffic.cavs or self._ended() or traffic.crashed):
+            traffic.advance(np.zeros(0))
+            self._memory = traffic.carry(self._memory, self._expert)
 
     @property
     def traffic(self) -> Traffic:

@@ -59,9 +59,11 @@ class ParallelRoad(ParallelEnv[str, Any, Any]):
             return {}, {}, {}, {}, {}
         acted = self.agents
         done = self._road.step([float(np.asarray(actions[agent]).reshape(())) for agent in acted])
-        observations = {**done.left, **dict(zip(done.cavs, done.observations, strict=True))}
-        agents = list(observations)
         ended = done.terminated or done.truncated
+        seen = {**done.left, **dict(zip(done.cavs, done.observations, strict=True))}
+        # Who enters as the episode ends never was an agent.
+        observations = {name: seen[name] for name in seen if name in acted or not ended}
+        agents = list(observations)
         self.agents = [] if ended else done.cavs
         return (
             observations,

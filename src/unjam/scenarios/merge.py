@@ -22,6 +22,8 @@ JUNCTION_RADIUS = 10.0
 """of the node where they meet [m], as Flow's"""
 JUNCTION_WAYS = (24.525483, 23.270389)
 """lengths of the ways across that node, of highway and ramp, as netconvert makes them from the radius [m]"""
+ENTRANCE_WAY = 0.1
+"""length of the way across the nodes where the inflow edges end, as netconvert makes it [m]"""
 HIGHWAY_SPEED, RAMP_SPEED = 10.0, 7.5
 """with which vehicles enter [m/s]"""
 JOINS_IN = pi / 4
@@ -44,6 +46,7 @@ class Merge(Scenario):
 
     title: ClassVar[str] = "merge"
     reward: ClassVar[str] = "released-merge"
+    closed: ClassVar[bool] = False
     people_gap: ClassVar[float] = 2.5
 
     inflow: Positive = 2000.0
@@ -95,15 +98,18 @@ class Merge(Scenario):
                 )
             )
 
-        start = -(INFLOW_EDGE + BEFORE + JUNCTION_WAYS[HIGHWAY])
+        begin = -(BEFORE + JUNCTION_WAYS[HIGHWAY])
+        start = begin - ENTRANCE_WAY - INFLOW_EDGE
         for index, along in enumerate(self._standing_places()):
             beyond = along - INFLOW_EDGE
-            edge, place = ("inflow_highway", along) if beyond < 0 else ("highway", beyond)
-            enter(f"human_s{index}", 0.0, f"from_{edge}", place, 0.0, Origin(HIGHWAY, start + along))
+            on_inflow = beyond < 0
+            edge, place = ("inflow_highway", along) if on_inflow else ("highway", beyond)
+            origin = Origin(HIGHWAY, place + (start if on_inflow else begin))
+            enter(f"human_s{index}", 0.0, f"from_{edge}", place, 0.0, origin)
         for index, time in enumerate(self._times(self.inflow)):
             name = f"{'cav' if index in chosen else 'human'}_{index}"
             enter(name, time, "from_inflow_highway", 0.0, HIGHWAY_SPEED, Origin(HIGHWAY, start))
-        start = -(INFLOW_EDGE + RAMP + JUNCTION_WAYS[ON_RAMP])
+        start = -(INFLOW_EDGE + ENTRANCE_WAY + RAMP + JUNCTION_WAYS[ON_RAMP])
         for index, time in enumerate(self._times(self.ramp_flow)):
             enter(f"human_r{index}", time, "from_inflow_ramp", 0.0, RAMP_SPEED, Origin(ON_RAMP, start))
         entering.sort(key=lambda entry: entry[0])  # as SUMO wants it
@@ -150,7 +156,7 @@ class Merge(Scenario):
 
     def limit(self) -> float:
         """Return the mean speed of the highway's people where no ramp, no noise and no jam disturbs them."""
-        length = INFLOW_EDGE + BEFORE + JUNCTION_WAYS[HIGHWAY] + AFTER
+        length = INFLOW_EDGE + ENTRANCE_WAY + BEFORE + JUNCTION_WAYS[HIGHWAY] + AFTER
         return _undisturbed_speed(self.inflow, length, self.humans, self.simulation_step)
 
     @property

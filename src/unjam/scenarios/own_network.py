@@ -1,5 +1,6 @@
 """The user's own road: any SUMO network with its traffic, some of whose vehicles become CAVs."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
@@ -34,6 +35,7 @@ class OwnNetwork(Scenario):
 
     title: ClassVar[str] = "own-network"
     reward: ClassVar[str] = "released"
+    closed: ClassVar[bool] = False
 
     file: str = ""
     """the .sumocfg file"""
@@ -115,16 +117,12 @@ def own_network(file: str, changes: dict[str, Any]) -> OwnNetwork:
         InputError: one line on what is missing or broken, before SUMO starts.
     """
     files = read_sumo_files(Path(file).resolve())
-    step = float(changes.get("simulation_step", files.step))
-    seconds = (files.end if files.end is not None else files.begin + LONGEST) - files.begin
-    each = int(changes.get("steps_per_decision", 1))
-    values = {
-        "file": str(files.path),
-        "simulation_step": step,
-        "horizon": max(1, int(seconds / (step * max(1, each)))),
-        **changes,
-    }
-    return build(OwnNetwork, values, Path(file).name)
+    values = {"file": str(files.path), "simulation_step": files.step, **changes}
+    made = build(OwnNetwork, values, Path(file).name)
+    if "horizon" in changes:
+        return made
+    seconds = LONGEST if files.end is None else files.end - files.begin
+    return replace(made, horizon=max(1, int(seconds / made.decision_step + 1e-9)))
 
 
 def is_car(attributes: dict[str, str]) -> bool:

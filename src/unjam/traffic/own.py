@@ -38,6 +38,11 @@ class OwnTraffic(OpenTraffic[OwnRoad]):
         self._log_edges: list[list[tuple[str, float]]] = []
         self._allowed: list[float] = []
 
+    @property
+    def expects_cavs(self) -> bool:
+        """Whether a CAV may still enter: while anybody may, as SUMO alone knows who will."""
+        return not self.over
+
     def _is_cav(self, name: str) -> bool:
         """Whether a vehicle is a CAV: by its type, or by a draw that depends on its id and the seed alone.
 

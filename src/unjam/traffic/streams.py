@@ -65,9 +65,10 @@ class Streams:
         while self._main and self.positions[self._past] >= 0:  # the first of the main road: in place already
             self._past, self._main = self._past + 1, self._main - 1
         while (first := self._past + self._main) < len(self.names) and self.positions[first] >= 0:
-            self.names.insert(self._past, self.names.pop(first))
+            place = int((self.positions[: self._past] >= self.positions[first]).sum())
+            self.names.insert(place, self.names.pop(first))
             order = np.arange(len(self.names))
-            order[self._past : first + 1] = [first, *range(self._past, first)]
+            order[place : first + 1] = [first, *range(place, first)]
             self.positions, self.speeds = self.positions[order], self.speeds[order]
             self._past += 1
 

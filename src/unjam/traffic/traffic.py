@@ -130,6 +130,11 @@ class Traffic(Generic[RoadKind]):
         raise NotImplementedError
 
     @property
+    def expects_cavs(self) -> bool:
+        """Whether a CAV may still enter."""
+        return False
+
+    @property
     def stayed(self) -> Sequence[int]:
         """Rows of the CAVs before the last decision that are on the road after it."""
         return range(len(self.cavs))

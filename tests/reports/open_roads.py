@@ -1,0 +1,42 @@
+"""Episodes on roads with ends, as pictures show them."""
+
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+
+from unjam.drivers import Human, PISaturation
+from unjam.reports.results import PICTURED, Shown
+from unjam.scenarios import Merge, make_scenario
+from unjam.traffic.episode import run_episode
+from unjam.traffic.record import Episode
+
+from ..traffic.own_roads import game
+
+
+def shown_from(episode: Episode, driver: str) -> Shown:
+    """What a folder of results has of an episode."""
+    return Shown(
+        driver=driver,
+        step=episode.step,
+        loop_length=episode.loop_length,
+        crossings=[list(crossing) for crossing in episode.crossings],
+        limit_speed=episode.limit_speed,
+        drawn=episode.drawn,
+        vehicle_ids=list(episode.vehicle_ids),
+        cav_ids=list(episode.cav_ids),
+        branches=list(episode.branches),
+        **{name: getattr(episode, name).astype(np.float32) for name in PICTURED},
+    )
+
+
+@cache
+def merge_episode(seconds: int = 100, driver: str = "pi") -> Episode:
+    found = {"pi": PISaturation(), "human": Human()}[driver]
+    return run_episode(Merge(penetration=0.2, horizon=seconds), found, (1,), full=True)
+
+
+def own_episode(folder: Path, seconds: int = 60) -> Episode:
+    """Some traffic on SUMO's game `ramp`."""
+    scenario = make_scenario(str(game(folder, "ramp")), {"cav_share": 0.3, "horizon": seconds * 5})
+    return run_episode(scenario, PISaturation(), (1,), full=True)

@@ -1,0 +1,89 @@
+import base64
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from unjam.reports.replay import _share, replay_data
+from unjam.reports.results import Shown
+
+from .open_roads import merge_episode, own_episode, shown_from
+
+
+def unpacked(driver: dict[str, Any], name: str) -> np.ndarray:
+    shape = (-1, driver["vehicles"], 3) if name == "places" else (-1, driver["vehicles"])
+    return np.frombuffer(base64.b64decode(driver[name]), "<f4").reshape(shape)
+
+
+@pytest.fixture(scope="module", params=["merge", "ramp"])
+def shown(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Shown:
+    if request.param == "merge":
+        return shown_from(merge_episode(), "pi")
+    return shown_from(own_episode(tmp_path_factory.mktemp("own")), "pi")
+
+
+@given(hnp.arrays(np.bool_, (8, 12)), st.sets(st.integers(0, 11)))
+def test_vehicles_that_share_a_column_are_never_there_together(there: np.ndarray, chosen: set[int]) -> None:
+    for vehicle in range(there.shape[1]):  # each comes once and stays in between
+        moments = np.flatnonzero(there[:, vehicle])
+        if len(moments):
+            there[moments[0] : moments[-1] + 1, vehicle] = True
+    mask = np.isin(np.arange(12), list(chosen))
+    groups = _share(there, mask)
+    found = [vehicle for group in groups for vehicle in group]
+    assert sorted(found) == [vehicle for vehicle in sorted(chosen) if there[:, vehicle].any()]
+    for group in groups:
+        for one, other in pairwise(group):
+            # An empty frame lies between: or the page would draw one vehicle that flies.
+            assert np.flatnonzero(there[:, one])[-1] + 1 < np.flatnonzero(there[:, other])[0]
+
+
+def test_all_that_were_there_are_in_the_replay_where_they_were_and_as_fast(shown: Shown) -> None:
+    data = replay_data([shown])
+    (driver,) = data["drivers"]
+    speeds, places = unpacked(driver, "speeds"), unpacked(driver, "places")
+    assert len(speeds) == len(places) == data["frames"]
+    assert driver["vehicles"] < len(shown.vehicle_ids)
+    moments = np.round(np.arange(data["frames"]) * data["step"] / shown.step).astype(int)
+    for frame, moment in enumerate(moments):
+        there = ~np.isnan(shown.speeds[moment])
+        expected = np.column_stack([shown.places[moment][there], shown.speeds[moment][there]])
+        seen = ~np.isnan(speeds[frame])
+        found = np.column_stack([places[frame][seen], speeds[frame][seen]])
+        np.testing.assert_array_equal(np.sort(found, axis=0), np.sort(expected, axis=0))
+        cavs = {tuple(shown.places[moment][column]) for column in shown.cavs if there[column]}
+        marked = {tuple(places[frame][column]) for column in driver["cavs"] if seen[column]}
+        assert marked == cavs
+    assert data["fastest"] >= np.nanmax(shown.speeds)
+
+
+def test_a_loop_is_not_asked_for_where_there_is_none(shown: Shown) -> None:
+    (driver,) = replay_data([shown])["drivers"]
+    assert driver["loop_length"] is None
+    assert "positions" not in driver
+
+
+def test_lines_are_those_of_the_lanes(shown: Shown) -> None:
+    (driver,) = replay_data([shown])["drivers"]
+    points = np.concatenate([np.array(line)[:, 1:] for line in driver["lines"]])
+    known = shown.lines[~np.isnan(shown.lines[:, 0])]
+    assert all(len(line) >= 2 for line in driver["lines"])
+    assert len(points) >= 0.9 * len(known)
+    np.testing.assert_allclose(points.min(0), known.min(0), atol=0.06)
+    np.testing.assert_allclose(points.max(0), known.max(0), atol=0.06)
+
+
+def test_the_replay_of_a_shorter_episode_stays_as_at_its_end() -> None:
+    short, long = (shown_from(merge_episode(seconds), "pi") for seconds in (20, 100))
+    first, second = replay_data([short, long])["drivers"]
+    assert len(unpacked(first, "speeds")) == len(unpacked(second, "speeds"))
+    np.testing.assert_array_equal(unpacked(first, "speeds")[30:], unpacked(first, "speeds")[29:-1])
+
+
+def test_of_nobody_there_is_nothing_to_play(tmp_path: Path) -> None:
+    assert replay_data([]) == {"drivers": []}

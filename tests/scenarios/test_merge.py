@@ -1,0 +1,189 @@
+import re
+import xml.etree.ElementTree as ElementTree
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from unjam.errors import InputError
+from unjam.scenarios import Merge, make_scenario
+from unjam.scenarios.merge import ENTRANCE_WAY, JUNCTION_WAYS
+from unjam.scenarios.registry import scenario_from_recipe, scenario_recipe
+from unjam.scenarios.road import MergingRoad
+from unjam.traffic.network_files import network_file
+
+
+def drawn(seed: int = 0, **changes: Any) -> MergingRoad:
+    return Merge(**changes).draw(np.random.default_rng(seed))
+
+
+def entries(road: MergingRoad) -> list[dict[str, str]]:
+    """Attributes of the vehicles in SUMO's file, in their order."""
+    return [vehicle.attrib for vehicle in ElementTree.fromstring(road.traffic).iter("vehicle")]
+
+
+def cavs(road: MergingRoad) -> list[int]:
+    """Which of the highway's vehicles are CAVs, sorted."""
+    return sorted(int(name.removeprefix("cav_")) for name in road.cav_ids)
+
+
+def times_of(road: MergingRoad, pattern: str) -> list[float]:
+    return [float(entry["depart"]) for entry in entries(road) if re.fullmatch(pattern, entry["id"])]
+
+
+def test_as_many_want_to_enter_as_the_flows_say_evenly_spaced() -> None:
+    road = drawn()
+    highway, ramp = times_of(road, r"(human|cav)_\d+"), times_of(road, r"human_r\d+")
+    assert (len(highway), len(ramp)) == (333, 16)  # 2,000 and 100 an hour, in 600 s
+    np.testing.assert_allclose(highway, np.arange(333) * 1.8, atol=0.006)
+    np.testing.assert_allclose(ramp, np.arange(16) * 36.0, atol=0.006)
+    assert times_of(road, r"human_s\d+") == [0.0] * 5
+
+
+def test_the_file_lists_vehicles_by_time_of_entry_as_sumo_wants_them() -> None:
+    road = drawn(warmup=100)
+    times = [float(entry["depart"]) for entry in entries(road)]
+    assert times == sorted(times)
+    assert {entry["id"] for entry in entries(road)} == set(road.origins)
+    assert road.cav_ids <= set(road.origins)
+    assert {entry["type"] for entry in entries(road)} == {"human"}  # until the driver takes over
+
+
+def test_a_warmup_lasts_as_long_as_its_vehicles() -> None:
+    assert len(times_of(drawn(warmup=500, horizon=100), r"(human|cav)_\d+")) == 200 * 2000 // 3600
+
+
+def test_vehicles_enter_where_their_origin_says() -> None:
+    road = drawn(standing=3)
+    highway, ramp = JUNCTION_WAYS
+    starts = {"from_inflow_highway": -(600.1 + highway), "from_highway": -(500 + highway)}
+    starts |= {"from_inflow_ramp": -(200.1 + ramp)}
+    for entry in entries(road):
+        place = starts[entry["route"]] + float(entry["departPos"])
+        assert road.origins[entry["id"]] == (entry["route"] == "from_inflow_ramp", pytest.approx(place))
+    standing = [road.origins[f"human_s{index}"].position for index in range(3)]
+    np.testing.assert_allclose(np.diff(standing), 200.0, atol=0.11)
+
+
+def test_nobody_stands_where_none_shall() -> None:
+    assert times_of(drawn(standing=0), r"human_s\d+") == []
+
+
+@given(st.integers(0, 2**32 - 1), st.floats(0, 1))
+def test_a_share_is_drawn_for_each_vehicle_by_itself(seed: int, penetration: float) -> None:
+    count = len(cavs(drawn(seed, penetration=penetration)))
+    spread = np.sqrt(333 * penetration * (1 - penetration))
+    assert abs(count - 333 * penetration) <= 5.5 * spread + 1e-9
+
+
+@pytest.mark.parametrize("spacing", ["random", "even"])
+def test_none_or_all_of_the_highways_vehicles_are_cavs(spacing: str) -> None:
+    assert cavs(drawn(penetration=0.0, spacing=spacing)) == []
+    assert cavs(drawn(penetration=1.0, spacing=spacing)) == list(range(333))
+
+
+def test_even_spacing_is_each_tenth_vehicle_in_every_episode() -> None:
+    for seed in range(3):
+        assert cavs(drawn(seed, spacing="even")) == list(range(0, 333, 10))
+
+
+@given(st.floats(0, 1))
+def test_even_spacing_spreads_the_share_evenly(penetration: float) -> None:
+    found = cavs(drawn(penetration=penetration, spacing="even"))
+    assert abs(len(found) - 333 * penetration) <= 1.0
+    assert len(np.unique(np.diff(found))) <= 2
+
+
+def test_random_cavs_differ_from_episode_to_episode() -> None:
+    found = [tuple(cavs(drawn(seed))) for seed in range(6)]
+    assert len(set(found)) == 6
+    assert found[0] == tuple(cavs(drawn(0)))
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(1, 166))
+def test_so_many_cavs_enter_in_the_first_half_as_were_asked_for(seed: int, count: int) -> None:
+    road = drawn(seed, cavs=count)
+    assert len(cavs(road)) == count
+    assert max(cavs(road)) * 1.8 < 300.0
+
+
+def test_cavs_have_names_that_were_announced() -> None:
+    some: list[dict[str, Any]] = [{}, {"cavs": 5}, {"penetration": 1.0}, {"inflow": 700.0}]
+    for changes in some:
+        assert drawn(**changes).cav_ids <= set(Merge(**changes).possible_cavs())
+
+
+def test_ways_across_the_junction_are_those_of_the_network_file() -> None:
+    tree = ElementTree.parse(network_file(drawn().network))
+    lanes = {lane.get("id"): float(lane.get("length", "nan")) for lane in tree.iter("lane")}
+    via = {
+        link.get("from"): lanes[link.get("via")]
+        for link in tree.iter("connection")
+        if link.get("to") == "after" and link.get("via")
+    }
+    np.testing.assert_allclose((via["highway"], via["ramp"]), JUNCTION_WAYS, atol=1e-6)
+    assert drawn().junctions == JUNCTION_WAYS
+    assert lanes[":highway_begin_0_0"] == lanes[":ramp_begin_0_0"] == ENTRANCE_WAY
+    edges = [lanes[f"{name}_0"] for name in ("inflow_highway", "highway", "after", "inflow_ramp", "ramp")]
+    np.testing.assert_allclose(edges, [100.0, 500.0, 100.0, 100.0, 100.0], atol=1e-6)
+
+
+def plain_highway(flow: float, vehicles: int = 120, step: float = 0.2) -> float:
+    """Mean speed of the last of many people on 724.6 m, all on one clock, Eq. 5-6 written down once more."""
+    length, every = 700.1 + JUNCTION_WAYS[0], round(3600.0 / flow / step)
+    position, speed, taken = (np.full(vehicles, value) for value in (np.nan, 10.0, 0.0))
+    clock = 0
+    while not position[-1] >= length:
+        there = np.arange(vehicles) * every <= clock
+        position[there & np.isnan(position)] = 0.0
+        leader = np.where(position[:-1] >= length, np.inf, position[:-1])  # who has left is no leader
+        gap = np.append(np.inf, leader - position[1:] - 5.0)
+        closing = np.append(0.0, speed[1:] - speed[:-1])
+        wanted = 2.0 + np.maximum(speed + speed * closing / (2 * np.sqrt(1.5)), 0.0)
+        pushed = np.maximum(speed + step * (1.0 - (speed / 30.0) ** 4 - (wanted / gap) ** 2), 0.0)
+        speed[there] = pushed[there]
+        taken[there & (position < length)] += step
+        position[there] += step * speed[there]
+        clock += 1
+    return length / taken[-1]
+
+
+@pytest.mark.parametrize("flow", [1200.0, 2000.0])
+def test_limit_is_the_speed_of_people_whom_nothing_disturbs(flow: float) -> None:
+    assert drawn(inflow=flow).limit_speed == pytest.approx(plain_highway(flow), rel=1e-9)
+
+
+def test_limit_is_about_twenty_and_falls_with_the_flow() -> None:
+    limits = [Merge(inflow=flow).limit() for flow in (200.0, 1000.0, 2000.0)]
+    assert limits == sorted(limits, reverse=True)
+    assert 20.0 < limits[-1] < limits[0] < 30.0
+
+
+def test_recipe_makes_the_same_scenario_again() -> None:
+    scenario = Merge(cavs=3, spacing="even", inflow=1500.0)
+    assert scenario_from_recipe(scenario_recipe(scenario)) == scenario
+    assert scenario.part(1, 3) == scenario
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"standing": 101}, "standing: 101 is not allowed; allowed: <= 100"),
+        ({"standing": -1}, "standing"),
+        ({"cavs": 167}, "cavs: 167 is not allowed; allowed: <= 166, who enter in the first half"),
+        ({"cavs": 0}, "cavs"),
+        ({"penetration": 1.1}, "penetration: 1.1"),
+        ({"penetration": -0.1}, "penetration: -0.1"),
+        ({"inflow": 0}, "inflow: 0"),
+        ({"ramp_flow": -5}, "ramp_flow: -5"),
+        ({"spacing": "odd"}, "'random' or 'even'"),
+        ({"people": "native"}, "people: 'native' is not allowed on the merge; allowed: 'commanded'"),
+        ({"length": (230, 230)}, "length: unknown name"),
+    ],
+)
+def test_wrong_values_get_one_clear_line(changes: Any, words: str) -> None:
+    with pytest.raises(InputError, match=re.escape(words)) as caught:
+        make_scenario("merge", changes)
+    assert "\n" not in str(caught.value)

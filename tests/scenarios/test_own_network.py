@@ -1,0 +1,134 @@
+import re
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from unjam.errors import InputError
+from unjam.scenarios import make_scenario
+from unjam.scenarios.own_network import OwnNetwork
+from unjam.scenarios.registry import scenario_from_recipe, scenario_recipe
+from unjam.scenarios.road import OwnRoad
+
+from .test_sumo_files import configuration
+
+TYPES = """
+<routes>
+  <vType id="car" length="4.2" minGap="3" carFollowModel="IDM" sigma="0.7" lcStrategic="2"/>
+  <vType id="truck" vClass="truck" maxSpeed="22"/>
+  <vType id="bike" vClass="bicycle"/>
+  <vType id="unused"/>
+  <flow id="f" type="car"/><flow id="g" type="bike"/><vehicle id="h" type="truck"/>
+</routes>
+"""
+
+
+def own(folder: Path, times: str = "", routes: str = TYPES, **changes: Any) -> OwnNetwork:
+    changes = changes or {"cav_share": 0.5}
+    found = make_scenario(str(configuration(folder, times, routes=routes)), changes)
+    assert isinstance(found, OwnNetwork)
+    return found
+
+
+def drawn(folder: Path, **changes: Any) -> OwnRoad:
+    return own(folder, **changes).draw(np.random.default_rng(0))
+
+
+TIMES = '<time><begin value="30"/><end value="90"/><step-length value="0.2"/></time>'
+
+
+@pytest.mark.parametrize(
+    ("changes", "step", "horizon"),
+    [
+        ({}, 0.2, 300),
+        ({"steps_per_decision": 5}, 0.2, 60),
+        ({"simulation_step": 0.5}, 0.5, 120),
+        ({"horizon": 7}, 0.2, 7),
+        ({"simulation_step": 0.1, "steps_per_decision": 3}, 0.1, 200),
+    ],
+)
+def test_step_and_horizon_are_its_own_unless_said_otherwise(
+    changes: dict[str, Any], step: float, horizon: int, tmp_path: Path
+) -> None:
+    found = own(tmp_path, TIMES, cav_share=0.1, **changes)
+    assert (found.simulation_step, found.horizon) == (step, horizon)
+
+
+def test_without_an_end_an_episode_is_an_hour(tmp_path: Path) -> None:
+    assert own(tmp_path).horizon == 3600
+
+
+def test_each_type_has_a_cav_type_as_large_and_as_fast(tmp_path: Path) -> None:
+    kinds = {kind.get("id"): kind.attrib for kind in ElementTree.fromstring(drawn(tmp_path).traffic)}
+    assert set(kinds) == {f"cav_of_{name}" for name in ("car", "truck", "bike", "unused", "DEFAULT_VEHTYPE")}
+    car, truck = kinds["cav_of_car"], kinds["cav_of_truck"]
+    assert (car["length"], car["lcStrategic"], car["carFollowModel"]) == ("4.2", "2", "Krauss")
+    assert (float(car["sigma"]), float(car["speedDev"]), car["minGap"]) == (0.0, 0.0, "0.5")
+    assert (truck["vClass"], truck["maxSpeed"]) == ("truck", "22")
+
+
+def test_a_share_picks_cars_and_the_like_alone(tmp_path: Path) -> None:
+    road = drawn(tmp_path)
+    assert road.cars == {"car", "truck", "unused", "DEFAULT_VEHTYPE"}
+    assert (road.cav_share, road.cav_types) == (0.5, ())
+    assert drawn(tmp_path, cav_types=["bike"]).cav_types == ("bike",)
+
+
+def test_other_episodes_pick_other_vehicles(tmp_path: Path) -> None:
+    scenario = own(tmp_path)
+    seeds = {scenario.draw(np.random.default_rng(seed)).cav_seed for seed in range(5)}
+    assert len(seeds) == 5
+    assert np.isnan(scenario.draw(np.random.default_rng(0)).limit_speed)
+
+
+def test_recipe_makes_the_same_scenario_again(tmp_path: Path) -> None:
+    scenario = own(tmp_path, TIMES, cav_types=["car", "truck"], cav_share=0.25)
+    assert scenario_from_recipe(scenario_recipe(scenario)) == scenario
+    assert dict(scenario.facts())["vehicles"] == "as its files say (25 % CAV, car, truck)"
+
+
+def test_its_vehicles_are_not_known_before(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="its vehicles are known to SUMO alone"):
+        own(tmp_path).possible_cavs()
+
+
+BIKES = '<routes><vType id="bike" vClass="bicycle"/><flow id="g" type="bike"/></routes>'
+
+
+@pytest.mark.parametrize(
+    ("changes", "routes", "words"),
+    [
+        ({"cav_share": 0.0}, TYPES, "cav_share: 0.0 is not allowed without cav_types"),
+        ({"horizon": 5}, TYPES, "cav_share: 0.0 is not allowed without cav_types"),
+        ({"cav_share": 1.5}, TYPES, "cav_share: 1.5"),
+        ({"cav_share": "some"}, TYPES, "cav_share: 'some'"),
+        ({"cav_types": ["tank"]}, TYPES, "no vehicle has the type 'tank'; allowed: bike, car, truck"),
+        ({"cav_types": ["unused"]}, TYPES, "no vehicle has the type 'unused'"),
+        ({"cav_share": 0.1}, BIKES, "no vehicle is a car; its types are bike; name cav_types"),
+        ({"cav_share": 0.1, "people": "commanded"}, TYPES, "people: 'commanded' is not allowed"),
+        ({"cav_share": 0.1, "noise": 0.2}, TYPES, "noise: 0.2"),
+        ({"cav_share": 0.1, "simulation_step": 0}, TYPES, "simulation_step: 0"),
+        ({"cav_share": 0.1, "simulation_step": "fast"}, TYPES, "simulation_step: 'fast'"),
+        ({"cav_share": 0.1, "steps_per_decision": 0}, TYPES, "steps_per_decision: 0"),
+        ({"cav_share": 0.1, "length": 3}, TYPES, "length: unknown name"),
+    ],
+)
+def test_wrong_values_get_one_clear_line(
+    changes: dict[str, Any], routes: str, words: str, tmp_path: Path
+) -> None:
+    with pytest.raises(InputError, match=re.escape(words)) as caught:
+        own(tmp_path, routes=routes, **changes)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_type_that_sumo_has_by_itself_may_be_a_cav(tmp_path: Path) -> None:
+    routes = '<routes><flow id="g" type="DEFAULT_BIKETYPE"/></routes>'
+    with pytest.raises(InputError, match="no vehicle is a car"):
+        own(tmp_path, routes=routes)
+    road = drawn(tmp_path, routes=routes, cav_types=["DEFAULT_BIKETYPE"])
+    (bike,) = [
+        kind for kind in ElementTree.fromstring(road.traffic) if kind.get("id") == "cav_of_DEFAULT_BIKETYPE"
+    ]
+    assert bike.get("vClass") == "bicycle"
