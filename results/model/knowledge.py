@@ -37,7 +37,9 @@ from unjam.virtual.rollout import draw_starts
 from unjam.virtual.settings import BaseName, VirtualSettings
 
 ROADS = ("ring", "figure-eight")
-STEPS = (6_000, 24_000, 100_000)
+PASSES = {6_000: 200, 24_000: 100, 100_000: 40}
+"""actual steps, and passes over them that a fit may make: more data have more gradient steps in a pass"""
+STEPS = tuple(PASSES)
 SEEDS = range(5)
 TEST_EPISODES, TEST_SEED = 12, 2_000_000
 STARTS, SECONDS = 500, 5.0
@@ -46,9 +48,9 @@ ALONE: dict[str, BaseName] = {"IDM alone": "idm", "nothing changes": "none"}
 WORKERS = 2
 
 
-def settings_for(base: BaseName) -> VirtualSettings:
+def settings_for(base: BaseName, passes: int = 1) -> VirtualSettings:
     """Return the defaults, but all rows are learned from, until the holdout has not improved for long."""
-    return VirtualSettings(base=base, fit_rows=200_000, rows=200_000, epochs=200, patience=15)
+    return VirtualSettings(base=base, fit_rows=200_000, rows=200_000, epochs=passes, patience=10)
 
 
 def untrained(config: RunConfig) -> ResidualDriver:
@@ -116,7 +118,7 @@ def measured(workers: Workers, road: str) -> list[dict[str, Any]]:
             episodes += driven(workers, scenario, driver, missing, (seed, steps))
             actual = data_of(episodes, scenario).transitions(0.2)
             for name, base in BASES.items():
-                settings = settings_for(base)
+                settings = settings_for(base, PASSES[steps])
                 model = EnvironmentModel(settings, drawn, (seed,))
                 found = fit(model, actual, settings, scenario, "", (seed, steps))
                 rows.append(

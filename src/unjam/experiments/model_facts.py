@@ -3,6 +3,7 @@
 All of it is measured on episodes that no network learned from, and kept in the run folder as `model.json`.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -137,14 +138,19 @@ def _by_bins(values: Floats, errors: OneStepErrors) -> dict[str, Any]:
     }
 
 
-def _replayed(imagination: Imagination, scenario: Scenario, generator: np.random.Generator) -> dict[str, Any]:
-    """Return how recorded accelerations end in the virtual environment, without noise, and some examples.
+def decisions_ahead(stays: Sequence[int]) -> int:
+    """Return over how many decisions to replay stays on the road that were so long [decisions].
 
-    Over half of a usual stay on the road, so that at least half of the stays have places to start from.
+    Over half of a usual one, so that at least half of the stays have places to start from.
     """
+    return min(LONGEST, max(1, int(np.median(stays)) // 2))
+
+
+def _replayed(imagination: Imagination, scenario: Scenario, generator: np.random.Generator) -> dict[str, Any]:
+    """Return how recorded accelerations end in the virtual environment, without noise, and some examples."""
     data, model = imagination.data, imagination.model
     held_out = data.held_out(imagination.settings.holdout)
-    decisions = min(LONGEST, max(1, int(np.median([rows.sum() for rows in held_out if rows.any()])) // 2))
+    decisions = decisions_ahead([int(rows.sum()) for rows in held_out if rows.any()])
     looks = data.looks(decisions)
     looks = looks[[held_out[place][at] for place, at in looks]]
     looks = looks[np.sort(generator.permutation(len(looks))[:STARTS])]
