@@ -80,10 +80,10 @@ def test_only_the_critic_sees_the_road_that_was_drawn(agent: str, sees_road: boo
     task = Task(policy, agent=agent, episodes=2)
     learner = task.learner
     learner.collect_rollouts()
-    with learner.learning() as rows:
-        assert rows.observations.shape == (2 * DECISIONS, INPUTS + sees_road)
-        if sees_road:
-            assert set(rows.observations[:, INPUTS]) == {-1.0, 1.0}
+    rows = next(learner.updates()).rows
+    assert rows.observations.shape == (2 * DECISIONS, INPUTS + sees_road)
+    if sees_road:
+        assert set(rows.observations[:, INPUTS]) == {-1.0, 1.0}
     assert task.learner.observation_space.shape == (INPUTS + sees_road,)
     assert task.learner.network().inputs == INPUTS
 

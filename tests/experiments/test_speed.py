@@ -15,6 +15,7 @@ RATES = ("bare_steps_per_s", "episode_steps_per_s", "traci_steps_per_s", "every_
 def short(monkeypatch: pytest.MonkeyPatch) -> None:
     """Measures less, and so less exactly."""
     monkeypatch.setattr(speed, "TRACI_STEPS", 50)
+    monkeypatch.setattr(speed, "VIRTUAL", {"long": (500, 20), "short": (50, 10)})
     monkeypatch.setattr(speed, "SIZES", {22: 200, 66: 100})
 
 
@@ -49,6 +50,11 @@ def test_measures_rates_and_their_ratios() -> None:
         found["every_step_steps_per_s"] / found["bare_steps_per_s"]
     )
     assert found["over_traci"] > 2.0
+    for rollouts in found["virtual"].values():
+        assert rollouts["over_actual"] == pytest.approx(
+            rollouts["steps_per_s"] / found["episode_steps_per_s"]
+        )
+    assert found["virtual"]["long"]["over_actual"] > 2.0
     for road in found["roads"].values():
         assert road["over_bare"] == pytest.approx(road["episode_steps_per_s"] / road["bare_steps_per_s"])
     costs = [entry["us_per_vehicle_step"] for entry in found["scaling"]]

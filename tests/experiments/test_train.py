@@ -38,6 +38,7 @@ CONTENT = {
     "episodes.parquet",
     "evaluation.json",
     "manifest.json",
+    "model.json",
     "progress.jsonl",
     "report.html",
     "shown.safetensors",

@@ -21,6 +21,7 @@ from unjam.reports.results import read_results
 from unjam.traffic.record import Episode, failed_episode
 
 from .test_metrics import LENGTH, episode_of
+from .test_model_story import facts_of, progress_of
 
 SPEEDS = {"human": 3.0, "pi": 4.0, "trained": 4.5, "follower-stopper": 3.5}
 
@@ -309,6 +310,20 @@ def test_results_in_which_every_episode_failed_still_have_a_page(tmp_path: Path)
     assert "no road" in text
     assert not page.of("img")
     assert not re.search(r"\bnan\b", text)
+
+
+def test_a_run_with_a_virtual_environment_shows_it(tmp_path: Path, written: tuple[str, Page]) -> None:
+    folder = run_in(tmp_path / "virtual")
+    (folder / "progress.jsonl").write_text("".join(to_json(row) + "\n" for row in progress_of()))
+    (folder / "model.json").write_text(to_json(facts_of()))
+    _, page = page_of(folder)
+    assert "The virtual environment" in page.texts["h2"]
+    assert "The virtual environment" not in written[1].texts["h2"]
+    assert len(page.of("img")) == len(written[1].of("img")) + 3
+    assert any("IDM alone, 10 s" in text for text in page.texts["th"])
+    words = " ".join(page.texts["p"])
+    assert "earns 5.50 in the virtual environment" in words
+    assert "so it says nothing" in words
 
 
 def test_the_same_results_give_the_same_page(tmp_path: Path, written: tuple[str, Page], run: Path) -> None:

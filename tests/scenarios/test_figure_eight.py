@@ -5,17 +5,20 @@ import numpy as np
 import pytest
 
 from unjam.errors import InputError
-from unjam.scenarios import SCENARIOS, FigureEight, Road, make_scenario
+from unjam.scenarios import SCENARIOS, FigureEight, make_scenario
 from unjam.scenarios.figure_eight import loop_length
 from unjam.scenarios.registry import scenario_from_recipe, scenario_recipe
+from unjam.scenarios.road import ClosedRoad
 from unjam.traffic.network_files import network_file
 
 ORDER = ["bottom", "top", "upper_ring", "right", "left", "lower_ring"]
 
 
-def drawn(radius: int, **changes: object) -> Road:
+def drawn(radius: int, **changes: object) -> ClosedRoad:
     scenario = make_scenario("figure-eight", {"radius": (radius, radius), **changes})
-    return scenario.draw(np.random.default_rng(0))
+    road = scenario.draw(np.random.default_rng(0))
+    assert isinstance(road, ClosedRoad)
+    return road
 
 
 @pytest.mark.parametrize("radius", [20, 30, 32, 35, 50])

@@ -110,7 +110,8 @@ def test_so_many_cavs_enter_in_the_first_half_as_were_asked_for(seed: int, count
 
 
 def test_cavs_have_names_that_were_announced() -> None:
-    for changes in ({}, {"cavs": 5}, {"penetration": 1.0}, {"inflow": 700.0}):
+    some: list[dict[str, Any]] = [{}, {"cavs": 5}, {"penetration": 1.0}, {"inflow": 700.0}]
+    for changes in some:
         assert drawn(**changes).cav_ids <= set(Merge(**changes).possible_cavs())
 
 

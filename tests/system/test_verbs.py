@@ -40,7 +40,7 @@ METRICS_OF_THE_DESIGN = [
     "speed_limit_ratio_steady",
 ]
 
-VERBS = ["scenarios", "drivers", "drive", "train", "evaluate", "report", "watch", "bench", "doctor"]
+VERBS = ["scenarios", "drivers", "drive", "train", "evaluate", "model", "report", "watch", "bench", "doctor"]
 
 
 def document(ran: subprocess.CompletedProcess[str]) -> Any:
@@ -173,6 +173,15 @@ def test_train_evaluate_report_and_go_on(unjam: Run, tmp_path: Path) -> None:
     (run / "report.html").unlink()
     assert document(unjam("report", "run", "--json"))["report"] == "run/report.html"
     assert "A trained residual on pi".lower() in (run / "report.html").read_text().lower()
+
+    (run / "report.html").unlink()
+    facts = document(unjam("model", "run", "--json"))
+    assert facts["iteration"] == 3
+    assert facts["report"] == "run/report.html"
+    assert "The virtual environment" in (run / "report.html").read_text()
+    table = unjam("model", "run").stdout
+    assert "leader's speed" in table
+    assert "bound C" in table
 
     driven = document(unjam("drive", "ring", "--driver", "run", *SMALL, "-n", 1, "--json"))
     assert driven["episodes"][0]["status"] == "completed"

@@ -63,6 +63,8 @@ WRONG: dict[str, tuple[str, list[str]]] = {
     "resuming what is no run": ("not a run folder", ["train --resume full"]),
     "resuming with a preset": ("not allowed beside it", ["train --resume full --preset demo"]),
     "evaluating what is no run": ("not a run folder", ["evaluate full"]),
+    "virtual environment of what is no run": ("not a run folder", ["model full"]),
+    "virtual environment of a run without one": ("has no virtual environment", ["model model-free"]),
     "report of nothing": ("has no evaluation.json", ["report full"]),
     "report of damaged results": ("damaged", ["report damaged"]),
     "share above one": ("penetration: 2", ["drive merge --driver pi --set penetration=2"]),
@@ -110,6 +112,8 @@ def files(tmp_path: Path, my_drivers: Path) -> None:
         )
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "precious.txt").write_text("keep me")
+    (tmp_path / "model-free").mkdir()
+    (tmp_path / "model-free" / "config.toml").write_text("[virtual]\nvirtual_ratio = 0.0\n")
     (tmp_path / "damaged").mkdir()
     (tmp_path / "damaged" / "evaluation.json").write_text('{"rows": [')
 

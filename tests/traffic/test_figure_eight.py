@@ -10,6 +10,7 @@ from unjam.drivers.pacer import Pacer
 from unjam.reports.metrics import measure
 from unjam.scenarios.figure_eight import FigureEight
 from unjam.scenarios.scenario import SMALLEST_CAV_GAP
+from unjam.traffic.closed import ClosedTraffic
 from unjam.traffic.episode import run_episode
 from unjam.traffic.simulation import Simulation
 from unjam.traffic.stepping import make_traffic
@@ -41,6 +42,7 @@ def test_agrees_with_flow_within_six_percent_without_collision() -> None:
 
 def test_leader_and_gap_are_those_of_sumo(simulation: Simulation) -> None:
     traffic = make_traffic(FigureEight(cavs=14), (3,), simulation)
+    assert isinstance(traffic, ClosedTraffic)
     traffic.start(controlled=True)
     ids, compared = traffic.road.vehicle_ids, 0
     for _ in range(400):
@@ -71,6 +73,7 @@ def test_on_the_crossing_people_are_left_to_sumo(
     simulation: Simulation, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     traffic = make_traffic(FigureEight(radius=(32, 32)), (0,), simulation)
+    assert isinstance(traffic, ClosedTraffic)
     asked: list[tuple[str, float]] = []
     monkeypatch.setattr(
         simulation, "command_speeds", lambda ids, speeds: asked.extend(zip(ids, speeds, strict=True))

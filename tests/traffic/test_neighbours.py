@@ -5,6 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from unjam.scenarios import Ring
+from unjam.traffic.closed import ClosedTraffic
 from unjam.traffic.neighbours import loop_neighbours, loop_state
 from unjam.traffic.simulation import Simulation
 from unjam.traffic.stepping import make_traffic
@@ -90,6 +91,7 @@ def test_leaders_and_gaps_in_running_traffic_are_sumos(
     steps = 300
     ring = Ring(length=(length, length), vehicles=vehicles, cavs=cavs, warmup=40, horizon=steps)
     traffic = make_traffic(ring, (3,), simulation)
+    assert isinstance(traffic, ClosedTraffic)
     traffic.start(controlled=True)
     pushes = np.random.default_rng(0).uniform(-0.6, 1.0, (steps, cavs))
     names, seen = traffic.road.vehicle_ids, []
@@ -113,6 +115,7 @@ def test_leaders_and_gaps_in_running_traffic_are_sumos(
 def test_positions_are_sumos_own_along_the_road(simulation: Simulation) -> None:
     ring = Ring(length=(222, 222), warmup=30, horizon=400)
     traffic = make_traffic(ring, (1,), simulation)
+    assert isinstance(traffic, ClosedTraffic)
     traffic.start(controlled=False)
     for _ in range(400):
         traffic.advance(None)

@@ -7,7 +7,7 @@ import pytest
 from unjam.drivers import IDM, PISaturation
 from unjam.errors import EpisodeError, UnjamError
 from unjam.scenarios import Ring
-from unjam.scenarios.scenario import Road
+from unjam.scenarios.road import ClosedRoad
 from unjam.traffic.episode import run_episode
 from unjam.traffic.simulation import Backend, Simulation
 from unjam.traffic.stepping import make_traffic
@@ -18,7 +18,7 @@ RING = Ring(horizon=100, length=(230, 230))
 
 
 @pytest.fixture
-def road(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Road:
+def road(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> ClosedRoad:
     monkeypatch.setenv("UNJAM_CACHE", str(tmp_path))
     return RING.draw(np.random.default_rng(0))
 
@@ -49,7 +49,7 @@ def test_simulations_over_traci_run_beside_it_without_disturbing_it(simulation: 
     np.testing.assert_array_equal(again.speeds, expected.speeds)
 
 
-def test_closing_twice_is_fine_and_makes_room_for_a_new_one(road: Road) -> None:
+def test_closing_twice_is_fine_and_makes_room_for_a_new_one(road: ClosedRoad) -> None:
     first = Simulation()
     first.load(road, 0.1, 0)
     first.close()
@@ -67,7 +67,7 @@ def test_one_that_never_ran_can_be_closed() -> None:
     Simulation().close()
 
 
-def test_closing_removes_its_files(road: Road, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_closing_removes_its_files(road: ClosedRoad, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     with Simulation() as simulation:
         simulation.load(road, 0.1, 0)
@@ -75,7 +75,7 @@ def test_closing_removes_its_files(road: Road, tmp_path: Path, monkeypatch: pyte
     assert not list(tmp_path.glob("unjam-*"))
 
 
-def test_an_error_inside_the_block_closes_it(road: Road) -> None:
+def test_an_error_inside_the_block_closes_it(road: ClosedRoad) -> None:
     def fail() -> None:
         with Simulation() as simulation:
             simulation.load(road, 0.1, 0)
@@ -86,7 +86,7 @@ def test_an_error_inside_the_block_closes_it(road: Road) -> None:
     Simulation().close()
 
 
-def test_loading_puts_every_vehicle_in_its_place_at_rest(road: Road, simulation: Simulation) -> None:
+def test_loading_puts_every_vehicle_in_its_place_at_rest(road: ClosedRoad, simulation: Simulation) -> None:
     simulation.load(road, 0.1, 0)
     assert simulation.vehicle_count() == 22
     assert simulation.speeds(road.vehicle_ids) == [0.0] * 22
@@ -106,7 +106,7 @@ BROKEN_TRAFFIC = {
 @pytest.mark.parametrize("loaded_before", [False, True])
 @pytest.mark.parametrize(("traffic", "words"), BROKEN_TRAFFIC.items())
 def test_sumos_own_words_about_broken_traffic_reach_the_user_in_one_line(
-    loaded_before: bool, traffic: str, words: str, road: Road, simulation: Simulation
+    loaded_before: bool, traffic: str, words: str, road: ClosedRoad, simulation: Simulation
 ) -> None:
     if loaded_before:
         simulation.load(road, 0.1, 0)
@@ -116,7 +116,7 @@ def test_sumos_own_words_about_broken_traffic_reach_the_user_in_one_line(
     assert "\n" not in str(caught.value)
 
 
-def test_sumos_own_words_come_from_the_child_process_too(road: Road) -> None:
+def test_sumos_own_words_come_from_the_child_process_too(road: ClosedRoad) -> None:
     for traffic, words in list(BROKEN_TRAFFIC.items())[:2]:
         with Simulation("traci") as simulation, pytest.raises(EpisodeError) as caught:
             simulation.load(replace(road, traffic=traffic), 0.1, 0)
@@ -132,7 +132,7 @@ BROKEN_ROADS = {
 
 @pytest.mark.parametrize(("change", "words"), BROKEN_ROADS.items())
 def test_netconverts_own_words_about_a_broken_road_reach_the_user_in_one_line(
-    change: tuple[str, str], words: str, road: Road, simulation: Simulation
+    change: tuple[str, str], words: str, road: ClosedRoad, simulation: Simulation
 ) -> None:
     with pytest.raises(EpisodeError) as caught:
         simulation.load(replace(road, network=replace(road.network, **dict([change]))), 0.1, 0)
@@ -140,7 +140,9 @@ def test_netconverts_own_words_about_a_broken_road_reach_the_user_in_one_line(
     assert "\n" not in str(caught.value)
 
 
-def test_an_error_names_its_own_reason_and_not_an_earlier_one(road: Road, simulation: Simulation) -> None:
+def test_an_error_names_its_own_reason_and_not_an_earlier_one(
+    road: ClosedRoad, simulation: Simulation
+) -> None:
     for traffic, words in BROKEN_TRAFFIC.items():
         with pytest.raises(EpisodeError) as caught:
             simulation.load(replace(road, traffic=traffic), 0.1, 0)
@@ -149,7 +151,9 @@ def test_an_error_names_its_own_reason_and_not_an_earlier_one(road: Road, simula
 
 
 @pytest.mark.parametrize("backend", ["libsumo", "traci"])
-def test_after_a_refused_road_the_next_one_runs_as_in_a_new_simulation(backend: Backend, road: Road) -> None:
+def test_after_a_refused_road_the_next_one_runs_as_in_a_new_simulation(
+    backend: Backend, road: ClosedRoad
+) -> None:
     expected = run_episode(RING, IDM(), (0,))
     first, second, *_ = BROKEN_TRAFFIC
     with Simulation(backend) as simulation:

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from unjam.drivers import IDM, ResidualDriver
-from unjam.virtual.comparison import open_loop, return_gap
+from unjam.virtual.comparison import one_step_errors, open_loop, recorded, replay, return_gap
 from unjam.virtual.data import ActualData
 from unjam.virtual.fitting import fit
 from unjam.virtual.model import NUMBERS, EnvironmentModel
@@ -61,6 +61,38 @@ def test_learning_brings_virtual_and_actual_together() -> None:
         assert after.error[name][-1] < 0.6 * before.error[name][-1]
         assert 0.0 < after.spread[name][-1] < 2 * after.error[name][-1]
     assert after.error["speed"].max() < 1e-3
+
+
+def test_each_member_drives_alone_from_what_was_recorded() -> None:
+    data = known_ahead(LittleWorld())
+    model = alone()
+    fit(model, data.transitions(0.2), SETTINGS, RING, "", (2,))
+    looks = data.looks(30)[:5]
+    actual, virtual = recorded(data, looks, 30), replay(model, data, looks, 30, RING)
+    for name in NUMBERS:
+        assert virtual[name].shape == (3, 5, 30)
+        assert actual[name].shape == (5, 31)
+        np.testing.assert_array_equal(actual[name][:, 0], getattr(data.states_at(looks), name))
+    assert np.ptp(virtual["leader_speed"], axis=0)[:, -1].min() > 0.0
+    np.testing.assert_allclose(
+        virtual["leader_speed"][1, :1], replay(model, data, looks[:1], 30, RING)["leader_speed"][1], rtol=1e-4
+    )
+
+
+def test_errors_one_step_ahead_are_those_of_the_fit() -> None:
+    data, model = known_ahead(LittleWorld()), alone()
+    actual = data.transitions(0.2)
+    found = fit(model, actual, SETTINGS, RING, "", (2,))
+    errors = one_step_errors(model, actual.chosen(np.flatnonzero(actual.held_out)), RING, "")
+    assert errors.model.shape == (3, found.held_out, 6)
+    for name, error in errors.by_number().items():
+        assert error == pytest.approx(found.one_step[name], rel=1e-6, abs=1e-9), name
+
+
+def test_a_new_model_is_as_wrong_as_its_base() -> None:
+    errors = one_step_errors(alone(), known_ahead(LittleWorld()).transitions(0.2), RING, "")
+    for member in errors.model:
+        np.testing.assert_array_equal(member, errors.base)
 
 
 def test_in_the_true_world_there_is_no_gap_between_returns() -> None:

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from unjam.drivers import LocalState, PISaturation, ResidualDriver
+from unjam.drivers import IDM, LocalState, PISaturation, ResidualDriver
 from unjam.errors import InputError
 from unjam.scenarios import Ring
 from unjam.traffic.record import Episode, Trajectory
@@ -130,3 +130,15 @@ def test_unpacked_data_are_what_was_packed() -> None:
     assert fingerprint(tuple(again.recordings)) == fingerprint(tuple(data.recordings))
     assert (again.rows, again.episodes) == (data.rows, data.episodes)
     assert again.recordings[0].memory.keys() == {"window", "total", "seen", "command"}
+
+
+def test_chosen_rows_are_those_of_each_column() -> None:
+    actual = actual_data(LittleWorld(), ResidualDriver(IDM(), random_network(), 1.0), 2, 30).transitions(0.2)
+    rows = np.array([7, 3, 41])
+    found = actual.chosen(rows)
+    for name, values in actual._asdict().items():
+        pairs = [(values, getattr(found, name))]
+        if isinstance(values, LocalState):
+            pairs = list(zip(values, getattr(found, name), strict=True))
+        for all_of_them, chosen in pairs:
+            np.testing.assert_array_equal(chosen, all_of_them[rows])

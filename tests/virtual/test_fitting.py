@@ -89,6 +89,14 @@ def test_the_base_is_used_where_nothing_can_be_learned(actual: Transitions) -> N
     assert (answers[:, TARGETS.index("follower_speed")] == 0.0).all()
 
 
+def test_a_number_that_never_varied_misleads_nobody_where_it_does(actual: Transitions) -> None:
+    """As the length of the ring, of which the first episodes may have a single one."""
+    other = actual.drawn + np.where(actual.held_out, 0.5, 0.1 / 3.0)[:, None]
+    _, found = fitted(actual._replace(drawn=other))
+    for name in ("leader_speed", "leader_gap"):
+        assert found.one_step[name].model < 0.5 * found.one_step[name].base, name
+
+
 def test_noise_is_what_the_holdout_was_off_by(actual: Transitions) -> None:
     generator = np.random.default_rng(1)
     error = generator.normal(size=len(actual.applied))

@@ -114,10 +114,20 @@ class Imagination:
 
     def bound(self, eps_pi: float, gamma: float) -> float:
         """Return the bound C for this iteration; `gamma` is the discount from look to look."""
-        hold = self._policy.decisions_held(self._scenario.decision_step)
-        largest = max(float(np.abs(kept.reward).max()) for kept in self.data.recordings)
-        eps_m = self.facts["eps_m_by_estimator"]["total_variation"]
-        return return_bound(eps_pi, eps_m, self.k_star, gamma ** (1 / hold), largest)
+        return self.bound_at(self.k_star, eps_pi, self.facts["eps_m_by_estimator"]["total_variation"], gamma)
+
+    def bound_at(self, k: int, eps_pi: float, eps_m: float, gamma: float) -> float:
+        """Return the bound C with rollouts of `k` decisions; `gamma` is the discount from look to look."""
+        return return_bound(eps_pi, eps_m, k, self.decision_discount(gamma), self.largest_reward)
+
+    @property
+    def largest_reward(self) -> float:
+        """R_max: the largest |reward| of a decision in the actual data."""
+        return max(float(np.abs(kept.reward).max()) for kept in self.data.recordings)
+
+    def decision_discount(self, gamma: float) -> float:
+        """Return the discount from decision to decision; `gamma` is that from look to look."""
+        return gamma ** (1 / self._policy.decisions_held(self._scenario.decision_step))
 
     def state(self) -> tuple[dict[str, Any], dict[str, torch.Tensor]]:
         """Return all that a run must keep of it to go on, as JSON and tensors."""

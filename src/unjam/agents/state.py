@@ -7,6 +7,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 
 from unjam.agents.algorithms import SAC
 from unjam.agents.episodic import Episodic
+from unjam.agents.imagination import Imagination
 
 Tensors = dict[str, torch.Tensor]
 
@@ -50,13 +51,18 @@ def restore_learner(learner: Episodic, counters: dict[str, Any], tensors: Tensor
     learner.num_timesteps = counters["actual_steps"]
     learner._n_updates = counters["updates"]
     if learner.training.imagination is not None:
-        kept = {n.removeprefix(VIRTUAL): tensor for n, tensor in tensors.items() if n.startswith(VIRTUAL)}
-        learner.training.imagination.restore(counters["virtual"], kept)
+        restore_imagination(learner.training.imagination, counters, tensors)
     if isinstance(learner, SAC):
         for name in REPLAY_PLACE:
             setattr(learner.replay_buffer, name, counters[name])
         for name, tensor in _tensors_in_place(learner).items():
             tensor.detach().copy_(tensors[name])
+
+
+def restore_imagination(imagination: Imagination, counters: dict[str, Any], tensors: Tensors) -> None:
+    """Put a virtual environment made from the same configuration into the state of its learner."""
+    kept = {name.removeprefix(VIRTUAL): t for name, t in tensors.items() if name.startswith(VIRTUAL)}
+    imagination.restore(counters["virtual"], kept)
 
 
 def _tensors_in_place(learner: SAC) -> Tensors:

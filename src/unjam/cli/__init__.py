@@ -15,6 +15,7 @@ from unjam.cli.doctor import doctor
 from unjam.cli.drive import drive
 from unjam.cli.evaluate import evaluate
 from unjam.cli.lists import drivers, scenarios
+from unjam.cli.model import model
 from unjam.cli.report import report
 from unjam.cli.train import train
 from unjam.cli.watch import watch
@@ -47,7 +48,7 @@ def _root(
     pass
 
 
-for verb in (scenarios, drivers, drive, train, evaluate, report, watch, bench, doctor):
+for verb in (scenarios, drivers, drive, train, evaluate, model, report, watch, bench, doctor):
     app.command()(verb)
 
 

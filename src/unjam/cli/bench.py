@@ -11,7 +11,7 @@ def bench(
     rounds: Annotated[int, typer.Option(min=1, help="Rounds in which all parts are measured in turn.")] = 7,
     json: JsonOption = False,
 ) -> None:
-    """Measure how fast episodes run here, beside bare SUMO and beside the same calls over TraCI.
+    """Measure how fast episodes run here, beside bare SUMO, the same over TraCI, and virtual ones.
 
     One core. Look at the ratios: steps per second change with the machine, and with the minute.
 
@@ -48,6 +48,12 @@ def bench(
         f"{found['traci_steps_per_s']:,.0f}",
         f"{found['over_traci']:.1f} times slower",
     )
+    for rollouts in found["virtual"].values():
+        table.add_row(
+            f"virtual environment, {rollouts['rows']:,} rollouts of {rollouts['decisions']} decisions",
+            f"{rollouts['steps_per_s']:,.0f}",
+            f"{rollouts['over_actual']:.0f} times run_episode",
+        )
     for name, road in found["roads"].items():
         table.add_row(f"{name}: bare SUMO", f"{road['bare_steps_per_s']:,.0f}", "1")
         speed, ratio = road["episode_steps_per_s"], road["over_bare"]

@@ -29,6 +29,9 @@ class Driver:
     """True where `act` also takes torch tensors, as in the virtual environment; otherwise it is asked there
     through NumPy, which is slower."""
 
+    needs_loop: ClassVar[bool] = False
+    """True where it must know its place on a closed road"""
+
     native: ClassVar[bool] = False
     """True where the simulator itself drives (a human driver): `act` is then not asked."""
 

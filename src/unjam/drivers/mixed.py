@@ -33,6 +33,11 @@ class Mixed(Driver):
         """Whether all of them take tensors."""
         return all(getattr(driver, "tensors", False) for driver in self.drivers)
 
+    @property
+    def needs_loop(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Whether one of them must know its place on a closed road."""
+        return any(driver.needs_loop for driver in self.drivers)
+
     def initial_memory(self, n: int) -> Memory:
         """Return which driver each CAV has, and what all drivers would remember of it."""
         memory: Memory = {KIND: np.arange(n, dtype=np.float64) % len(self.drivers)}

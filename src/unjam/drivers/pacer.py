@@ -39,6 +39,7 @@ class Pacer(Driver):
 
     plain_numbers: ClassVar[bool] = True
     tensors: ClassVar[bool] = True
+    needs_loop: ClassVar[bool] = True
 
     lap_time: Positive = 69.0
     """time for a lap [s]: 6.5 m/s at a radius of 32 m, 7.1 m/s at 35 m"""

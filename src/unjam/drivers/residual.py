@@ -87,6 +87,11 @@ class ResidualDriver(Driver):
         """Whether the expert takes tensors; the network does."""
         return getattr(self.expert, "tensors", False)
 
+    @property
+    def needs_loop(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Whether the expert must know its place on a closed road."""
+        return self.expert.needs_loop
+
     @cached_property
     def _keys(self) -> tuple[str, str]:
         """Names of the held residual and its age in the memory: others than those of an expert like this."""

@@ -66,14 +66,17 @@ def evaluate(
         if progress is not None:
             progress(pairs[task], steps)
 
-    episodes = workers.run(tasks, told)
-    by_label: dict[str, list[Episode]] = {label: [] for label in drivers}
-    for (label, _), episode in zip(pairs, episodes, strict=True):
-        by_label[label].append(episode)
-    return Evaluation(
-        rows={label: [measure(episode) for episode in found] for label, found in by_label.items()},
-        shown={label: found[0] for label, found in by_label.items() if found[0].ok},
-    )
+    def measured(task: int, episode: Episode) -> tuple[dict[str, Any], Episode | None]:
+        _, index = pairs[task]
+        return measure(episode), episode if index == 0 and episode.ok else None
+
+    rows: dict[str, list[dict[str, Any]]] = {label: [] for label in drivers}
+    shown: dict[str, Episode] = {}
+    for (label, _), (row, episode) in zip(pairs, workers.run_each(tasks, measured, told), strict=True):
+        rows[label].append(row)
+        if episode is not None:
+            shown[label] = episode
+    return Evaluation(rows, shown)
 
 
 def raise_failure(rows: Sequence[dict[str, Any]]) -> None:

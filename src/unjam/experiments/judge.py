@@ -17,11 +17,14 @@ TRAINED = "trained"
 
 def comparison(config: RunConfig, folder: Path, baselines: Sequence[str]) -> dict[str, Driver]:
     """Return the drivers to compare, by label: the baselines, the run's expert, its trained controller."""
-    time_step = config.make_scenario().decision_step
+    scenario = config.make_scenario()
+    time_step = scenario.decision_step
     expert = {} if config.expert == "none" else {describe(made := config.make_expert()): made}
     drivers: dict[str, Driver] = {}
     for name in baselines:
         driver = make_driver(name, time_step)
+        if driver.needs_loop and not scenario.closed:
+            continue
         drivers[free_label(driver, {**expert, **drivers})] = driver
     return {**drivers, **expert, TRAINED: make_driver(str(folder), time_step)}
 

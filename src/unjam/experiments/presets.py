@@ -35,7 +35,8 @@ PRESETS: dict[str, dict[str, Any]] = {
             "start_steps": 10_000,
             "start": "uniform",
         },
+        "virtual": {"k_max": 500, "kappa": 2.0, "virtual_ratio": 1.0},
     },
     # Ends within about five minutes on two cores, evaluation included.
-    "demo": {"steps": 960_000},
+    "demo": {"steps": 480_000},
 }

@@ -14,6 +14,7 @@ from statistics import median
 from typing import Any
 
 import numpy as np
+import torch
 
 from unjam.agents.settings import PolicySettings
 from unjam.drivers.network import Network
@@ -21,14 +22,24 @@ from unjam.drivers.pi_saturation import PISaturation
 from unjam.drivers.residual import ResidualDriver
 from unjam.scenarios.registry import SCENARIOS
 from unjam.scenarios.ring import Ring
+from unjam.scenarios.scenario import Scenario
 from unjam.traffic.episode import drive_traffic, run_episode
+from unjam.traffic.record import Episode
 from unjam.traffic.simulation import Simulation
 from unjam.traffic.stepping import make_traffic
+from unjam.virtual.data import ActualData
+from unjam.virtual.model import EnvironmentModel, torch_generator
+from unjam.virtual.rollout import begin, draw_starts, imagine
+from unjam.virtual.settings import VirtualSettings
+from unjam.virtual.world import VirtualWorld
 
 ROUNDS = 7
 TRACI_STEPS = 200
 SIZES = {22: 3000, 220: 800, 2200: 200}
 """vehicles on the ring, one CAV in 22, and decisions driven"""
+VIRTUAL = {"long": (2000, 50), "short": (1200, 10)}
+"""virtual rows, and decisions of each: a model that is trusted for long; one that is not, as in an iteration
+of training on the ring"""
 METRES_PER_VEHICLE = 245 / 22
 OTHER_ROADS = ("figure-eight", "merge")
 """roads beside the ring on which `run_episode` is compared with SUMO alone"""
@@ -52,6 +63,8 @@ def measure_speed(rounds: int = ROUNDS, told: Callable[[str], None] | None = Non
     residual driver that training makes by default, whose network looks once a second.
     `over_bare_every_step`: the same with a network that looks in every step.
     `over_traci`: steps/s of the same driving loop with libsumo over those through TraCI.
+    `virtual`: decisions/s of virtual rollouts, with the default ensemble and beginning them included, over
+    those of `run_episode`.
     `roads`: `over_bare` on other roads.
     `growth`: the largest cost of a vehicle-step over that of the smallest road.
     """
@@ -72,17 +85,22 @@ def _measure(rounds: int, say: Callable[[str], None]) -> dict[str, Any]:
     every_step = neural_driver(1)
     found: dict[str, list[float]] = {"bare": [], "episode": [], "every_step": [], "loop": [], "traci": []}
     others: dict[str, dict[str, list[float]]] = {name: {"bare": [], "episode": []} for name in OTHER_ROADS}
+    virtual: dict[str, list[float]] = {name: [] for name in VIRTUAL}
+    torch.set_num_threads(1)
     with Simulation() as simulation:
-        for name in ("ring", *OTHER_ROADS):  # networks made, caches warm
+        for name in OTHER_ROADS:  # networks made, caches warm
             run_episode(SCENARIOS[name], driver, (0,), explore=True, simulation=simulation)
+        driven = run_episode(ring, driver, (0,), explore=True, simulation=simulation)
     for number in range(1, rounds + 1):
         say(f"round {number} of {rounds}")
         with Simulation() as simulation:
             make_traffic(ring, (number,), simulation)
             found["bare"].append(_rate(partial(_step, simulation, ring.horizon), ring.horizon))
-            for name, driven in (("episode", driver), ("every_step", every_step)):
-                run = partial(run_episode, ring, driven, (number,), explore=True, simulation=simulation)
+            for name, who in (("episode", driver), ("every_step", every_step)):
+                run = partial(run_episode, ring, who, (number,), explore=True, simulation=simulation)
                 found[name].append(_rate(run, ring.horizon))
+            for name, (rows, decisions) in VIRTUAL.items():
+                virtual[name].append(_virtual_rate(driven, ring, driver, rows, decisions))
             found["loop"].append(_loop_rate(ring, driver, simulation))
             for name, rates in others.items():
                 road = SCENARIOS[name]
@@ -104,6 +122,15 @@ def _measure(rounds: int, say: Callable[[str], None]) -> dict[str, Any]:
         "over_bare": _median_ratio(found["episode"], found["bare"]),
         "over_bare_every_step": _median_ratio(found["every_step"], found["bare"]),
         "over_traci": _median_ratio(found["loop"], found["traci"]),
+        "virtual": {
+            name: {
+                "rows": VIRTUAL[name][0],
+                "decisions": VIRTUAL[name][1],
+                "steps_per_s": median(rates),
+                "over_actual": _median_ratio(rates, found["episode"]),
+            }
+            for name, rates in virtual.items()
+        },
         "roads": {
             name: {
                 "bare_steps_per_s": median(rates["bare"]),
@@ -140,6 +167,23 @@ def _loop_rate(scenario: Ring | Any, driver: ResidualDriver, simulation: Simulat
     """Return decisions per second of the driving loop alone."""
     traffic = make_traffic(scenario, (1,), simulation, driver.plain_numbers)
     return _rate(lambda: drive_traffic(traffic, driver, explore=True), scenario.horizon)
+
+
+def _virtual_rate(
+    episode: Episode, scenario: Scenario, driver: ResidualDriver, rows: int, decisions: int
+) -> float:
+    """Return virtual decisions per second of rollouts from an actual episode."""
+    data = ActualData(episode.steps)
+    data.add([episode], scenario)
+    model = EnvironmentModel(VirtualSettings(), len(scenario.drawn_ranges), (0,))
+    generator = torch_generator((0,), "cpu")
+    world = VirtualWorld(model, scenario, "", generator)
+    looks = draw_starts(data, rows, 1, (0,))
+
+    def run() -> None:
+        imagine(driver, world, begin(data, looks, driver.expert, "cpu"), decisions, generator)
+
+    return _rate(run, rows * decisions)
 
 
 def _step(simulation: Simulation, steps: int) -> None:

@@ -14,6 +14,7 @@ from unjam.errors import InputError
 from unjam.experiments.config import RunConfig, load_config, to_toml
 from unjam.experiments.judge import TRAINED, judge
 from unjam.experiments.manifest import manifest
+from unjam.experiments.model_facts import write_model_facts
 from unjam.experiments.run import Run, Told
 from unjam.files import make_folder, to_json, write_whole
 from unjam.reports.html import write_report
@@ -80,6 +81,8 @@ def train(
     with Workers(config.workers) as workers:
         Run(folder, config, workers, told).train()
         found = judge(folder, config, workers, progress=progress)
+    if config.virtual.virtual_ratio > 0:
+        write_model_facts(folder, config)
     write_report([folder], folder / "report.html")
     return TrainResult(folder, found.rows, gain_of(config, found.rows))
 

@@ -19,6 +19,8 @@ from unjam.reports.figures import (
     space_time,
     time_split,
 )
+from unjam.reports.model_figures import errors, examples, trust
+from unjam.reports.model_story import model_section
 from unjam.reports.replay import replay_data
 from unjam.reports.results import Results, Shown, command_to_repeat, read_results
 from unjam.reports.statistics import estimate
@@ -71,6 +73,7 @@ def render(results: Sequence[Results]) -> str:
         if all(episode.closed for episode in panels)
         else "Speed, waves and queues over time",
         learning_note="Validation uses fixed seeds and chooses the controller; the table uses other seeds.",
+        model=model_section(single) if single else None,
         columns=[column.name for column in columns],
         table=table_of(columns),
         table_note=_table_note(columns),
@@ -127,7 +130,12 @@ def _pictures(results: Sequence[Results], panels: Sequence[Shown]) -> dict[str, 
         references = _references(results)
         add("learning_curve", "svg", lambda wide: learning_curve(runs, references, wide))
     if len(results) == 1 and results[0].progress:
-        add("time_split", "svg", lambda wide: time_split(results[0].progress, wide))
+        progress, model = results[0].progress, results[0].model
+        add("time_split", "svg", lambda wide: time_split(progress, wide))
+        if model is not None:
+            add("model_examples", "svg", lambda wide: examples(model, wide))
+            add("model_errors", "svg", lambda wide: errors(model, wide))
+            add("model_trust", "svg", lambda wide: trust(progress, model, wide))
     return pictures
 
 

@@ -17,6 +17,8 @@ from unjam.errors import InputError
 Floats = NDArray[np.float32]
 
 
+MODEL_FILE = "model.json"
+"""what there is to see of a run's virtual environment"""
 PICTURED = ("speeds", "positions", "gaps", "outline", "waiting", "lines", "places")
 """arrays of an episode that pictures are made of"""
 
@@ -84,6 +86,8 @@ class Results:
     """a row per iteration of training; empty without one"""
     config: str = ""
     """the run's configuration, as TOML"""
+    model: dict[str, Any] | None = None
+    """what there is to see of the virtual environment; None without one"""
 
     @property
     def trained(self) -> str | None:
@@ -116,7 +120,8 @@ def _results(folder: Path, about: dict[str, Any], arrays: dict[str, NDArray[Any]
         values: dict[str, Any] = {key: _nan(value) for key, value in entry.items() if key != "seed"}
         values |= {name: arrays[f"{number}.{name}"] for name in PICTURED}
         shown[entry["driver"]] = Shown(**values)
-    return Results(folder, about, rows, shown, read_progress(folder), _text(folder / "config.toml"))
+    config = _text(folder / "config.toml")
+    return Results(folder, about, rows, shown, read_progress(folder), config, read_model(folder))
 
 
 def read_progress(folder: Path) -> list[dict[str, Any]]:
@@ -128,6 +133,15 @@ def read_progress(folder: Path) -> list[dict[str, Any]]:
         except ValueError:
             break
     return rows
+
+
+def read_model(folder: Path) -> dict[str, Any] | None:
+    """Return what a run's `model.json` says; None where there is none, or none that can be read."""
+    try:
+        found = json.loads(_text(folder / MODEL_FILE))
+    except ValueError:
+        return None
+    return found if isinstance(found, dict) else None
 
 
 def _text(path: Path) -> str:

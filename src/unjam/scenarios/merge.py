@@ -46,6 +46,7 @@ class Merge(Scenario):
 
     title: ClassVar[str] = "merge"
     reward: ClassVar[str] = "released-merge"
+    closed: ClassVar[bool] = False
     people_gap: ClassVar[float] = 2.5
 
     inflow: Positive = 2000.0

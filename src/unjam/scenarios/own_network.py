@@ -35,6 +35,7 @@ class OwnNetwork(Scenario):
 
     title: ClassVar[str] = "own-network"
     reward: ClassVar[str] = "released"
+    closed: ClassVar[bool] = False
 
     file: str = ""
     """the .sumocfg file"""

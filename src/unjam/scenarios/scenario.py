@@ -46,6 +46,8 @@ class Scenario:
     title: ClassVar[str]
     reward: ClassVar[str]
     """reward used where none is named"""
+    closed: ClassVar[bool] = True
+    """whether the road is a loop"""
     people_gap: ClassVar[float] = 0.0
     """gap that SUMO keeps for commanded people [m]"""
 

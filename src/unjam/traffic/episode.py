@@ -55,6 +55,8 @@ def run_episode(
         InputError: driver or reward answer something that is not finite, or of a wrong shape.
         EpisodeError: SUMO cannot run the scenario.
     """
+    if driver.needs_loop and not scenario.closed:
+        raise InputError(f"driver: it is not allowed on {scenario.title}: it needs a closed road")
     earned = make_reward(reward or scenario.reward)
     if simulation is None:
         with Simulation() as simulation:

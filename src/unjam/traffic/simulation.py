@@ -25,8 +25,9 @@ Backend = Literal["libsumo", "traci", "gui"]
 
 SPEED_MODES = {"shielded": 31, "raw": 30, "flow": 25}
 """SUMO's speed mode bits for each way of actuation: bit 0 is the check for a safe speed."""
-WITHOUT_RIGHT_OF_WAY = 7
-"""the bits that stay where vehicles need not obey the right of way"""
+WITHOUT_RIGHT_OF_WAY = 1
+"""the bit that stays where vehicles need not obey the right of way: who is surprised on a junction then stops
+as fast as it must, and so must who follows"""
 
 _exhaust = deque(maxlen=0).extend
 """runs through an iterator, in C: a loop would cost as much as the calls"""

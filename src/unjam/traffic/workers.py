@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, Self, TypeVar
 
 from unjam.drivers.driver import Driver
 from unjam.drivers.registry import recipe_of
@@ -25,6 +25,7 @@ ATTEMPTS = 3
 SILENCE = 30.0
 """seconds without a sign of life after which a worker counts as hung"""
 
+Kept = TypeVar("Kept")
 Message = tuple[dict[str, Any], Arrays]
 
 
@@ -87,9 +88,23 @@ class Workers:
 
         `progress` is called with a task's index and its decisions so far, from several threads.
         """
-        futures = [
-            self._threads.submit(self._run_one, index, task, progress) for index, task in enumerate(tasks)
-        ]
+        return self.run_each(tasks, lambda index, episode: episode, progress)
+
+    def run_each(
+        self,
+        tasks: Sequence[EpisodeTask],
+        keep: Callable[[int, Episode], Kept],
+        progress: Callable[[int, int], None] | None = None,
+    ) -> list[Kept]:
+        """Run all tasks and return what `keep` makes of each index and episode: many need much memory.
+
+        `keep` is called as an episode ends, from several threads.
+        """
+
+        def run_one(index: int, task: EpisodeTask) -> Kept:
+            return keep(index, self._run_one(index, task, progress))
+
+        futures = [self._threads.submit(run_one, index, task) for index, task in enumerate(tasks)]
         try:
             return [future.result() for future in futures]
         except BaseException:

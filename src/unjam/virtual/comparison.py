@@ -12,8 +12,10 @@ from unjam.drivers.local_state import LocalState
 from unjam.drivers.residual import ResidualDriver
 from unjam.scenarios.scenario import Scenario
 from unjam.traffic.record import Floats
-from unjam.virtual.data import ActualData
+from unjam.virtual.data import ActualData, Transitions
+from unjam.virtual.fitting import answers_of, changes_of, inputs_of, targets_of
 from unjam.virtual.model import NUMBERS, EnvironmentModel, torch_generator
+from unjam.virtual.model_error import OneStepErrors
 from unjam.virtual.rollout import begin, imagine
 from unjam.virtual.world import VirtualWorld, World
 
@@ -29,10 +31,32 @@ class OpenLoop(NamedTuple):
     """root mean square of what happened: how far the actual state is from its start, shape (H,)"""
 
 
-@torch.no_grad()
 def open_loop(
     model: EnvironmentModel, data: ActualData, looks: NDArray[np.int64], decisions: int, scenario: Scenario
 ) -> OpenLoop:
+    """Replay recorded accelerations in the virtual environment, and tell how far it goes astray.
+
+    The arguments are those of `replay`.
+    """
+    actual = recorded(data, looks, decisions)
+    error, spread, change = {}, {}, {}
+    for name, virtual in replay(model, data, looks, decisions, scenario).items():
+        error[name] = np.sqrt(np.square(virtual - actual[name][:, 1:]).mean((0, 1)))
+        spread[name] = np.sqrt(virtual.var(0).mean(0))
+        change[name] = np.sqrt(np.square(actual[name][:, 1:] - actual[name][:, :1]).mean(0))
+    return OpenLoop(error, spread, change)
+
+
+def recorded(data: ActualData, looks: NDArray[np.int64], decisions: int) -> dict[str, Floats]:
+    """Return what happened from `looks` on, by number of the state [m/s, m], shape (rows, H + 1)."""
+    windows = [(data.recordings[place].states, slice(at, at + decisions + 1)) for place, at in looks]
+    return {name: np.stack([getattr(states, name)[at] for states, at in windows]) for name in NUMBERS}
+
+
+@torch.no_grad()
+def replay(
+    model: EnvironmentModel, data: ActualData, looks: NDArray[np.int64], decisions: int, scenario: Scenario
+) -> dict[str, Floats]:
     """Replay recorded accelerations in the virtual environment, without noise, each member by itself.
 
     Args:
@@ -41,6 +65,9 @@ def open_loop(
         looks: where to begin, rows (recording, decision); at least `decisions` recorded ones must follow.
         decisions: H.
         scenario: the road.
+
+    Returns:
+        By number of the state [m/s, m], shape (members, rows, H).
     """
     device = model.input_mean.device
     starts = begin(data, looks, Constant(), device)
@@ -49,25 +76,23 @@ def open_loop(
     world = VirtualWorld(model, scenario, "", generator, noise=False, members=members)
     state = LocalState(*(values.repeat(model.members) for values in starts.state))
     drawn = starts.drawn.repeat(model.members, 1)
-    recordings = [data.recordings[place] for place in looks[:, 0]]
-    windows = [slice(at, at + decisions + 1) for at in looks[:, 1]]
-    applied = np.stack([r.applied[at][:decisions] for r, at in zip(recordings, windows, strict=True)])
-    actual = {
-        name: np.stack([getattr(r.states, name)[at] for r, at in zip(recordings, windows, strict=True)])
-        for name in NUMBERS
-    }
+    applied = np.stack([data.recordings[place].applied[at : at + decisions] for place, at in looks])
     found: dict[str, list[Floats]] = {name: [] for name in NUMBERS}
     for column in torch.as_tensor(applied.T, dtype=torch.float32, device=device):
         state = world.step(state, column.repeat(model.members), drawn).state
         for name in NUMBERS:
             found[name].append(getattr(state, name).view(model.members, -1).cpu().numpy())
-    error, spread, change = {}, {}, {}
-    for name in NUMBERS:
-        virtual = np.stack(found[name], -1)  # (members, rows, H)
-        error[name] = np.sqrt(np.square(virtual - actual[name][:, 1:]).mean((0, 1)))
-        spread[name] = np.sqrt(virtual.var(0).mean(0))
-        change[name] = np.sqrt(np.square(actual[name][:, 1:] - actual[name][:, :1]).mean(0))
-    return OpenLoop(error, spread, change)
+    return {name: np.stack(values, -1) for name, values in found.items()}
+
+
+def one_step_errors(
+    model: EnvironmentModel, actual: Transitions, scenario: Scenario, reward: str
+) -> OneStepErrors:
+    """Return the errors of base and model in predicting each of the actual decisions."""
+    wanted = targets_of(actual, model.base, scenario, reward)
+    inputs = torch.as_tensor(inputs_of(actual)).to(model.input_mean.device)
+    answers = answers_of(model, inputs) * model.learned.cpu().numpy()  # where the base is better, it is used
+    return OneStepErrors(wanted, answers, changes_of(actual))
 
 
 class ReturnGap(NamedTuple):

@@ -56,6 +56,18 @@ class Transitions(NamedTuple):
     held_out: NDArray[np.bool_]
     """rows that no network learns from, shape (R,)"""
 
+    def chosen(self, rows: NDArray[np.int64]) -> "Transitions":
+        """Return the decisions with these indices."""
+        return Transitions(
+            states=LocalState(*(values[rows] for values in self.states)),
+            applied=self.applied[rows],
+            drawn=self.drawn[rows],
+            following=LocalState(*(values[rows] for values in self.following)),
+            reward=self.reward[rows],
+            crashed=self.crashed[rows],
+            held_out=self.held_out[rows],
+        )
+
 
 class ActualData:
     """The newest trajectories: at least `rows` decisions of whole episodes, once there are as many."""
@@ -99,19 +111,12 @@ class ActualData:
     def transitions(self, holdout: float) -> Transitions:
         """Return all decisions, a share `holdout` of the episodes held out.
 
-        An episode that is held out stays so in every fit. Where that leaves nothing on one side, it is the
-        last part of every trajectory instead.
-
         Raises:
             InputError: there are no decisions yet.
         """
         if not len(self):
             raise InputError("virtual environment: there are no actual decisions to learn from")
         recordings = self.recordings
-        held_out = [np.full(len(r.reward), is_held_out(r.episode, holdout)) for r in recordings]
-        if np.concatenate(held_out).all() or not np.concatenate(held_out).any():
-            lengths = [len(recording.reward) for recording in recordings]
-            held_out = [np.arange(length) >= max(1, (1 - holdout) * length) for length in lengths]
         return Transitions(
             states=_joined([_between(r.states, 0, -1) for r in recordings]),
             applied=np.concatenate([r.applied for r in recordings]),
@@ -119,8 +124,20 @@ class ActualData:
             following=_joined([_between(r.states, 1, None) for r in recordings]),
             reward=np.concatenate([r.reward for r in recordings]),
             crashed=np.concatenate([_crashes(r) for r in recordings]),
-            held_out=np.concatenate(held_out),
+            held_out=np.concatenate(self.held_out(holdout)),
         )
+
+    def held_out(self, holdout: float) -> list[NDArray[np.bool_]]:
+        """Return for each recording which of its decisions no network learns from.
+
+        An episode that is held out stays so in every fit. Where that leaves nothing on one side, it is the
+        last part of every trajectory instead.
+        """
+        held_out = [np.full(len(r.reward), is_held_out(r.episode, holdout)) for r in self.recordings]
+        if np.concatenate(held_out).all() or not np.concatenate(held_out).any():
+            lengths = [len(recording.reward) for recording in self.recordings]
+            return [np.arange(length) >= max(1, (1 - holdout) * length) for length in lengths]
+        return held_out
 
     def looks(self, ahead: int = 1) -> NDArray[np.int64]:
         """Return where a residual was due and at least `ahead` decisions follow.

@@ -16,7 +16,7 @@ from unjam.traffic.reward import make_reward
 from unjam.virtual.base import base_reward, base_step
 from unjam.virtual.data import Transitions
 from unjam.virtual.model import NOISE_ROWS, NUMBERS, TARGETS, EnvironmentModel
-from unjam.virtual.model_error import SMALLEST_CHANGE, OneStep, one_step, total_variation, unexplained
+from unjam.virtual.model_error import SMALLEST_CHANGE, OneStep, OneStepErrors, total_variation, unexplained
 from unjam.virtual.settings import VirtualSettings
 
 
@@ -80,7 +80,7 @@ def fit(
         generator,
     )
 
-    wanted, predicted = targets[holdout].cpu().numpy(), _predicted(model, inputs[holdout])
+    wanted, predicted = targets[holdout].cpu().numpy(), answers_of(model, inputs[holdout])
     learned = np.square(wanted - predicted).mean((0, 1)) < np.square(wanted).mean(0)
     predicted = predicted * learned  # where the base is better, it is used alone
     left = wanted - predicted.mean(0)
@@ -88,11 +88,7 @@ def fit(
     model.learned.copy_(torch.as_tensor(learned))
     model.noise.copy_(torch.as_tensor(noise))
 
-    changed = [getattr(actual.following, name) - getattr(actual.states, name) for name in NUMBERS]
-    changed = np.column_stack([*changed, actual.reward])[holdout]
-    steps = {
-        name: one_step(wanted[:, i], predicted[:, :, i], changed[:, i]) for i, name in enumerate(TARGETS)
-    }
+    steps = OneStepErrors(wanted, predicted, changes_of(actual)[holdout]).by_number()
     errors = {
         "unexplained": unexplained([steps[name] for name in NUMBERS]),
         "total_variation": total_variation(predicted[:, :, :-1], left[:, :-1].std(0)),
@@ -117,6 +113,22 @@ def targets_of(actual: Transitions, base: str, scenario: Scenario, reward: str) 
     return np.column_stack([*left, actual.reward - known_reward])
 
 
+def changes_of(actual: Transitions) -> Floats:
+    """Return what there was to predict: by how much the state changed, and the reward, shape (rows, 6)."""
+    changed = [getattr(actual.following, name) - getattr(actual.states, name) for name in NUMBERS]
+    return np.column_stack([*changed, actual.reward])
+
+
+@torch.no_grad()
+def answers_of(model: EnvironmentModel, inputs: Tensor) -> Floats:
+    """Return what each member answers to the same rows, SI units, shape (members, rows, 6).
+
+    Also where the base is better.
+    """
+    answers = _answers(model, _seen(model, inputs)) * model.target_scale + model.target_mean
+    return answers.double().cpu().numpy()
+
+
 def _some(chosen: NDArray[np.bool_], most: int, generator: np.random.Generator) -> NDArray[np.int64]:
     """Return the indices of at most so many of the chosen rows."""
     rows = np.flatnonzero(chosen)
@@ -125,19 +137,12 @@ def _some(chosen: NDArray[np.bool_], most: int, generator: np.random.Generator) 
 
 def _seen(model: EnvironmentModel, inputs: Tensor) -> Tensor:
     """Return inputs in SI units as the networks take them."""
-    return ((inputs - model.input_mean) / model.input_scale).float()
+    return (inputs.float() - model.input_mean) / model.input_scale
 
 
 def _wanted(model: EnvironmentModel, targets: Tensor) -> Tensor:
     """Return targets in SI units as the networks are to answer them."""
     return ((targets - model.target_mean) / model.target_scale).float()
-
-
-@torch.no_grad()
-def _predicted(model: EnvironmentModel, inputs: Tensor) -> Floats:
-    """Return what each member answers to the same rows, SI units, shape (members, rows, 6)."""
-    answers = _answers(model, _seen(model, inputs)) * model.target_scale + model.target_mean
-    return answers.double().cpu().numpy()
 
 
 def _descend(

@@ -96,9 +96,13 @@ class EnvironmentModel(nn.Module):
         """Take mean and standard deviation of `inputs` and `targets` as the new units, (rows, ...) in SI.
 
         First and last layers are written in the new units, so that the networks answer what they did. A
-        standard deviation below `smallest` counts as that.
+        standard deviation of a target below `smallest` counts as that. An input that varies by less, as the
+        length of the ring does in a single episode, counts as constant: its normalised value is zero, for
+        Adam would make long steps of rounding errors, and another value on the holdout would be far away.
         """
-        mean, scale = inputs.mean(0).float(), inputs.std(0).clip(smallest).float()
+        varies = inputs.std(0) >= smallest
+        mean = torch.where(varies, inputs.mean(0), inputs[0]).float()
+        scale = torch.where(varies, inputs.std(0), 1.0).float()
         first, bias = self.weights[0], self.biases[0]
         bias += ((mean - self.input_mean) / self.input_scale)[None] @ first
         first *= (scale / self.input_scale)[:, None]

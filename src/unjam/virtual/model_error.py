@@ -8,6 +8,7 @@ import numpy as np
 import torch
 
 from unjam.traffic.record import Floats
+from unjam.virtual.model import TARGETS
 
 SMALLEST_CHANGE = 1e-4
 """what varies by less than this is as good as constant [m/s, m, reward]"""
@@ -33,6 +34,27 @@ def one_step(wanted: Floats, predicted: Floats, changed: Floats) -> OneStep:
         changed: by how much it changed, shape (rows,).
     """
     return OneStep(root_mean_square(wanted), root_mean_square(wanted - predicted), float(changed.std()))
+
+
+class OneStepErrors(NamedTuple):
+    """By how much a decision was predicted wrongly [m/s, m, reward]; R rows, columns as TARGETS."""
+
+    base: Floats
+    """of the base alone, shape (R, 6)"""
+    predicted: Floats
+    """of these, by each member of the ensemble, shape (members, R, 6)"""
+    change: Floats
+    """what there was to predict: the change in the decision, and the reward, shape (R, 6)"""
+
+    @property
+    def model(self) -> Floats:
+        """Of each member of the ensemble, shape (members, R, 6)."""
+        return self.base - self.predicted
+
+    def by_number(self) -> dict[str, OneStep]:
+        """Return the root mean squares, by name of TARGETS."""
+        columns = zip(TARGETS, self.base.T, np.moveaxis(self.predicted, -1, 0), self.change.T, strict=True)
+        return {name: one_step(wanted, predicted, changed) for name, wanted, predicted, changed in columns}
 
 
 def root_mean_square(values: Floats) -> float:
