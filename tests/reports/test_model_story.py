@@ -5,7 +5,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from unjam.files import to_json
 from unjam.reports.model_story import (
     NUMBERS,
     bound_of,
@@ -72,7 +71,7 @@ def facts_of(**changes: Any) -> dict[str, Any]:
             "C": [9000.0, 5000.0, 80000.0],
         },
     }
-    return json.loads(to_json({**facts, **changes}, indent=1)) if not changes else {**facts_of(), **changes}
+    return {**json.loads(json.dumps(facts, default=np.ndarray.tolist)), **changes}
 
 
 def progress_of(**virtual: Any) -> list[dict[str, Any]]:
