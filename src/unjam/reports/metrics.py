@@ -131,8 +131,8 @@ def time_to_dissolve(episode: Episode) -> float:
     From the first decision to the first moment from which on the std of speed across vehicles stays below
     0.3 m/s for 60 s on end.
     """
-    anybody = ~np.isnan(episode.speeds).all(axis=1)
-    calm = ~anybody
+    anybody = np.asarray(~np.isnan(episode.speeds).all(axis=1))
+    calm = np.logical_not(anybody)
     calm[anybody] = np.nanstd(episode.speeds[anybody], axis=1) < CALM_STD
     needed = round(CALM_SECONDS / episode.step)
     if calm[0] or len(calm) < needed:
