@@ -55,7 +55,8 @@ def mean_speed_of_moments(episode: Episode) -> float:
     Where vehicles come and go it counts a moment with few vehicles as much as one in a jam.
     """
     moments = episode.speeds[1:]
-    return float(np.nanmean(moments[~np.isnan(moments).all(axis=1)], axis=1).mean())
+    there = ~np.isnan(moments).all(axis=1)
+    return float(np.nanmean(moments[there], axis=1).mean()) if there.any() else float("nan")
 
 
 def mean_speed_steady(episode: Episode) -> float:
