@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Trains the demo's residual with five seeds and keeps what the docs say of it. A few minutes on two cores.
+# Trains the demo's residual with five seeds and keeps what the docs say of it. A quarter of an hour on two cores.
 set -eu
 cd "$(dirname "$0")/../.."
 runs=runs/for-the-docs

@@ -6,7 +6,10 @@ import pytest
 from unjam import check_driver
 from unjam.controller import make_driver
 from unjam.drivers.check import random_state
+from unjam.drivers.from_file import FileDriver
 from unjam.errors import InputError
+from unjam.scenarios import Merge
+from unjam.traffic.episode import run_episode
 
 
 def test_a_function_becomes_a_driver(my_drivers: Path) -> None:
@@ -56,3 +59,13 @@ def test_a_file_may_import_its_neighbours(tmp_path: Path) -> None:
     driver = make_driver(f"{tmp_path}/main.py:d", 0.1)
     state = random_state(np.random.default_rng(0), 3)
     np.testing.assert_allclose(driver.act(state, {})[0], 0.25 * state.speed)
+
+
+def test_a_users_driver_is_not_asked_while_no_cav_is_on_the_road(tmp_path: Path) -> None:
+    file = tmp_path / "nearest.py"
+    file.write_text("def nearest(state):\n    return state.speed * 0.0 + 0.001 * state.leader_gap.min()\n")
+    lonely = Merge(cavs=1, standing=0, horizon=60)
+    episode = run_episode(lonely, FileDriver(file, "nearest"), (3,))
+    (trajectory,) = episode.trajectories
+    assert trajectory.start > 3
+    np.testing.assert_allclose(trajectory.applied, 0.001 * trajectory.states.leader_gap[:-1], atol=1e-12)

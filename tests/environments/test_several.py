@@ -77,6 +77,7 @@ def test_agents_of_the_merge_enter_and_leave_as_in_the_very_episode_that_run_epi
     environment = unjam.parallel_env("merge", **{**MERGE, "horizon": 100, "standing": 0})
     last, _ = environment.reset(seed=4)
     left, earned = [], {name: [] for name in stays}
+    truncated: dict[str, bool] = {}
     while environment.agents:
         acting = environment.agents
         seen, rewards, terminated, truncated, _ = environment.step(dict.fromkeys(acting, np.array([0.2])))
@@ -122,6 +123,7 @@ def test_a_collision_terminates_everybody_who_is_there() -> None:
     environment = unjam.parallel_env("merge", penetration=1.0, actuation="raw", standing=0)
     environment.reset(seed=0)
     terminated: dict[str, bool] = {}
+    truncated: dict[str, bool] = {}
     while environment.agents:
         actions = dict.fromkeys(environment.agents, np.array([1.0]))
         _, _, terminated, truncated, _ = environment.step(actions)

@@ -408,3 +408,77 @@ def test_metrics_have_labels_of_their_own() -> None:
     functions: list[Callable[[Episode], float]] = [found.function for found in METRICS.values()]
     assert len(set(labels)) == len(labels)
     assert len(set(functions)) == len(functions)
+
+
+NAN = float("nan")
+
+
+def open_episode(speeds: ArrayLike, **changes: Any) -> Episode:
+    """An episode on a road with ends: NaN where a vehicle is not on it; one decision a second."""
+    moved = np.asarray(speeds, float)
+    steps, vehicles = len(moved) - 1, moved.shape[1]
+    values: dict[str, Any] = {
+        "seed": (0,),
+        "status": "completed",
+        "step": 1.0,
+        "limit_speed": LIMIT,
+        "vehicle_ids": tuple(f"human_{n}" for n in range(vehicles)),
+        "speeds": moved,
+        "positions": np.full_like(moved, np.nan),
+        "gaps": np.full_like(moved, np.nan),
+        "waiting": np.zeros(steps + 1),
+        "fuel": np.where(np.isnan(moved[1:]), np.nan, 100.0),
+        "terms": {"speed": np.zeros(steps)},
+    }
+    return Episode(**{**values, **changes})
+
+
+def test_vehicles_count_while_they_are_on_the_road() -> None:
+    episode = open_episode([[4.0, NAN], [4.0, 1.0], [NAN, 3.0], [NAN, 0.0]])
+    assert metric("mean_speed", episode) == pytest.approx((4.0 + 1.0 + 3.0 + 0.0) / 4)
+    assert metric("mean_speed_steady", episode) == pytest.approx(
+        (3.0 + 0.0) / 2
+    )  # of three steps the last two
+    assert metric("speed_std_fleet", episode) == pytest.approx((1.5 + 0.0 + 0.0) / 3)
+    assert metric("share_standing", episode) == pytest.approx(1 / 4)
+    burnt = 4 * 100.0 / 742.0
+    assert metric("fuel_ml_per_km", episode) == pytest.approx(burnt / 8.0 * 1000.0)
+    assert np.isnan(metric("cav_mean_speed", episode))
+
+
+def test_throughput_of_a_road_with_ends_is_who_left_it_and_backlog_who_waits_at_the_end() -> None:
+    episode = open_episode(np.full((121, 3), 5.0), arrived=7, waiting=np.arange(121.0))
+    assert metric("throughput_veh_per_h", episode) == pytest.approx(7 * 30.0)
+    assert metric("backlog_veh", episode) == 120.0
+    assert metric("backlog_veh", episode_of(steady(4.0))) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("steps", "counted"),
+    [(1, 1), (2, 1), (3, 2), (10, 5), (999, 500), (1000, 500), (1001, 1000), (3000, 1000)],
+)
+def test_steady_are_the_last_thousand_steps_and_of_a_shorter_episode_its_second_half(
+    steps: int, counted: int
+) -> None:
+    speeds = np.zeros((steps + 1, 3))
+    speeds[-counted:] = 4.0
+    assert metric("mean_speed_steady", episode_of(speeds)) == pytest.approx(4.0)
+    speeds[-counted] = 0.0
+    expected = 4.0 * (counted - 1) / counted
+    assert metric("mean_speed_steady", episode_of(speeds)) == pytest.approx(expected)
+
+
+def test_an_episode_in_which_nobody_came_is_measured_without_complaint() -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for vehicles in (0, 2):
+            row = measure(open_episode(np.full((700, vehicles), np.nan)))
+            for name in (
+                "mean_speed",
+                "mean_speed_steady",
+                "speed_std_fleet",
+                "share_standing",
+                "fuel_ml_per_km",
+            ):
+                assert np.isnan(row[name])
+            assert row["throughput_veh_per_h"] == row["backlog_veh"] == 0.0

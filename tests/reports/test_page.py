@@ -29,6 +29,16 @@ def driven(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
+def merged(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The report of `unjam drive merge`: vehicles come and go."""
+    road = {"horizon": 40, "penetration": 0.3}
+    folder = tmp_path_factory.mktemp("merge") / "results"
+    report = unjam.drive("merge", ["human", "pi"], episodes=1, road=road, workers=1, out=folder).report
+    assert report is not None
+    return report
+
+
+@pytest.fixture(scope="module")
 def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The report of `unjam train`."""
     changes = {
@@ -120,7 +130,7 @@ class Opener:
 
 
 @pytest.mark.parametrize("size", [LAPTOP, PHONE], ids=["laptop", "phone"])
-@pytest.mark.parametrize(("report", "pictures"), [("driven", 2), ("trained", 7)])
+@pytest.mark.parametrize(("report", "pictures"), [("driven", 2), ("merged", 2), ("trained", 7)])
 def test_every_picture_is_there(
     open_page: Opener, request: pytest.FixtureRequest, report: str, pictures: int, size: tuple[int, int]
 ) -> None:
@@ -131,7 +141,7 @@ def test_every_picture_is_there(
 
 
 @pytest.mark.parametrize("size", [LAPTOP, PHONE, (320, 640), (820, 1180)], ids=lambda size: str(size[0]))
-@pytest.mark.parametrize("report", ["driven", "trained"])
+@pytest.mark.parametrize("report", ["driven", "merged", "trained"])
 def test_nothing_is_wider_than_the_screen(
     open_page: Opener, request: pytest.FixtureRequest, report: str, size: tuple[int, int]
 ) -> None:
@@ -213,6 +223,29 @@ def test_the_replay_stops_at_its_end_and_starts_again_from_the_beginning(
     button.click()
     page.wait_for_function(f"parseFloat(document.querySelector('.clock').textContent) < {SECONDS}")
     assert visit.time() < SECONDS / 2
+
+
+def test_a_road_with_ends_is_played_from_its_first_vehicles_to_its_last(
+    open_page: Opener, merged: Path
+) -> None:
+    visit = open_page(merged)
+    means = visit.page.locator("figcaption small")
+    pictures, texts = [], []
+    for moment in ("0", "10", "25.5", "40"):
+        visit.page.locator(".time").fill(moment)
+        pictures.append(visit.canvases())
+        texts.append([float(text.split()[1]) for text in means.all_inner_texts()])
+    for panel in range(2):
+        assert len({picture[panel] for picture in pictures}) == 4
+    assert all(0.5 < speed < 30 for text in texts for speed in text)  # one of six enters at 10 m/s
+    visit.page.locator(".time").fill("0")
+    visit.page.locator(".pace").select_option("30")
+    visit.page.locator(".play").click()
+    visit.page.wait_for_function("document.querySelector('.play').textContent === 'Play'")
+    assert visit.time() == 40.0
+    assert visit.canvases() == pictures[-1]
+    sizes = visit.page.eval_on_selector_all("canvas", "all => all.map(each => each.width / each.height)")
+    assert all(size > 3 for size in sizes), "a long road is a wide picture"
 
 
 def test_pace_is_how_many_times_as_fast_as_life_it_plays(open_page: Opener, driven: Path) -> None:

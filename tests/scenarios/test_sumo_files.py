@@ -228,3 +228,10 @@ def test_whatever_files_hold_is_read_or_refused(
     (tmp_path / name).write_bytes(content)
     with suppress(InputError):
         assert read_sumo_files(path).used_types
+
+
+def test_a_network_that_is_torn_off_is_told_however_long_it_is(tmp_path: Path) -> None:
+    network = '<net version="1.20">' + '<edge id="a"/>' * 20_000
+    with pytest.raises(InputError, match=re.escape("road.net.xml: cannot be read: no element found")):
+        read_sumo_files(configuration(tmp_path, network=network))
+    assert read_sumo_files(configuration(tmp_path, network=network + "</net>")).used_types == {"car"}

@@ -67,6 +67,30 @@ WRONG: dict[str, tuple[str, list[str]]] = {
     "virtual environment of a run without one": ("has no virtual environment", ["model model-free"]),
     "report of nothing": ("has no evaluation.json", ["report full"]),
     "report of damaged results": ("damaged", ["report damaged"]),
+    "share above one": ("penetration: 2", ["drive merge --driver pi --set penetration=2"]),
+    "nobody a CAV": (
+        "no CAV was on the road in 5 decisions",
+        ["drive merge --driver pi --set penetration=0 --set horizon=5"],
+    ),
+    "share of CAVs on a road without one": (
+        "cav_share: unknown name",
+        ["drive ring --driver pi --cav-share 0.1"],
+    ),
+    "configuration that is missing": ("there is no such file", ["drive none.sumocfg --driver pi"]),
+    "own network without CAVs": ("cav_share: 0.0", ["drive good.sumocfg --driver pi"]),
+    "type that nobody has": (
+        "no vehicle has the type 'tank'; allowed: car",
+        ["drive good.sumocfg --driver pi --cav-types tank"],
+    ),
+    "network without a version": (
+        "old.net.xml: the network has no version",
+        ["drive old.sumocfg --driver pi --cav-share 0.5"],
+    ),
+    "network that is torn": (
+        "torn.net.xml: cannot be read",
+        ["drive torn.sumocfg --driver pi --cav-share 0.5"],
+    ),
+    "training where nobody is a CAV": ("cav_share: 0.0", ["train good.sumocfg --steps 10"]),
     "film of an unknown kind": (".gif, .webp, .mp4", ["watch ring --driver pi --video film.avi"]),
 }
 
@@ -76,6 +100,16 @@ def files(tmp_path: Path, my_drivers: Path) -> None:
     (tmp_path / "torn.py").write_text("def gentle(state:\n")
     (tmp_path / "torn.unjam").write_bytes(b"PK\x03\x04 not really")
     (tmp_path / "torn.toml").write_text("scenario = ring\n")
+    networks = {"good": '<net version="1.20"/>', "old": "<net/>", "torn": '<net version="1.20"><edge'}
+    for name, network in networks.items():
+        (tmp_path / f"{name}.net.xml").write_text(network)
+        (tmp_path / f"{name}.rou.xml").write_text(
+            '<routes><vType id="car"/><trip id="a" type="car"/></routes>'
+        )
+        (tmp_path / f"{name}.sumocfg").write_text(
+            f'<configuration><net-file value="{name}.net.xml"/><route-files value="{name}.rou.xml"/>'
+            "</configuration>"
+        )
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "precious.txt").write_text("keep me")
     (tmp_path / "model-free").mkdir()

@@ -1,10 +1,12 @@
 """The figure eight on the actual simulator."""
 
+from typing import Any
+
 import libsumo
 import numpy as np
 import pytest
 
-from unjam.drivers import PISaturation
+from unjam.drivers import Driver, LocalState, Memory, PISaturation
 from unjam.drivers.idm import Human
 from unjam.drivers.pacer import Pacer
 from unjam.reports.metrics import measure
@@ -56,6 +58,34 @@ def test_leader_and_gap_are_those_of_sumo(simulation: Simulation) -> None:
                 assert state.leader_gap[row] == pytest.approx(gap + SMALLEST_CAV_GAP, abs=1e-3)
                 compared += 1
     assert compared > 1000
+
+
+@pytest.mark.parametrize("cavs", [2, 7, 14])
+def test_each_of_several_cavs_is_driven_and_recorded_by_itself(cavs: int, simulation: Simulation) -> None:
+    road = FigureEight(cavs=cavs, horizon=300)
+    episode = run_episode(road, ByRow(), (1,), simulation=simulation)
+    assert (episode.status, len(episode.trajectories)) == ("completed", cavs)
+    assert tuple(trajectory.vehicle for trajectory in episode.trajectories) == episode.cav_ids
+    for row, trajectory in enumerate(episode.trajectories):
+        place = episode.vehicle_ids.index(trajectory.vehicle)
+        states = trajectory.states
+        np.testing.assert_array_equal(states.speed, episode.speeds[:, place])
+        np.testing.assert_array_equal(states.leader_speed, episode.speeds[:, (place + 1) % 14])
+        np.testing.assert_array_equal(states.follower_gap, episode.gaps[:, (place - 1) % 14])
+        np.testing.assert_allclose(trajectory.applied, 0.1 + 0.02 * row + 0.001 * np.arange(300), atol=1e-12)
+        wanted = np.maximum(states.speed[:-1] + 0.1 * trajectory.applied, 0.0)
+        np.testing.assert_allclose(states.speed[1:], wanted - 0.1 * trajectory.shield, atol=1e-9)
+
+
+class ByRow(Driver):
+    """Each CAV pushes a little harder than the one before it, and all harder with time."""
+
+    def initial_memory(self, n: int) -> Memory:
+        return {"decisions": np.zeros(n)}
+
+    def act(self, state: LocalState, memory: Memory) -> tuple[Any, Memory]:
+        push = 0.1 + 0.02 * np.arange(len(state.speed)) + 0.001 * memory["decisions"]
+        return push, {"decisions": memory["decisions"] + 1.0}
 
 
 def test_vehicles_from_the_right_yield(simulation: Simulation) -> None:

@@ -290,3 +290,17 @@ def test_nothing_is_written_into_the_users_folder(tmp_path: Path) -> None:
         (episode,) = workers.run([EpisodeTask(scenario, IDM(), (0,), full=True)])
     assert episode.ok
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
+def test_a_network_that_breaks_later_fails_its_episode_and_nothing_else(tmp_path: Path) -> None:
+    scenario = scenario_of(straight(tmp_path, COLUMN), cav_share=1.0, horizon=20)
+    whole = (tmp_path / "road.net.xml").read_text()
+    with Workers(1) as workers:
+        task = EpisodeTask(scenario, IDM(), (0,))
+        (tmp_path / "road.net.xml").write_text("<net><edge/></net>")  # on this one SUMO itself would crash
+        (broken,) = workers.run([task])
+        (tmp_path / "road.net.xml").write_text(whole)
+        (mended,) = workers.run([task])
+    assert (broken.status, broken.error) == ("failed", "InputError")
+    assert "the network has no version" in broken.reason
+    assert mended.status == "completed"

@@ -67,7 +67,7 @@ def _data_uri(mime: str, content: io.BytesIO) -> str:
 
 def speed_scale(shown: Sequence[Shown]) -> Normalize:
     """Return one scale of speed for all pictures of these episodes."""
-    fastest = max(float(np.nanmax(episode.speeds)) for episode in shown)
+    fastest = max(float(np.nanmax(episode.speeds, initial=0.0)) for episode in shown)
     return Normalize(0.0, max(1.0, np.ceil(fastest)))
 
 

@@ -32,6 +32,12 @@ def _over_cavs(values: Sequence[Any]) -> float:
     return float(np.mean(values)) if len(values) else float("nan")
 
 
+def _mean_there(speeds: Floats) -> float:
+    """Return the mean over all that are on the road; NaN where nobody ever was."""
+    there = speeds[~np.isnan(speeds)]
+    return float(there.mean()) if there.size else float("nan")
+
+
 def _std_across(speeds: Floats) -> float:
     """Return the std across vehicles at one moment, averaged over the moments with at least one."""
     there = ~np.isnan(speeds).all(axis=1)
@@ -40,7 +46,7 @@ def _std_across(speeds: Floats) -> float:
 
 def mean_speed(episode: Episode) -> float:
     """Mean over all vehicles and all steps of the episode, start-up included [m/s]. The honest convention."""
-    return float(np.nanmean(episode.speeds[1:]))
+    return _mean_there(episode.speeds[1:])
 
 
 def mean_speed_of_moments(episode: Episode) -> float:
@@ -49,12 +55,13 @@ def mean_speed_of_moments(episode: Episode) -> float:
     Where vehicles come and go it counts a moment with few vehicles as much as one in a jam.
     """
     moments = episode.speeds[1:]
-    return float(np.nanmean(moments[~np.isnan(moments).all(axis=1)], axis=1).mean())
+    there = ~np.isnan(moments).all(axis=1)
+    return float(np.nanmean(moments[there], axis=1).mean()) if there.any() else float("nan")
 
 
 def mean_speed_steady(episode: Episode) -> float:
     """Mean over all vehicles in the last 1,000 steps [m/s]; of a shorter episode, in its second half."""
-    return float(np.nanmean(_steady(episode.speeds[1:])))
+    return _mean_there(_steady(episode.speeds[1:]))
 
 
 def speed_std_fleet(episode: Episode) -> float:
@@ -115,8 +122,8 @@ def mean_abs_jerk(episode: Episode) -> float:
 
 def share_standing(episode: Episode) -> float:
     """Share of vehicle-seconds spent below 0.1 m/s."""
-    present = ~np.isnan(episode.speeds[1:])
-    return float(((episode.speeds[1:] < STANDING_SPEED) & present).sum() / present.sum())
+    there = ~np.isnan(episode.speeds[1:])
+    return _mean_there(np.where(there, episode.speeds[1:] < STANDING_SPEED, np.nan))
 
 
 def time_to_dissolve(episode: Episode) -> float:
@@ -125,7 +132,9 @@ def time_to_dissolve(episode: Episode) -> float:
     From the first decision to the first moment from which on the std of speed across vehicles stays below
     0.3 m/s for 60 s on end.
     """
-    calm = np.nanstd(episode.speeds, axis=1) < CALM_STD
+    anybody = np.asarray(~np.isnan(episode.speeds).all(axis=1))
+    calm = np.logical_not(anybody)
+    calm[anybody] = np.nanstd(episode.speeds[anybody], axis=1) < CALM_STD
     needed = round(CALM_SECONDS / episode.step)
     if calm[0] or len(calm) < needed:
         return float("nan")
@@ -176,14 +185,18 @@ def shield_max_braking(episode: Episode) -> float:
 
 
 def fuel_ml_per_km(episode: Episode) -> float:
-    """Fuel of all vehicles per kilometre [ml/km], by the scenario's emission class; NaN if not recorded.
+    """Fuel of all vehicles per kilometre [ml/km], by the scenario's emission class.
+
+    NaN if it was not recorded, or nobody drove.
 
     SUMO's emission model: https://sumo.dlr.de/docs/Models/Emissions.html
     """
     if episode.fuel.size == 0:
         return float("nan")
-    driven = np.nansum(episode.speeds[1:]) * episode.step
-    return float(np.nansum(episode.fuel) * episode.step / PETROL_DENSITY / (driven / 1000.0))
+    driven = float(np.nansum(episode.speeds[1:])) * episode.step
+    if driven == 0:
+        return float("nan")
+    return float(np.nansum(episode.fuel)) * episode.step / PETROL_DENSITY / (driven / 1000.0)
 
 
 def throughput_veh_per_h(episode: Episode) -> float:

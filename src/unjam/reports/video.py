@@ -64,7 +64,7 @@ def _write_mp4(frames: Iterator[Image.Image], path: Path, rate: float) -> None:
 
 def _frames(episode: Episode, title: str, every: int) -> Iterator[Image.Image]:
     """Yield the pictures, one after the other."""
-    fastest = max(1.0, float(np.nanmax(episode.speeds)))
+    fastest = float(np.nanmax(episode.speeds, initial=1.0))
     moments = range(0, len(episode.speeds), every)
     for moment, scene in zip(moments, scenes(episode, moments), strict=True):
         there = scene.speeds[~np.isnan(scene.speeds)]

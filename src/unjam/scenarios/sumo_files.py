@@ -139,11 +139,18 @@ def _seconds(path: Path, options: dict[str, str], name: str, otherwise: float | 
 
 
 def _check_network(path: Path) -> None:
-    """Raise `InputError` unless the root is a network with a version: SUMO itself would crash."""
-    root = next(_elements(path, "start"))
+    """Raise `InputError` unless it is whole, and a network with a version.
+
+    SUMO itself would crash without a version, and says nothing of a file that is torn off.
+    """
+    elements = _elements(path, "start")
+    root = next(elements)
+    version = root.get("version")
+    for _ in elements:
+        root.clear()
     if root.tag != "net":
         raise InputError(f"{path.name}: is not a SUMO network: it begins with <{root.tag}>")
-    if not root.get("version"):
+    if not version:
         raise InputError(
             f"{path.name}: the network has no version; make it anew: netconvert -s {path.name} -o"
         )
