@@ -8,6 +8,7 @@ import pandas as pd
 from IPython.display import HTML
 
 from unjam.reports.metrics import METRICS
+from unjam.reports.model_story import error_text
 from unjam.reports.statistics import estimate
 
 RESULTS = Path(__file__).parent.parent / "results"
@@ -43,6 +44,50 @@ def metrics_of(name: str, metrics: Sequence[str]) -> pd.DataFrame:
 def mean_of(name: str, driver: str, metric: str) -> float:
     """Return the mean of one metric of one driver in a results file."""
     return estimate([row[metric] for row in rows_of(name)[driver]]).mean
+
+
+KNOWLEDGE = "model/knowledge.json"
+
+
+def knowledge_rows(road: str) -> pd.DataFrame:
+    """Return what the study of knowledge measured on a road: a row per model, number of steps and seed."""
+    rows = [row for row in json.loads((RESULTS / KNOWLEDGE).read_text())["rows"] if row["road"] == road]
+    return pd.json_normalize(rows)
+
+
+def knowledge_of(road: str, columns: dict[str, str]) -> pd.DataFrame:
+    """Return a table of the study of knowledge: mean over the seeds, with the smallest and the largest.
+
+    `columns` has the names of what was measured, with their headings.
+    """
+    table = []
+    for (steps, model), rows in knowledge_rows(road).groupby(["steps", "model"], sort=False):
+        cells = {"actual steps": f"{steps:,}" if steps else "none", "model": model}
+        for name, heading in columns.items():
+            values = rows[name]
+            cells[heading] = error_text(values.mean())
+            if len(values) > 1:
+                cells[heading] += f" [{error_text(values.min())}, {error_text(values.max())}]"
+        table.append(cells)
+    return pd.DataFrame(table)
+
+
+def knowledge_gain(road: str, name: str) -> pd.DataFrame:
+    """Return by how much an error is smaller with IDM + residual than with networks alone, same data."""
+    rows = knowledge_rows(road)
+    table = []
+    for steps, found in rows[rows["steps"] > 0].groupby("steps"):
+        errors = found.pivot(index="seed", columns="model", values=name)
+        less = 1.0 - errors["IDM + residual"] / errors["networks alone"]
+        table.append(
+            {
+                "road": road,
+                "actual steps": f"{steps:,}",
+                "less error, mean": f"{100 * less.mean():+.0f} %",
+                "seeds where it is less": f"{(less > 0).sum()} of {len(less)}",
+            }
+        )
+    return pd.DataFrame(table)
 
 
 def show(table: pd.DataFrame, index: bool = False, digits: int = 3) -> HTML:
