@@ -55,7 +55,7 @@ def test_rollout_length_is_equation_15(eps_m: float, k_max: int, kappa: float) -
     ("eps_m", "expected"), [(0.01, 200), (0.04, 50), (0.0, 500), (2.5, 0), (inf, 0), (nan, 0)]
 )
 def test_rollout_length_at_known_errors(eps_m: float, expected: int) -> None:
-    assert rollout_length(eps_m, VirtualSettings()) == expected
+    assert rollout_length(eps_m, VirtualSettings(kappa=2.0, k_max=500)) == expected
 
 
 @given(st.floats(0, 1), st.floats(0, 1), st.integers(0, 500), st.floats(0.5, 0.999), st.floats(0, 10))

@@ -9,6 +9,8 @@ import typer
 from unjam.cli.options import JsonOption
 from unjam.errors import InputError
 
+SHOWN_SHARE = 0.1
+"""share of CAVs with which your own network is listed"""
 PICTURED_AFTER = 60.0
 """seconds after which a road with ends is drawn: at the start it is all but empty"""
 
@@ -34,12 +36,12 @@ def scenarios(
     from rich.table import Table
 
     from unjam.cli.output import console, print_json
-    from unjam.scenarios.registry import SCENARIOS, make_scenario, scenario_recipe
+    from unjam.scenarios.registry import SCENARIOS, scenario_recipe
 
     if picture is not None:
         if name is None or picture.suffix.lower() != ".png":
             raise InputError("picture: wants the name of a scenario, and a file that ends in .png")
-        _draw(make_scenario(name), name, picture)
+        _draw(_scenario(name), name, picture)
     if name is None:
         if json:
             print_json({key: scenario_recipe(scenario) for key, scenario in SCENARIOS.items()})
@@ -55,7 +57,7 @@ def scenarios(
             )
         console.print(table)
         return
-    scenario = make_scenario(name)
+    scenario = _scenario(name)
     facts = [*scenario.facts(), *_common_facts(scenario)]
     parameters = parameter_rows(type(scenario), scenario)
     if json:
@@ -67,6 +69,13 @@ def scenarios(
         table.add_row(*map(escape, fact))
     console.print(table)
     console.print(_parameter_table(parameters, "parameter (--set key=value)"))
+
+
+def _scenario(name: str) -> Any:
+    """Return a scenario by name; of your own network, one with a share of CAVs, which it has no default of."""
+    from unjam.scenarios.registry import make_scenario
+
+    return make_scenario(name, {"cav_share": SHOWN_SHARE} if name.endswith(".sumocfg") else None)
 
 
 def _draw(scenario: Any, name: str, path: Path) -> None:
