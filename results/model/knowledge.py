@@ -2,16 +2,19 @@
 
     python results/model/knowledge.py FOLDER
 
-writes FOLDER/knowledge.json. Data are those with which `unjam train` begins: PI and a residual network that has
-learned nothing, with the exploration of the defaults. The first steps are part of the later ones. The episodes
-that judge have seeds of their own, and no network ever sees them.
+writes FOLDER/knowledge.json and FOLDER/knowledge.png. Data are those with which `unjam train` begins: PI and
+a residual network that has learned nothing, with the exploration of the defaults. The first steps are part of
+the later ones. The episodes that judge have seeds of their own, and no network ever sees them.
 """
 
 import sys
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
+from matplotlib import rc_context
+from matplotlib.figure import Figure
 
 from unjam.agents.algorithms import LEARNERS
 from unjam.agents.episodic import Training
@@ -20,6 +23,7 @@ from unjam.experiments.config import RunConfig, load_config
 from unjam.experiments.evaluate import raise_failure
 from unjam.experiments.manifest import manifest
 from unjam.files import to_json, write_whole
+from unjam.reports.figures import INK, LINES, STYLE
 from unjam.reports.metrics import measure
 from unjam.scenarios.scenario import Scenario
 from unjam.traffic.record import Episode
@@ -132,14 +136,53 @@ def measured(workers: Workers, road: str) -> list[dict[str, Any]]:
     return rows
 
 
+PANELS = {
+    "unexplained": "unexplained share of\na 0.1 s change, mean of 5 numbers",
+    "gap_later": "error of the gap ahead\nafter 5 s [m]",
+    "follower_gap_later": "error of the gap behind\nafter 5 s [m]",
+}
+
+
+def picture(rows: list[dict[str, Any]]) -> Figure:
+    """Return the errors by the number of actual steps: a row of panels per road."""
+    with rc_context(STYLE):
+        figure = Figure(figsize=(10.5, 5.6), layout="constrained", dpi=130)
+        panels = figure.subplots(len(ROADS), len(PANELS), sharex=True, squeeze=False)
+        for (line, column), axes in np.ndenumerate(panels):
+            road, (name, label) = ROADS[line], list(PANELS.items())[column]
+            here = [row for row in rows if row["road"] == road]
+            for alone, style in zip(ALONE, ("--", ":"), strict=True):
+                (value,) = (row[name] for row in here if row["model"] == alone)
+                axes.axhline(value, color=INK, lw=1.1, ls=style, label=alone)
+            for (model, colour), shift in zip(
+                zip(BASES, LINES[2:0:-1], strict=True), (0.96, 1.04), strict=True
+            ):
+                found = np.array(
+                    [[row[name] for row in here if (row["model"], row["steps"]) == (model, n)] for n in STEPS]
+                )
+                places = np.array(STEPS) * shift
+                axes.plot(places, found.mean(1), color=colour, lw=1.6, label=model)
+                axes.plot(places, found, color=colour, lw=0, marker="o", ms=3, alpha=0.5)
+            axes.set_xscale("log")
+            axes.set_yscale("log")
+            axes.set_xticks(STEPS, [f"{steps:,}" for steps in STEPS])
+            axes.minorticks_off()
+            axes.set_title(f"{road}: {label}", loc="left", fontsize=9, color=INK)
+            if line == len(ROADS) - 1:
+                axes.set_xlabel("actual steps")
+        figure.legend(*panels[0, 0].get_legend_handles_labels(), loc="outside upper left", ncols=4)
+        return figure
+
+
 def main(folder: Path) -> None:
-    """Measure, and write the numbers."""
+    """Measure, and write the numbers and their picture."""
     torch.set_num_threads(1)
     about = manifest()
     with Workers(WORKERS) as workers:
         rows = [row for road in ROADS for row in measured(workers, road)]
     folder.mkdir(parents=True, exist_ok=True)
     write_whole(folder / "knowledge.json", to_json({"manifest": about, "rows": rows}, indent=1))
+    picture(rows).savefig(folder / "knowledge.png")
 
 
 if __name__ == "__main__":

@@ -72,7 +72,7 @@ def scenarios(
 
 
 def _scenario(name: str) -> Any:
-    """Return a scenario by name; of your own network, one with a share of CAVs, which it has no default of."""
+    """Return a scenario by name; your own network has no default share of CAVs, and gets one here."""
     from unjam.scenarios.registry import make_scenario
 
     return make_scenario(name, {"cav_share": SHOWN_SHARE} if name.endswith(".sumocfg") else None)
