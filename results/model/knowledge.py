@@ -2,9 +2,9 @@
 
     python results/model/knowledge.py FOLDER
 
-writes FOLDER/knowledge.json. Data are those with which `unjam train` begins: PI and a residual network that has
-learned nothing, with the exploration of the defaults. The first steps are part of the later ones. The episodes
-that judge have seeds of their own, and no network ever sees them.
+writes FOLDER/knowledge.json. Data are those with which `unjam train` begins: PI and a residual network that
+has learned nothing, with the exploration of the defaults. The first steps are part of the later ones. The
+episodes that judge have seeds of their own, and no network ever sees them.
 """
 
 import sys

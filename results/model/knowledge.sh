@@ -3,9 +3,10 @@
 # an hour on one core.
 set -eu
 cd "$(dirname "$0")/../.."
-runs=runs/for-the-docs
+runs=runs/for-the-docs-knowledge
 rm -rf "$runs"
 python results/model/knowledge.py "$runs"
+python results/model/knowledge_picture.py "$runs"
 # Copied at the end: until then the tree is as committed, and the manifest says so.
 cp "$runs"/knowledge.{json,png} results/model/
 rm -r "$runs"
