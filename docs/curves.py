@@ -1,9 +1,11 @@
 """Learning curves with the virtual environment and without it, from files under results/model/."""
 
 import json
+from io import BytesIO
 
 import numpy as np
 import pandas as pd
+from IPython.display import Image
 from matplotlib.figure import Figure
 from tables import RESULTS, rows_of
 
@@ -38,7 +40,7 @@ def validations(kind: str) -> tuple[np.ndarray, np.ndarray]:
     return steps, np.array(curves)
 
 
-def draw() -> Figure:
+def draw() -> Image:
     """Draw validation against actual steps: mean and range of the runs."""
     figure = Figure(figsize=(9, 3.6), layout="constrained")
     axes = figure.subplots()
@@ -52,7 +54,9 @@ def draw() -> Figure:
     axes.legend(frameon=False)
     for side in ("top", "right"):
         axes.spines[side].set_visible(False)
-    return figure
+    content = BytesIO()
+    figure.savefig(content, format="png", dpi=130)
+    return Image(content.getvalue(), width=900)
 
 
 def reached(kind: str, level: float) -> list[float]:

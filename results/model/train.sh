@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
-# Trains on the ring with the virtual environment and without it, five seeds each; the curves are in the docs.
-# Half an hour on two cores. Each folder gets the progress and the judgement of one `unjam train`.
+# Trains on the ring with the virtual environment (that is the demo) and without it, five seeds each; the curves are
+# in the docs. Half an hour on two cores. Each folder gets the progress and the judgement of one `unjam train`.
 set -eu
 cd "$(dirname "$0")/../.."
 runs=runs/for-the-docs-model

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from unjam.drivers import IDM, Constant, Human, PISaturation
-from unjam.errors import EpisodeError, InputError
+from unjam.errors import InputError
 from unjam.reports.metrics import measure
 from unjam.scenarios import Scenario, make_scenario
 from unjam.traffic.episode import run_episode
@@ -239,38 +239,6 @@ def test_a_warmup_runs_before_the_first_decision(file: Path, simulation: Simulat
         if name in cold.vehicle_ids:
             column, other = warm.vehicle_ids.index(name), cold.vehicle_ids.index(name)
             np.testing.assert_array_equal(warm.speeds[:, column], cold.speeds[60:, other])
-
-
-FLOW = '<flow id="f" route="along" end="9" number="3"/>'
-
-
-def broken(folder: Path, network: str, vehicles: str) -> Path:
-    """A road whose network is whole, or without any edge."""
-    path = straight(folder, vehicles)
-    if network == "hollow":
-        (folder / "road.net.xml").write_text('<net version="1.20"></net>')
-    return path
-
-
-@pytest.mark.parametrize(
-    ("network", "vehicles", "words"),
-    [
-        ("hollow", FLOW, "SUMO cannot start"),
-        ("whole", '<vehicle id="v" type="ghost" route="along" depart="0"/>', "ghost"),
-        ("whole", '<vehicle id="v" route="nowhere" depart="0"/>', "nowhere"),
-        ("whole", '<vehicle id="v" depart="0"><route edges="moon"/></vehicle>', "moon"),
-    ],
-)
-def test_what_sumo_refuses_is_told_in_one_line_and_the_next_episode_runs(
-    network: str, vehicles: str, words: str, tmp_path: Path, simulation: Simulation
-) -> None:
-    path = broken(tmp_path, network, vehicles)
-    with pytest.raises(EpisodeError, match=words) as caught:
-        run_episode(scenario_of(path), IDM(), (0,), simulation=simulation)
-    assert "\n" not in str(caught.value)
-    (tmp_path / "good").mkdir()
-    good = straight(tmp_path / "good", COLUMN)
-    assert run_episode(scenario_of(good), IDM(), (0,), simulation=simulation).status == "completed"
 
 
 def test_a_vehicle_that_sumo_refuses_later_is_told_in_one_line(tmp_path: Path) -> None:

@@ -6,12 +6,13 @@ import pytest
 
 from unjam.drivers import IDM, PISaturation
 from unjam.errors import EpisodeError, UnjamError
-from unjam.scenarios import Ring
+from unjam.scenarios import Ring, make_scenario
 from unjam.scenarios.road import ClosedRoad
 from unjam.traffic.episode import run_episode
 from unjam.traffic.simulation import Backend, Simulation
 from unjam.traffic.stepping import make_traffic
 
+from .own_roads import straight
 from .test_record import fingerprint
 
 RING = Ring(horizon=100, length=(230, 230))
@@ -177,3 +178,33 @@ def test_libsumo_and_traci_give_identical_episodes() -> None:
             episode = run_episode(RING, PISaturation(), (5,), full=True, simulation=simulation)
         found.append(fingerprint(episode))
     assert found[0] == found[1]
+
+
+FLOW = '<flow id="f" route="along" end="9" number="3"/>'
+
+
+def broken(folder: Path, network: str, vehicles: str) -> Path:
+    """A road whose network is whole, or without any edge."""
+    path = straight(folder, vehicles)
+    if network == "hollow":
+        (folder / "road.net.xml").write_text('<net version="1.20"></net>')
+    return path
+
+
+@pytest.mark.parametrize(
+    ("network", "vehicles", "words"),
+    [
+        ("hollow", FLOW, "SUMO cannot start"),
+        ("whole", '<vehicle id="v" type="ghost" route="along" depart="0"/>', "ghost"),
+        ("whole", '<vehicle id="v" route="nowhere" depart="0"/>', "nowhere"),
+        ("whole", '<vehicle id="v" depart="0"><route edges="moon"/></vehicle>', "moon"),
+    ],
+)
+def test_what_sumo_refuses_of_the_users_own_network_is_told_in_one_line_and_the_next_episode_runs(
+    network: str, vehicles: str, words: str, tmp_path: Path, simulation: Simulation
+) -> None:
+    scenario = make_scenario(str(broken(tmp_path, network, vehicles)), {"cav_share": 1.0})
+    with pytest.raises(EpisodeError, match=words) as caught:
+        run_episode(scenario, IDM(), (0,), simulation=simulation)
+    assert "\n" not in str(caught.value)
+    assert run_episode(RING, IDM(), (0,), simulation=simulation).status == "completed"

@@ -38,5 +38,5 @@ PRESETS: dict[str, dict[str, Any]] = {
         "virtual": {"k_max": 500, "kappa": 2.0, "virtual_ratio": 1.0},
     },
     # Ends within about five minutes on two cores, evaluation included.
-    "demo": {"steps": 480_000},
+    "demo": {"steps": 300_000, "evaluation": {"every": 2}},
 }

@@ -55,8 +55,7 @@ def mean_speed_of_moments(episode: Episode) -> float:
     Where vehicles come and go it counts a moment with few vehicles as much as one in a jam.
     """
     moments = episode.speeds[1:]
-    there = ~np.isnan(moments).all(axis=1)
-    return float(np.nanmean(moments[there], axis=1).mean()) if there.any() else float("nan")
+    return _mean_there(np.nanmean(moments[~np.isnan(moments).all(axis=1)], axis=1))
 
 
 def mean_speed_steady(episode: Episode) -> float:
@@ -132,8 +131,8 @@ def time_to_dissolve(episode: Episode) -> float:
     From the first decision to the first moment from which on the std of speed across vehicles stays below
     0.3 m/s for 60 s on end.
     """
-    anybody = np.asarray(~np.isnan(episode.speeds).all(axis=1))
-    calm = np.logical_not(anybody)
+    anybody = ~np.isnan(episode.speeds).all(axis=1)
+    calm = np.ones(len(episode.speeds), bool)
     calm[anybody] = np.nanstd(episode.speeds[anybody], axis=1) < CALM_STD
     needed = round(CALM_SECONDS / episode.step)
     if calm[0] or len(calm) < needed:
