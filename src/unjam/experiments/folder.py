@@ -15,6 +15,9 @@ from unjam.traffic.reward import make_reward
 def check_possible(config: RunConfig) -> None:
     """Raise `InputError` where the expert, what the network sees, the reward or a baseline is at fault."""
     scenario = config.make_scenario()
+    of_a_loop = [part for part in config.policy.observe if part in ("loop_length", "place")]
+    if of_a_loop and not scenario.closed:
+        raise InputError(f"policy.observe: {of_a_loop[0]!r} is not allowed on a road with ends")
     observation_size(config.policy.observe, config.make_expert())
     make_reward(config.reward or scenario.reward)
     for name in config.evaluation.baselines:
