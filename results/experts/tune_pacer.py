@@ -1,10 +1,10 @@
 """Finds paces for the figure eight; prints the lap times and the paces that `drivers/pacer.py` holds.
 
 Lap times by grid, paces over the lap by the cross-entropy method: candidates are drawn from a normal
-distribution, which then moves to the best of them. Each candidate drives 5,000 steps with seeds that are new in
-each generation; its worth is the mean speed of all vehicles in the last 3,000, half of it the mean over the
-seeds and half the worst of them, nothing at a collision. 3,000 steps are four laps: the mean of fewer depends on
-where on the lap they begin.
+distribution, which then moves to the best of them. Each candidate drives 5,000 steps with seeds that are new
+in each generation; its worth is the mean speed of all vehicles in the last 3,000, half of it the mean over
+the seeds and half the worst of them, nothing at a collision. 3,000 steps are four laps: the mean of fewer
+depends on where on the lap they begin.
 Usage: tune_pacer.py [GENERATIONS [RADIUS ...]]; a generation takes half a minute on two cores.
 """
 

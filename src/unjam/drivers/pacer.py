@@ -113,7 +113,7 @@ def _tuned(harmonics: Harmonics, gain: float, wanted_gap: float) -> dict[str, An
 TUNED: dict[float, dict[str, Any]] = {
     449.0: _tuned((7.339, -1.983, 1.47, -1.075, 0.716, -0.025, 0.077), 0.05, 0.512),
     462.5: _tuned((7.973, -1.865, 2.48, -0.422, 0.173, 0.027, 0.063), 0.038, 0.545),
-    475.9: _tuned((8.386, -2.204, 2.993, 0.318, 0.135, -0.006, 0.038), 0.045, 0.553),
+    475.9: _tuned((8.45, -2.057, 3.128, 0.477, 0.086, -0.086, 0.075), 0.04, 0.552),
     489.3: _tuned((9.039, -1.791, 3.513, 1.051, 0.015, 0.024, 0.216), 0.044, 0.581),
 }
 """what `varying` uses, by the length of the lap [m], found by results/experts/tune_pacer.py.

@@ -12,7 +12,10 @@ from unjam.experiments.studies.table import best_expert, table_rows, write_table
 from unjam.files import to_json, write_whole
 
 LEARNERS = ("trpo", "ppo", "sac", "proposed", "without-model", "ours")
-ABLATION = ("trpo", "mb-trpo", "no-initial-policy", "without-model", "proposed", "ours")
+ABLATION = (
+    *("trpo", "mb-trpo", "no-initial-policy", "without-model", "proposed"),
+    *("ours-without-model", "ours"),
+)
 FRAMEWORK = ("ppo", "sac", "proposed-ppo", "proposed-sac", "proposed")
 
 

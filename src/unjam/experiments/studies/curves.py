@@ -15,7 +15,8 @@ from unjam.reports.statistics import estimate
 
 POINTS = 100
 """of a curve"""
-NAMES = {"return_mean": "return, in training", "cav_mean_speed": "CAV's mean speed,\nin training [m/s]"}
+DRAWN = {"return_mean": "return, in training", "cav_mean_speed": "CAV's mean speed, in training [m/s]"}
+NAMES = (*DRAWN, "return_validation")
 
 
 def curves_of(pool: Pool, road: str, variants: Sequence[str], seeds: int) -> dict[str, Any]:
@@ -33,9 +34,8 @@ def curves_of(pool: Pool, road: str, variants: Sequence[str], seeds: int) -> dic
 
 
 def _on(grid: np.ndarray, progress: list[dict[str, Any]], name: str) -> list[float]:
-    steps = [row["actual_steps"] for row in progress]
-    values = [np.nan if row[name] is None else row[name] for row in progress]
-    return np.interp(grid, steps, values).round(4).tolist()
+    known = [(row["actual_steps"], row[name]) for row in progress if row[name] is not None]
+    return np.interp(grid, *zip(*known, strict=True)).round(4).tolist()
 
 
 def draw_curves(
@@ -49,9 +49,9 @@ def draw_curves(
     """
     with rc_context(STYLE):
         figure = Figure(figsize=(10.5, 2.6 * len(by_road) + 0.5), layout="constrained", dpi=130)
-        panels = figure.subplots(len(by_road), len(NAMES), squeeze=False)
+        panels = figure.subplots(len(by_road), len(DRAWN), squeeze=False)
         for (road, curves), line in zip(by_road.items(), panels, strict=True):
-            for (name, label), axes in zip(NAMES.items(), line, strict=True):
+            for (name, label), axes in zip(DRAWN.items(), line, strict=True):
                 _draw(axes, curves, name)
                 metric = {"return_mean": "return"}.get(name, name)
                 for (reference, rows), style in zip(references[road].items(), ("--", ":"), strict=False):

@@ -47,6 +47,7 @@ VARIANTS: dict[str, Variant] = {
     "trpo-long": Variant("TRPO, 4 M steps", "paper", ALONE, LONG_BUDGET),
     "proposed-long": Variant("proposed, 4 M steps", "paper", {}, LONG_BUDGET),
     "ours": Variant("ours", "best", {}),
+    "ours-without-model": Variant("ours without model", "best", {"virtual.virtual_ratio": 0.0}),
     "best": Variant("ours, trained on", "best", {}, None),
 }
 """the paper's methods with the paper's settings, and what we make of them"""
