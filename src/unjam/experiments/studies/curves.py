@@ -35,7 +35,8 @@ def curves_of(pool: Pool, road: str, variants: Sequence[str], seeds: int) -> dic
 
 def _on(grid: np.ndarray, progress: list[dict[str, Any]], name: str) -> list[float]:
     known = [(row["actual_steps"], row[name]) for row in progress if row[name] is not None]
-    return np.interp(grid, *zip(*known, strict=True)).round(4).tolist()
+    steps, values = np.array(known, float).T
+    return np.interp(grid, steps, values).round(4).tolist()
 
 
 def draw_curves(
