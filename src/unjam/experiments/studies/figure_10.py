@@ -17,6 +17,7 @@ from unjam.traffic.workers import Workers
 VOLUMES = ("ring-5", "ring-11", "ring")
 LEARNERS = ("trpo", "ppo", "sac", "proposed", "ours")
 CARRIED = ("proposed", "ours")
+TRAINED_ON = "ring"
 OTHER_ROADS: dict[str, dict[str, Any]] = {
     "5 vehicles": ROADS["ring-5"],
     "11 vehicles": ROADS["ring-11"],
@@ -35,7 +36,7 @@ def carried_over(pool: Pool, seeds: int) -> list[dict[str, Any]]:
             drivers = {name: make_driver(name, scenario.decision_step) for name in ("human", "pi")}
             for variant in CARRIED:
                 for seed in range(seeds):
-                    folder = pool.folder_of(PlannedRun("ring", variant, seed))
+                    folder = pool.folder_of(PlannedRun(TRAINED_ON, variant, seed))
                     drivers[f"{variant} {seed}"] = make_driver(str(folder), scenario.decision_step)
             found = evaluate(scenario, drivers, held_out_seeds(EPISODES), workers)
             for label, episodes in found.rows.items():

@@ -18,6 +18,7 @@ from unjam.reports.figures import LINES, STYLE
 from unjam.reports.results import read_progress
 from unjam.traffic.workers import Workers
 
+ROAD = "ring"
 MEASURED = (
     *("trpo", "ppo", "sac", "mb-trpo", "without-model"),
     *("proposed", "proposed-ppo", "proposed-sac", "ours"),
@@ -37,7 +38,7 @@ def measured_seconds(steps: int = STEPS, rounds: int = ROUNDS) -> dict[str, list
     with Workers(1) as workers, tempfile.TemporaryDirectory() as place:
         for turn in range(rounds):
             for variant in MEASURED:
-                config = PlannedRun("ring", variant, turn).config
+                config = PlannedRun(ROAD, variant, turn).config
                 config = replace(config, steps=steps, evaluation=replace(config.evaluation, every=0))
                 # Or sac would measure hardly more than its start.
                 config = replace(config, sac=replace(config.sac, start_steps=START_STEPS))

@@ -79,11 +79,12 @@ def convergence(pool: Pool, seeds: int) -> list[dict[str, Any]]:
         for variant in COMPARED
     }
     best = max(row["return_mean"] for found in runs.values() for run in found for row in run.progress)
+    enough = best - TOLERANCE * abs(best)
     rows = []
     for variant, found in runs.items():
         arrivals = []
         for run in found:
-            near = [row for row in run.progress if row["return_mean"] >= (1 - TOLERANCE) * best]
+            near = [row for row in run.progress if row["return_mean"] >= enough]
             arrivals.append(near[0]["actual_steps"] if near else None)
         last = [run.in_training("return_mean") for run in found]
         rows.append(
@@ -92,7 +93,7 @@ def convergence(pool: Pool, seeds: int) -> list[dict[str, Any]]:
                 "name": VARIANTS[variant].label,
                 "best_known": best,
                 "arrivals": arrivals,
-                "stayed": sum(value >= (1 - TOLERANCE) * best for value in last),
+                "stayed": sum(value >= enough for value in last),
                 "trainings": len(found),
                 "last": entries(estimate(last)),
             }
