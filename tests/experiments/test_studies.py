@@ -26,8 +26,8 @@ def test_training_time_is_measured_in_turns_for_all_variants(
     assert set(virtual) - set(plain) == {"fit", "imagine"}
     assert min(plain["actual"], plain["update"], virtual["fit"], virtual["imagine"]) > 0
     axes = figure_8.draw({variant: found[variant][0] for variant in VARIANTS}).axes[0]
-    longest = max(patch.get_x() + patch.get_width() for patch in axes.patches)
-    assert longest == pytest.approx(max(sum(plain.values()), sum(virtual.values())))
+    longest = max(sum(plain.values()), sum(virtual.values()))
+    assert longest < axes.get_xlim()[1] < 1.2 * longest
 
 
 def test_controllers_are_carried_over_to_other_traffic(
