@@ -194,4 +194,4 @@ if __name__ == "__main__":
     recorded = zip(*(controller.sample[name] for name in (*State._fields, "acceleration")), strict=True)
     off = [abs(controller.act(*map(float, perceived)) - answer) for *perceived, answer in recorded]
     print(f"{len(off)} decisions, at most {max(off):.1e} m/s2 from what was recorded")
-    sys.exit(max(off) > 1e-9)
+    sys.exit(int(max(off) > 1e-9))

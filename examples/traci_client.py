@@ -1,4 +1,4 @@
-"""Drives a vehicle of a running SUMO by a .unjam controller, over TraCI. Needs traci, NumPy, run_controller.py.
+"""Drives a vehicle of a running SUMO by a .unjam controller, over TraCI; needs traci and run_controller.py.
 
     sumo -c my.sumocfg --remote-port 8813 &
     python examples/traci_client.py ring.unjam 8813 VEHICLE

@@ -22,6 +22,7 @@ from unjam.drivers import IDM, FollowerStopper, PISaturation, ResidualDriver
 from unjam.drivers.check import random_state
 from unjam.drivers.driver import Driver
 from unjam.drivers.from_file import FileDriver
+from unjam.drivers.local_state import ObservationPart
 from unjam.drivers.mixed import Mixed
 from unjam.drivers.network import network_arrays
 from unjam.drivers.registry import recipe_of
@@ -30,13 +31,19 @@ from unjam.errors import InputError
 
 from ..conftest import random_network
 
-ALL_PARTS = ("local", "expert_acceleration", "expert_memory", "loop_length")
+ALL_PARTS: tuple[ObservationPart, ...] = ("local", "expert_acceleration", "expert_memory", "loop_length")
 ABOUT = {"scenario": "ring", "iteration": 3}
 
 
-def residual(expert: Driver, seed: int = 0, hold: int = 1, outputs: int = 1) -> ResidualDriver:
-    network = random_network(observation_size(ALL_PARTS, expert), seed, outputs=outputs)
-    return ResidualDriver(expert, network, 1.0, ALL_PARTS, hold)
+def residual(
+    expert: Driver,
+    seed: int = 0,
+    hold: int = 1,
+    outputs: int = 1,
+    parts: tuple[ObservationPart, ...] = ALL_PARTS,
+) -> ResidualDriver:
+    network = random_network(observation_size(parts, expert), seed, outputs=outputs)
+    return ResidualDriver(expert, network, 1.0, parts, hold)
 
 
 def actions(driver: Driver) -> np.ndarray:
@@ -167,7 +174,9 @@ def test_a_file_by_itself_never_runs_code_that_it_names(tmp_path: Path, nested: 
     expert: Driver = FileDriver(code, "trap")
     content = controller_bytes(residual(Mixed((IDM(), residual(expert))) if nested else expert), ABOUT)
     code.write_text(code.read_text() + f"Path({str(tmp_path / 'sprung')!r}).touch()\n")
-    assert "is Python code (code.py), which a file by itself may not run" in refused(written(tmp_path, content))
+    assert "is Python code (code.py), which a file by itself may not run" in refused(
+        written(tmp_path, content)
+    )
     assert not (tmp_path / "sprung").exists()
 
 

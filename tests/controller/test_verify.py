@@ -1,4 +1,5 @@
 import json
+import sys
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
@@ -23,9 +24,12 @@ from .test_sample import perceived
 HELD = residual(PISaturation(), hold=3)
 
 
-def content_of(driver: Driver = HELD, limit: float | None = None, **parts: bytes) -> bytes:
+def content_of(
+    driver: Driver = HELD, limit: float | None = None, parts: dict[str, bytes] | None = None
+) -> bytes:
     about = ABOUT if limit is None else {**ABOUT, "action_limit": limit}
-    return controller_bytes(driver, about, {SAMPLE: sample_bytes(driver, perceived(), limit or 1.0), **parts})
+    sample = sample_bytes(driver, perceived(), limit or 1.0)
+    return controller_bytes(driver, about, {SAMPLE: sample, **(parts or {})})
 
 
 def changed(folder: Path, change: Callable[[dict[str, Any]], object], content: bytes | None = None) -> Path:
@@ -85,7 +89,7 @@ def test_a_manifest_that_says_something_else_is_refused(
 
 def test_a_sample_that_the_driver_does_not_answer_so_is_refused(tmp_path: Path) -> None:
     other = sample_bytes(residual(PISaturation(), seed=1), perceived(), 1.0)
-    words = refused(written(tmp_path, content_of(**{SAMPLE: other})))
+    words = refused(written(tmp_path, content_of(parts={SAMPLE: other})))
     assert words.startswith("controller: step 0 of its sample: its driver answers ")
 
 
@@ -103,15 +107,15 @@ def test_a_graph_that_answers_something_else_is_refused(tmp_path: Path) -> None:
     from .test_graph import graph
 
     driver = Constant()
-    path = written(tmp_path, content_of(driver, limit=20.0, **{GRAPH: graph()}))
+    path = written(tmp_path, content_of(driver, limit=20.0, parts={GRAPH: graph()}))
     assert "step 0 of its sample: its graph answers " in refused(path)
 
 
 def test_without_onnx_the_graph_is_not_run_and_that_is_told(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setitem(__import__("sys").modules, "onnx", None)
-    path = written(tmp_path, content_of(**{GRAPH: b"anything"}))
+    monkeypatch.setitem(sys.modules, "onnx", None)
+    path = written(tmp_path, content_of(parts={GRAPH: b"anything"}))
     last = verify_controller(path)[-1]
     assert last.name == "graph"
     assert last.found.startswith("not run: onnx is not installed")
@@ -157,7 +161,10 @@ JSON = st.recursive(
 def places(value: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
     """Every place in a JSON document."""
     inner = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
-    return [*([path] if path else []), *(found for key, part in inner for found in places(part, (*path, key)))]
+    return [
+        *([path] if path else []),
+        *(found for key, part in inner for found in places(part, (*path, key))),
+    ]
 
 
 @settings(max_examples=100)

@@ -55,7 +55,11 @@ def _what_is_wrong(entry: zipfile.ZipInfo) -> str:
         return f"is unknown; allowed: {', '.join(PARTS)}"
     if stat.S_ISLNK(entry.external_attr >> 16):
         return "is a link"
-    if entry.compress_type != zipfile.ZIP_STORED or entry.flag_bits & 1 or entry.compress_size != entry.file_size:
+    if (
+        entry.compress_type != zipfile.ZIP_STORED
+        or entry.flag_bits & 1
+        or entry.compress_size != entry.file_size
+    ):
         return "is compressed or encrypted; allowed: neither"
     if entry.file_size > LARGEST_PART:
         return f"has {entry.file_size} bytes; allowed: at most {LARGEST_PART}"

@@ -33,9 +33,7 @@ class Controller:
     """content of the archive, by name"""
 
 
-def controller_bytes(
-    driver: Driver, about: dict[str, Any], parts: dict[str, bytes] | None = None
-) -> bytes:
+def controller_bytes(driver: Driver, about: dict[str, Any], parts: dict[str, bytes] | None = None) -> bytes:
     """Return the content of a `.unjam` file.
 
     Args:

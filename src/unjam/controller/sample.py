@@ -16,7 +16,7 @@ ANSWER = "acceleration"
 
 
 def sample_bytes(driver: Driver, states: LocalState, limit: float) -> bytes:
-    """Return the part of an archive with `states`, arrays of shape (T,), and what `driver` answers to them."""
+    """Return the part of an archive with `states`, arrays of shape (T,), and the answers of `driver`."""
     arrays = {name: np.array(values, np.float64) for name, values in states._asdict().items()}
     return save({**arrays, ANSWER: replay(driver, states, limit)})
 

@@ -57,7 +57,8 @@ def _check_description(controller: Controller) -> None:
     manifest = controller.manifest
     for key, value in description(controller.driver, manifest.get("action_limit")).items():
         if manifest.get(key) != value:
-            raise InputError(f"controller: its manifest says of {key}: {_short(manifest.get(key))}; allowed: {_short(value)}")
+            said = _short(manifest.get(key))
+            raise InputError(f"controller: its manifest says of {key}: {said}; allowed: {_short(value)}")
 
 
 def _short(value: Any) -> str:

@@ -42,9 +42,7 @@ class Exported:
     """of the recorded sample"""
 
 
-def export_controller(
-    source: str | Path, to: str | Path, onnx: bool = False, scenario: str = ""
-) -> Exported:
+def export_controller(source: str | Path, to: str | Path, onnx: bool = False, scenario: str = "") -> Exported:
     """Write a controller into a file that needs nothing else: `.unjam`, and on demand an ONNX graph.
 
     One held-out episode is driven for its recorded sample.

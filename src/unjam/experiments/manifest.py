@@ -32,7 +32,7 @@ def manifest() -> dict[str, Any]:
 
 
 def origin(scenario: Scenario, expert: Driver) -> dict[str, Any]:
-    """Return where a controller comes from, for its own manifest: the same for the same run, whenever made."""
+    """Return where a controller comes from, for its own manifest: the same for the same run."""
     return {
         "scenario": scenario_recipe(scenario),
         "time_step": scenario.decision_step,

@@ -71,7 +71,7 @@ def _exact_constant() -> Callable[..., Any]:
 
     def constant(value: float, dtype: int = onnx_ir.DataType.DOUBLE, **_: Any) -> Any:
         exact = np.asarray(value, onnx_ir.DataType(dtype).numpy())
-        return operators.Constant(value=onnx_ir.tensor(exact))
+        return operators.Constant(value=onnx_ir.tensor(exact))  # pyright: ignore[reportArgumentType]
 
     return constant
 
