@@ -40,7 +40,8 @@ METRICS_OF_THE_DESIGN = [
     "speed_limit_ratio_steady",
 ]
 
-VERBS = ["scenarios", "drivers", "drive", "train", "evaluate", "model", "report", "watch", "bench", "doctor"]
+VERBS = ["scenarios", "drivers", "drive", "train", "evaluate", "model", "report", "export", "verify"]
+VERBS += ["watch", "bench", "doctor"]
 
 
 def document(ran: subprocess.CompletedProcess[str]) -> Any:
@@ -185,6 +186,14 @@ def test_train_evaluate_report_and_go_on(unjam: Run, tmp_path: Path) -> None:
 
     driven = document(unjam("drive", "ring", "--driver", "run", *SMALL, "-n", 1, "--json"))
     assert driven["episodes"][0]["status"] == "completed"
+
+    shipped = document(unjam("export", "run", "--to", "ring.unjam", "--json"))
+    assert shipped == {"file": "ring.unjam", "onnx": None, "driver": "pi + residual", "decisions": 80}
+    assert document(unjam("verify", "ring.unjam", "--json"))["verified"].keys() >= {"weights", "sample"}
+    assert "ok sample: 80 decisions" in unjam("verify", "ring.unjam").stdout
+    assert "ring.unjam: " in unjam("export", "run", "--to", "ring.unjam").stdout
+    again = document(unjam("drive", "ring", "--driver", "ring.unjam", *SMALL, "-n", 1, "--json"))
+    assert again["mean"] == driven["mean"]
 
     on_top = document(
         unjam(*TINY_RUN, "--steps", 160, "--expert", "run/controller.unjam", "--out", "second", "--json")
