@@ -1,4 +1,4 @@
-"""Faults of processes: workers that are lost, networks that break SUMO, thousands of episodes, killed runs."""
+"""Faults of processes: lost workers, networks that break SUMO, thousands of episodes, killed runs."""
 
 import hashlib
 import json
@@ -34,7 +34,8 @@ SILENCE = 3.0
 """seconds after which a stopped worker counts as hung here"""
 NUMBERS = ("nan", "-1", "1e30", "inf", "", "0", "ghost", "1e-30")
 DEMAND = (
-    '<vehicle id="a" type="car" route="along" depart="0"/><trip id="b" type="car" depart="1" from="road"/>'
+    '<vehicle id="a" type="car" route="along" depart="0"/>'
+    '<trip id="b" type="car" depart="1" from="road" to="road"/>'
 )
 
 
@@ -89,6 +90,7 @@ def networks(count: int, folder: Path, generator: np.random.Generator) -> Outcom
     names = ("road.net.xml", "demand.rou.xml", "straight.sumocfg")
     whole = {name: (folder / name).read_bytes() for name in names}
     with Workers(1, silence=10.0, attempts=1) as workers:
+        assert driven(path, workers) == DRIVEN
         for _ in range(count):
             for name, content in whole.items():
                 (folder / name).write_bytes(content)
@@ -96,6 +98,9 @@ def networks(count: int, folder: Path, generator: np.random.Generator) -> Outcom
             (folder / name).write_bytes(broken(whole[name], generator))
             outcome.happened[driven(path, workers)] += 1
     return outcome
+
+
+DRIVEN = "driven: the damage does not matter"
 
 
 def driven(path: Path, workers: Workers) -> str:
@@ -107,7 +112,7 @@ def driven(path: Path, workers: Workers) -> str:
         return "refused in one line before SUMO started"
     (episode,) = workers.run([EpisodeTask(road, IDM(), (0,))])
     if episode.ok:
-        return "driven: the damage does not matter"
+        return DRIVEN
     assert "\n" not in episode.reason
     if "workers were lost" in episode.reason:
         return "SUMO crashed in the worker, which was replaced"

@@ -20,6 +20,6 @@ FAULTS: dict[str, Fault] = {
     "full disk": Fault("disk full after some bytes of a checkpoint", full_disks, quick=20, long=200),
     "networks": Fault("network, demand or configuration of SUMO broken", networks, quick=12, long=500),
     "lost workers": Fault("worker killed, crashed or stopped in an episode", lost_workers, quick=2, long=200),
-    "resets": Fault("episodes one after the other in one process", resets, quick=300, long=10_000),
-    "killed runs": Fault("training run killed (signal 9)", killed_runs, quick=4, long=40, slow=True),
+    "resets": Fault("episodes one after the other in one process", resets, quick=100, long=10_000),
+    "killed runs": Fault("training run killed (signal 9)", killed_runs, quick=4, long=24, slow=True),
 }

@@ -25,10 +25,10 @@ TARGET = ROOT / "results" / "soak" / "soak.json"
 def soak(names: list[str]) -> None:
     """Inject the faults of these names; the rows of others stay as they were measured before."""
     rows = {row["name"]: row for row in json.loads(TARGET.read_text())["rows"]} if TARGET.exists() else {}
-    for number, name in enumerate(names):
+    for name in names:
         fault, started = FAULTS[name], time.monotonic()
         with tempfile.TemporaryDirectory() as folder:
-            outcome = fault.inject(fault.long, Path(folder), np.random.default_rng(number))
+            outcome = fault.inject(fault.long, Path(folder), np.random.default_rng(list(FAULTS).index(name)))
         rows[name] = {
             "name": name,
             "about": fault.about,
