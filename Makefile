@@ -35,6 +35,10 @@ docs: $(VENV)/.installed-dev
 	$(BIN)/python -m sphinx -q -W -b html docs docs/_build/html
 	@echo docs/_build/html/index.html
 
+# Thousands of injected faults, half an hour: results/soak/soak.json
+soak: $(VENV)/.installed-dev
+	$(BIN)/python tests/faults/soak.py
+
 bench: $(VENV)/.installed
 	$(BIN)/unjam bench
 
