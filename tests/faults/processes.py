@@ -135,7 +135,7 @@ def broken(content: bytes, generator: np.random.Generator) -> bytes:
 TINY = {
     "ring": ["ring", "--length", "60", "--vehicles", "5", "--set", "road.horizon=100"],
     "figure-eight": ["figure-eight", "--set", "road.horizon=100"],
-    "merge": ["merge", "--set", "road.horizon=40"],
+    "merge": ["merge", "--set", "road.horizon=40", "--set", "road.penetration=0.5"],
     "own-network": ["straight.sumocfg", "--cav-types", "car", "--set", "road.horizon=100"],
 }
 LEARNERS = ("trpo", "sac", "ppo")
@@ -144,7 +144,7 @@ SETTINGS = [
     *("policy.hidden=[8]", "trpo.batch_steps=100", "ppo.batch_steps=100", "ppo.epochs=3"),
     *("sac.batch_steps=100", "sac.start_steps=200", "sac.updates_per_step=0.05", "sac.batch=16"),
 ]
-ITERATIONS = 8
+ITERATIONS = 6
 
 
 def killed_runs(count: int, folder: Path, generator: np.random.Generator) -> Outcome:
@@ -161,7 +161,8 @@ def killed_runs(count: int, folder: Path, generator: np.random.Generator) -> Out
         command += [part for setting in SETTINGS for part in ("--set", setting)]
         steps = 100 * ITERATIONS if road != "merge" else 120 * ITERATIONS
         last = ["--steps", str(steps), "--json"]
-        unjam(folder, [*command, *last, "--out", f"{road}-whole"]).wait()
+        whole = unjam(folder, [*command, *last, "--out", f"{road}-whole"])
+        assert whole.wait() == 0, (folder / "words.txt").read_text()
         run = folder / f"{road}-killed"
         start = [*command, *last, "--out", run.name]
         for _ in range(kills):
@@ -169,7 +170,7 @@ def killed_runs(count: int, folder: Path, generator: np.random.Generator) -> Out
             outcome.happened[words] += 1
             start = ["train", "--resume", run.name, "--json"] if (run / "config.toml").exists() else start
         process = unjam(folder, start)
-        assert process.wait() == 0
+        assert process.wait() == 0, (folder / "words.txt").read_text()
         assert hashes(run) == hashes(folder / f"{road}-whole")
     return outcome
 
@@ -177,8 +178,8 @@ def killed_runs(count: int, folder: Path, generator: np.random.Generator) -> Out
 def unjam(folder: Path, arguments: list[str]) -> "subprocess.Popen[bytes]":
     """Start the command line."""
     command = [sys.executable, "-m", "unjam", *arguments]
-    quiet = subprocess.DEVNULL
-    return subprocess.Popen(command, cwd=folder, stdout=quiet, stderr=quiet)
+    with (folder / "words.txt").open("wb") as words:
+        return subprocess.Popen(command, cwd=folder, stdout=subprocess.DEVNULL, stderr=words)
 
 
 def killed_at_random(folder: Path, command: list[str], run: Path, generator: np.random.Generator) -> None:

@@ -21,5 +21,5 @@ FAULTS: dict[str, Fault] = {
     "networks": Fault("network, demand or configuration of SUMO broken", networks, quick=12, long=500),
     "lost workers": Fault("worker killed, crashed or stopped in an episode", lost_workers, quick=2, long=200),
     "resets": Fault("episodes one after the other in one process", resets, quick=100, long=10_000),
-    "killed runs": Fault("training run killed (signal 9)", killed_runs, quick=4, long=24, slow=True),
+    "killed runs": Fault("training run killed (signal 9)", killed_runs, quick=4, long=12, slow=True),
 }
