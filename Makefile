@@ -11,7 +11,7 @@ TORCH_INDEX ?=
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet -c constraints.txt
 
-.PHONY: demo test test-all check docs bench clean
+.PHONY: demo test test-all check bless docs bench soak clean
 
 demo: $(VENV)/.installed
 	$(BIN)/unjam train ring --preset demo
@@ -27,9 +27,17 @@ check: $(VENV)/.installed-dev
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright
 
+# Trajectories that have changed, and rightly so: make bless WHY="why they have"
+bless: $(VENV)/.installed-dev
+	$(BIN)/python tests/golden/bless.py "$(WHY)"
+
 docs: $(VENV)/.installed-dev
 	$(BIN)/python -m sphinx -q -W -b html docs docs/_build/html
 	@echo docs/_build/html/index.html
+
+# Thousands of injected faults, half an hour: results/soak/soak.json
+soak: $(VENV)/.installed-dev
+	$(BIN)/python tests/faults/soak.py
 
 bench: $(VENV)/.installed
 	$(BIN)/unjam bench

@@ -91,6 +91,31 @@ def _steps_of(text: str) -> int:
     return int("".join(digit for digit in text if digit.isdigit()) or 0)
 
 
+SOAK = "soak/soak.json"
+
+
+def soak_table() -> pd.DataFrame:
+    """Return what was injected in the last soak, how often, and what happened."""
+    table = []
+    for row in json.loads((RESULTS / SOAK).read_text())["rows"]:
+        happened = [f"{count:,}: {words}" for words, count in row["happened"].items()]
+        facts = [f"{name}: {value}" for name, value in row["facts"].items()]
+        table.append(
+            {
+                "what was injected": row["about"],
+                "how often": f"{row['injected']:,}",
+                "what happened": "; ".join([*happened, *facts]),
+            }
+        )
+    return pd.DataFrame(table)
+
+
+def soak_origin() -> str:
+    """Return with what the last soak was made."""
+    made = json.loads((RESULTS / SOAK).read_text())["manifest"]
+    return f"SUMO {made['packages']['libsumo']}, commit {made['commit']}, {made['started'][:10]}"
+
+
 def show(table: pd.DataFrame, index: bool = False, digits: int = 3) -> HTML:
     """Return a table in the style of the site."""
     html = table.to_html(

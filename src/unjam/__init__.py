@@ -17,10 +17,12 @@ __version__ = "0.1.0.dev0"
 
 if TYPE_CHECKING:
     from unjam.controller import load_controller
+    from unjam.controller.verify import verify_controller
     from unjam.drivers import Driver, LocalState, check_driver
     from unjam.environments.several import parallel_env
     from unjam.experiments.config import load_config
     from unjam.experiments.drive import drive
+    from unjam.experiments.export import export_controller
     from unjam.experiments.train import train
     from unjam.reports.html import write_report
     from unjam.traffic.episode import run_episode
@@ -31,6 +33,8 @@ _PLACES = {
     "train": "unjam.experiments.train",
     "load_config": "unjam.experiments.config",
     "load_controller": "unjam.controller",
+    "export_controller": "unjam.experiments.export",
+    "verify_controller": "unjam.controller.verify",
     "run_episode": "unjam.traffic.episode",
     "parallel_env": "unjam.environments.several",
     "write_report": "unjam.reports.html",
@@ -46,11 +50,13 @@ __all__ = [
     "LocalState",
     "check_driver",
     "drive",
+    "export_controller",
     "load_config",
     "load_controller",
     "parallel_env",
     "run_episode",
     "train",
+    "verify_controller",
     "write_report",
 ]
 

@@ -5,6 +5,7 @@ import torch
 from unjam.agents.algorithms import LEARNERS
 from unjam.agents.episodic import seed_iteration
 from unjam.agents.settings import PolicySettings
+from unjam.errors import UnjamError
 
 from .task import DECISIONS, INPUTS, Task, same
 
@@ -96,3 +97,26 @@ def test_each_iteration_of_each_run_draws_its_own_numbers() -> None:
         seed_iteration(run, iteration)
         assert (float(torch.rand(1)), float(np.random.rand())) == drawn[run, iteration]
     assert len(set(drawn.values())) == 4
+
+
+@every_learner
+@pytest.mark.filterwarnings("ignore:overflow", "ignore:invalid value")
+def test_a_reward_that_is_not_finite_is_named_before_anything_is_learned(agent: str) -> None:
+    task = Task(agent=agent, target=lambda observations: np.full(len(observations), 1e200))
+    before = task.parameters()
+    with pytest.raises(UnjamError, match="learner: rewards of iteration 1 are not finite"):
+        task.learn(1)
+    assert same(task.parameters(), before)
+    assert task.iterations == []
+
+
+@every_learner
+def test_a_parameter_that_is_not_finite_is_named_in_the_same_iteration(agent: str) -> None:
+    task = Task(agent=agent)
+    critic = (p for name, p in task.learner.policy.named_parameters() if "value" in name or "critic" in name)
+    with torch.no_grad():
+        next(critic)[0] = torch.nan
+    with pytest.raises(UnjamError, match=r"learner: \S+ is not finite in iteration 1") as caught:
+        task.learn(1)
+    assert "\n" not in str(caught.value)
+    assert task.iterations == []

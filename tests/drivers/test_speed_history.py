@@ -2,7 +2,8 @@ import numpy as np
 import pytest
 import torch
 
-from unjam.drivers.speed_history import SPARE_STEPS, empty_window, mean_speed, slide
+from unjam.drivers.speed_history import SPARE_STEPS, WrittenRows, empty_window, mean_speed, slide
+from unjam.errors import InputError
 
 ROWS = 3
 
@@ -55,3 +56,24 @@ def test_two_memories_may_follow_from_the_same(after: int) -> None:
     for speed in generator.uniform(0, 9, (30, ROWS)):
         expected, again = (slide(one, torch.tensor(speed)) for one in (expected, again))
         np.testing.assert_array_equal(mean_speed(again).numpy(), mean_speed(expected).numpy())
+
+
+@pytest.mark.parametrize("before", [0, 3, 40])
+def test_rows_that_share_nothing_remember_what_arrays_do(before: int) -> None:
+    generator = np.random.default_rng(3)
+    expected = watched(7, generator.uniform(0, 9, (before, ROWS)))
+    found = tensors(expected)
+    for speed in generator.uniform(0, 9, (30, ROWS)):
+        rows, kept = WrittenRows(found["window"], found["seen"]), found["window"].clone()
+        after = slide({**found, "window": rows}, torch.tensor(speed))
+        expected = slide(expected, speed)
+        np.testing.assert_allclose(mean_speed(after).numpy(), mean_speed(expected), atol=1e-12)
+        np.testing.assert_array_equal(found["window"].numpy(), kept.numpy())
+        found = {**after, "window": after["window"].rows}
+        np.testing.assert_array_equal(found["window"].numpy(), expected["window"])
+
+
+@pytest.mark.parametrize(("window", "step"), [(1e12, 0.1), (1.0, 1e-9), (1e308, 1e-300)])
+def test_a_window_that_would_fill_the_memory_is_refused(window: float, step: float) -> None:
+    with pytest.raises(InputError, match=r"window: .* is not allowed; allowed: at most 1,000,000 steps"):
+        empty_window(1, window, step)

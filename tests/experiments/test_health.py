@@ -1,9 +1,11 @@
+import json
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from unjam.experiments import health
-from unjam.experiments.health import Check, check_health
+from unjam.experiments.health import RESULTS_SUMO, Check, check_health
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +36,36 @@ def test_says_what_was_found(checks: dict[str, Check]) -> None:
 
 
 def test_what_can_be_missing_is_not_needed(checks: dict[str, Check]) -> None:
-    assert {name for name, check in checks.items() if not check.needed} == {"traci", "display", "mp4 video"}
+    assert {name for name, check in checks.items() if not check.needed} == {
+        *("traci", "display", "mp4 video"),
+        "SUMO of the results",
+    }
+
+
+def versions_in(value: object) -> Iterator[str]:
+    """The versions of libsumo that a results file names."""
+    if isinstance(value, dict):
+        packages = value.get("packages")
+        if isinstance(packages, dict) and "libsumo" in packages:
+            yield packages["libsumo"]
+        for part in value.values():
+            yield from versions_in(part)
+
+
+def test_the_results_were_made_with_the_version_that_is_said() -> None:
+    results = Path(__file__).parents[2] / "results"
+    found = [
+        version for path in results.rglob("*.json") for version in versions_in(json.loads(path.read_text()))
+    ]
+    assert len(found) > 10
+    assert set(found) == {RESULTS_SUMO}
+
+
+def test_another_sumo_than_that_of_the_results_is_a_warning(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(health, "version", lambda name: "1.28.1")
+    check = health._sumo_of_results()
+    assert (check.ok, check.needed, check.found) == (False, False, "1.28.1")
+    assert f"made with SUMO {RESULTS_SUMO}" in check.remedy
 
 
 def test_each_thing_that_can_be_missing_has_a_remedy(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,8 +1,26 @@
+import shutil
+import socket
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
+from xml.etree import ElementTree
 
+import numpy as np
 import pytest
+
+from unjam.controller import controller_bytes
+from unjam.controller.archive import SAMPLE
+from unjam.controller.sample import replay, sample_bytes
+from unjam.drivers import LACC, Driver, FollowerStopper, LocalState, Pacer, PISaturation
+from unjam.drivers.local_state import LARGEST_GAP
+from unjam.drivers.registry import named_driver
+from unjam.traffic.network_files import sumo_program
+
+from ..controller.test_file import residual
+from ..controller.test_sample import perceived
+from ..drivers.test_experts import EXPERTS
+from ..traffic.own_roads import straight
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
@@ -19,3 +37,119 @@ def test_the_examples_run(name: str, argument: int, words: str, tmp_path: Path) 
     ran = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300, check=False)
     assert ran.returncode == 0, ran.stderr
     assert words in ran.stdout
+
+
+WITHOUT_UNJAM = """
+import json, sys
+
+class NoUnjam:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in ("unjam", "torch", "safetensors", "pydantic", "gymnasium"):
+            raise ImportError(f"{name} is not there")
+
+sys.meta_path.insert(0, NoUnjam())
+sys.path.insert(0, sys.argv[1])
+from run_controller import Controller, State
+for path in sys.argv[2:]:
+    controller = Controller(path)
+    rows = zip(*(controller.sample[name].tolist() for name in State._fields))
+    print(json.dumps([controller.act(*row) for row in rows]))
+assert not {"unjam", "torch", "safetensors"} & set(sys.modules)
+"""
+
+
+def shipped(driver: Driver, path: Path, states: LocalState) -> Path:
+    about = {"time_step": 0.1, "action_limit": 1.5}
+    path.write_bytes(controller_bytes(driver, about, {SAMPLE: sample_bytes(driver, states, 1.0)}))
+    return path
+
+
+def test_the_plain_reader_drives_as_unjam_without_it(tmp_path: Path) -> None:
+    drivers = [named_driver(name, 0.1) for name in EXPERTS if name != "human"]
+    drivers += [
+        residual(PISaturation(), hold=10),
+        residual(Pacer(lap_time=40.0), hold=3, outputs=2),
+        residual(residual(residual(FollowerStopper(), 1, hold=3), 2), 3, hold=5),
+    ]
+    states = perceived(700)
+    paths = [shipped(driver, tmp_path / f"{number}.unjam", states) for number, driver in enumerate(drivers)]
+    command = [sys.executable, "-I", "-c", WITHOUT_UNJAM, str(EXAMPLES), *map(str, paths)]
+    ran = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
+    for driver, line in zip(drivers, ran.stdout.splitlines(), strict=True):
+        limit = getattr(driver, "action_limit", 1.5)
+        found = np.array(line.strip("[]").split(","), float)
+        np.testing.assert_allclose(
+            found, replay(driver, states, limit), rtol=0, atol=1e-9, err_msg=str(driver)
+        )
+
+
+def test_the_plain_reader_compares_itself_with_the_recorded_sample(tmp_path: Path) -> None:
+    path = shipped(residual(PISaturation()), tmp_path / "it.unjam", perceived())
+    command = [sys.executable, "-I", str(EXAMPLES / "run_controller.py"), str(path)]
+    ran = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
+    assert ran.stdout.startswith("40 decisions, at most ")
+    other = path.read_bytes().replace(b'"hold": 1,', b'"hold": 2,')
+    path.write_bytes(other)
+    assert subprocess.run(command, capture_output=True, timeout=60, check=False).returncode != 0
+
+
+def test_the_plain_reader_is_short() -> None:
+    assert len((EXAMPLES / "run_controller.py").read_text().splitlines()) < 200
+
+
+def free_port() -> int:
+    with socket.socket() as opened:
+        opened.bind(("127.0.0.1", 0))
+        return opened.getsockname()[1]
+
+
+def test_the_client_drives_a_vehicle_of_a_running_sumo(tmp_path: Path) -> None:
+    """What SUMO recorded is what the driver answers to what SUMO recorded."""
+    road = straight(
+        tmp_path,
+        '<vehicle id="ahead" type="van" route="along" depart="0" departPos="60" speedFactor="0.6"/>'
+        '<vehicle id="me" type="van" route="along" depart="1" departPos="30" departSpeed="5"/>'
+        '<vehicle id="behind" type="car" route="along" depart="2" departPos="0" departSpeed="5"/>',
+        length=500.0,
+    )
+    driver = residual(LACC(time_gap=2.0, lag=0.5), hold=4, parts=("local", "expert_acceleration"))
+    driver = replace(driver, network=replace(driver.network, authority=0.2))
+    path, port = shipped(driver, tmp_path / "it.unjam", perceived()), free_port()
+    record = tmp_path / "record.xml"
+    sumo = [sumo_program("sumo"), "-c", str(road), "--remote-port", str(port), "--no-step-log"]
+    sumo += ["--fcd-output", str(record), "--precision", "9"]
+    for name in ("traci_client.py", "run_controller.py"):
+        shutil.copy(EXAMPLES / name, tmp_path)
+    with subprocess.Popen(sumo, stdout=subprocess.DEVNULL) as running:
+        try:
+            client = [sys.executable, "traci_client.py", str(path), str(port), "me"]
+            ran = subprocess.run(
+                client, cwd=tmp_path, capture_output=True, text=True, timeout=60, check=False
+            )
+            assert ran.returncode == 0, ran.stderr
+            running.wait(timeout=20)
+        finally:
+            running.kill()
+    moments = [
+        {each.get("id"): (float(each.get("pos", "")), float(each.get("speed", ""))) for each in moment}
+        for moment in ElementTree.parse(record).getroot()
+    ]
+    rows = [moment for moment in moments if "me" in moment]
+    assert f"me: {len(rows)} decisions" in ran.stdout
+    states = LocalState(*np.array([perceived_in(moment) for moment in rows]).T)
+    done = np.diff(states.speed) / 0.1
+    assert np.ptp(done) > 0.5
+    assert {"ahead", "behind"} <= rows[len(rows) // 2].keys()
+    np.testing.assert_allclose(done, replay(driver, states, 1.0)[:-1], rtol=0, atol=1e-5)
+
+
+def perceived_in(moment: dict[str | None, tuple[float, float]]) -> tuple[float, ...]:
+    """The local state of `me` at a moment of SUMO's record; vans are 7 m long."""
+    position, speed = moment["me"]
+    seen = []
+    for name, direction in (("ahead", 1.0), ("behind", -1.0)):
+        place, pace = moment.get(name, (np.inf, 0.0))
+        gap = abs(place - position) - 7.0
+        seen += [pace if gap < LARGEST_GAP else speed, min(gap, LARGEST_GAP)]
+        assert (place - position) * direction > 7.0 or place == np.inf
+    return speed, *seen, np.nan, np.nan

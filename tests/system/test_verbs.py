@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from tests.faults.processes import SETTINGS, TINY
 from tests.system.conftest import UNJAM, Run
-from tests.traffic.own_roads import game
+from tests.traffic.own_roads import game, straight
 
 SMALL = ["--length", "60", "--vehicles", "5", "--set", "horizon=80"]
 TINY_RUN = [
@@ -40,7 +41,8 @@ METRICS_OF_THE_DESIGN = [
     "speed_limit_ratio_steady",
 ]
 
-VERBS = ["scenarios", "drivers", "drive", "train", "evaluate", "model", "report", "watch", "bench", "doctor"]
+VERBS = ["scenarios", "drivers", "drive", "train", "evaluate", "model", "report", "export", "verify"]
+VERBS += ["watch", "bench", "doctor"]
 
 
 def document(ran: subprocess.CompletedProcess[str]) -> Any:
@@ -186,6 +188,14 @@ def test_train_evaluate_report_and_go_on(unjam: Run, tmp_path: Path) -> None:
     driven = document(unjam("drive", "ring", "--driver", "run", *SMALL, "-n", 1, "--json"))
     assert driven["episodes"][0]["status"] == "completed"
 
+    shipped = document(unjam("export", "run", "--to", "ring.unjam", "--json"))
+    assert shipped == {"file": "ring.unjam", "onnx": None, "driver": "pi + residual", "decisions": 80}
+    assert document(unjam("verify", "ring.unjam", "--json"))["verified"].keys() >= {"weights", "sample"}
+    assert "ok sample: 80 decisions" in unjam("verify", "ring.unjam").stdout
+    assert "ring.unjam: " in unjam("export", "run", "--to", "ring.unjam").stdout
+    again = document(unjam("drive", "ring", "--driver", "ring.unjam", *SMALL, "-n", 1, "--json"))
+    assert again["mean"] == driven["mean"]
+
     on_top = document(
         unjam(*TINY_RUN, "--steps", 160, "--expert", "run/controller.unjam", "--out", "second", "--json")
     )
@@ -241,11 +251,19 @@ def test_version(unjam: Run) -> None:
     assert unjam("--version").stdout.strip() == f"unjam {package.__version__}"
 
 
+def slowly(road: str) -> Any:
+    return pytest.param(road, marks=pytest.mark.slow)
+
+
 @pytest.mark.parametrize(("sign", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+@pytest.mark.parametrize("road", ["ring", slowly("figure-eight"), slowly("merge"), slowly("own-network")])
 def test_a_stopped_run_leaves_no_process_and_can_go_on(
-    sign: signal.Signals, code: int, unjam: Run, tmp_path: Path
+    sign: signal.Signals, code: int, road: str, unjam: Run, tmp_path: Path
 ) -> None:
-    command = [str(UNJAM), *TINY_RUN, "--steps", "1000000", "--out", "run"]
+    straight(tmp_path, '<flow id="f" type="car" route="along" begin="0" end="60" period="3"/>', length=300.0)
+    tiny = [part for setting in SETTINGS for part in ("--set", setting)]
+    command = [str(UNJAM), "train", *TINY[road], *tiny, "--workers", "1"]
+    command += ["--steps", "1000000", "--out", "run"]
     with subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True) as process:
         progress = tmp_path / "run" / "progress.jsonl"
         wait_until(lambda: progress.exists() and progress.read_text().count("\n") >= 2)
@@ -256,8 +274,8 @@ def test_a_stopped_run_leaves_no_process_and_can_go_on(
     assert process.returncode == code
     assert "Traceback" not in words
     wait_until(lambda: not any(Path(f"/proc/{worker}").exists() for worker in workers))
-    made = progress.read_text().count("\n")
-    assert unjam("train", "--resume", "run", "--steps", (made + 1) * 160).returncode == 0
+    last = json.loads(progress.read_text().splitlines()[-1])["actual_steps"]
+    assert unjam("train", "--resume", "run", "--steps", last + 1).returncode == 0
 
 
 def children_of(pid: int) -> list[int]:

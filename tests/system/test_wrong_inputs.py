@@ -91,6 +91,10 @@ WRONG: dict[str, tuple[str, list[str]]] = {
         ["drive torn.sumocfg --driver pi --cav-share 0.5"],
     ),
     "training where nobody is a CAV": ("cav_share: 0.0", ["train good.sumocfg --steps 10"]),
+    "exporting to a file of another kind": ("ends in .unjam", ["export pi --to pi.zip"]),
+    "exporting Python code": ("is Python code", ["export mine.py:gentle --to mine.unjam"]),
+    "verifying what is not there": ("does not exist", ["verify none.unjam"]),
+    "verifying what is no controller": ("not a controller", ["verify torn.unjam"]),
     "film of an unknown kind": (".gif, .webp, .mp4", ["watch ring --driver pi --video film.avi"]),
 }
 

@@ -2,6 +2,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import psutil
 import pytest
 
 from unjam.drivers import IDM, PISaturation
@@ -208,3 +209,13 @@ def test_what_sumo_refuses_of_the_users_own_network_is_told_in_one_line_and_the_
         run_episode(scenario, IDM(), (0,), simulation=simulation)
     assert "\n" not in str(caught.value)
     assert run_episode(RING, IDM(), (0,), simulation=simulation).status == "completed"
+
+
+def test_over_traci_sumo_is_reached_from_this_machine_alone_once_we_are_there(road: ClosedRoad) -> None:
+    """SUMO has no option to listen on loopback alone: it must stop to listen once its one client is there."""
+    with Simulation("traci") as simulation:
+        simulation.load(road, 0.1, 1)
+        (sumo,) = [child for child in psutil.Process().children() if "sumo" in child.name()]
+        connections = sumo.net_connections("tcp")
+    assert [each.raddr.ip for each in connections] == ["127.0.0.1"]
+    assert all(each.status != psutil.CONN_LISTEN for each in connections)

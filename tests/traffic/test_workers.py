@@ -15,11 +15,12 @@ import pytest
 from unjam.drivers import IDM, Constant, Driver, Human, LocalState, Memory, PISaturation, ResidualDriver
 from unjam.drivers.from_file import FileDriver
 from unjam.errors import InputError
-from unjam.scenarios import Ring
+from unjam.scenarios import Ring, make_scenario
 from unjam.traffic.episode import run_episode
 from unjam.traffic.workers import EpisodeTask, Workers
 
 from ..conftest import random_network
+from .own_roads import straight
 from .test_record import fingerprint
 
 SHORT = Ring(horizon=60)
@@ -55,6 +56,11 @@ def writes_everywhere(state):
 def thinks_long(state):
     time.sleep(0.025)
     return np.zeros(len(state.speed))
+
+def is_limited(state):
+    import resource
+    limit, _ = resource.getrlimit(resource.RLIMIT_AS)
+    return np.full(len(state.speed), -0.5 if limit == resource.RLIM_INFINITY else 0.5)
 
 def finds_torch(state):
     return np.full(len(state.speed), 0.5 if "torch" in sys.modules else -0.5)
@@ -521,3 +527,16 @@ def test_a_residual_driver_runs_without_torch(drivers: Path, workers: Workers) -
     driver = ResidualDriver(expert, random_network(), 1.0)
     (episode,) = workers.run([EpisodeTask(SHORT, driver, (0,), explore=True)])
     assert set(episode.trajectories[0].expert) == {-0.5}
+
+
+def test_on_a_network_of_the_users_own_a_worker_may_not_fill_the_machine(
+    drivers: Path, tmp_path: Path
+) -> None:
+    path = straight(tmp_path, '<vehicle id="a" type="car" route="along" depart="0"/>')
+    road = make_scenario(str(path), {"cav_types": ["car"], "horizon": 5})
+    with Workers(1) as workers:
+        free, limited = workers.run(
+            [EpisodeTask(scenario, FileDriver(drivers, "is_limited"), (0,)) for scenario in (SHORT, road)]
+        )
+    assert set(free.trajectories[0].applied) == {-0.5}
+    assert set(limited.trajectories[0].applied) == {0.5}

@@ -25,6 +25,7 @@ from unjam.agents.imagination import Imagination
 from unjam.agents.policy import policy_spaces
 from unjam.agents.settings import PolicySettings
 from unjam.drivers.network import Network
+from unjam.errors import UnjamError
 from unjam.scenarios.scenario import Scenario
 from unjam.traffic.record import Episode
 
@@ -134,8 +135,16 @@ class Episodic(BaseAlgorithm):
         self._seconds: dict[str, float] = {}
 
     def run(self, actual_steps: int) -> None:
-        """Learn until this many actual steps were made in all, earlier runs of this learner included."""
-        self.learn(actual_steps - self.num_timesteps, log_interval=NEVER, reset_num_timesteps=False)
+        """Learn until this many actual steps were made in all, earlier runs of this learner included.
+
+        Raises:
+            UnjamError: an observation, a reward or a parameter is not finite; it names the first.
+        """
+        try:
+            self.learn(actual_steps - self.num_timesteps, log_interval=NEVER, reset_num_timesteps=False)
+        except ValueError:  # what torch says of a distribution with such a parameter
+            self._check_parameters()
+            raise
 
     def network(self) -> Network:
         """Return the policy's NumPy twin."""
@@ -175,6 +184,9 @@ class Episodic(BaseAlgorithm):
         """
         imagination = self.training.imagination
         actual = self._rows()
+        for name in ("observations", "rewards"):
+            if not np.isfinite(getattr(actual, name)).all():
+                raise UnjamError(f"learner: {name} of iteration {self.iteration} are not finite")
         if self.iteration == 1:
             self.measure_units(actual)
         some = torch.as_tensor(actual.observations[:: -(-len(actual.rewards) // COMPARED_ROWS)])
@@ -230,6 +242,13 @@ class Episodic(BaseAlgorithm):
             seed_iteration(self.training.seed, self.iteration)
             with self._timing("update"):
                 yield update
+            self._check_parameters()
+
+    def _check_parameters(self) -> None:
+        """Raise `UnjamError` where an update has made a parameter that is not finite."""
+        for name, parameter in self.policy.named_parameters():
+            if not parameter.isfinite().all():
+                raise UnjamError(f"learner: {name} is not finite in iteration {self.iteration}")
 
     @contextmanager
     def _timing(self, part: str) -> Iterator[None]:

@@ -14,11 +14,13 @@ from unjam.cli.bench import bench
 from unjam.cli.doctor import doctor
 from unjam.cli.drive import drive
 from unjam.cli.evaluate import evaluate
+from unjam.cli.export import export
 from unjam.cli.lists import drivers, scenarios
 from unjam.cli.model import model
 from unjam.cli.report import report
 from unjam.cli.reproduce import reproduce
 from unjam.cli.train import train
+from unjam.cli.verify import verify
 from unjam.cli.watch import watch
 from unjam.errors import DISK_ERRNOS, UnjamError, disk_error
 
@@ -49,7 +51,10 @@ def _root(
     pass
 
 
-for verb in (scenarios, drivers, drive, train, evaluate, model, report, reproduce, watch, bench, doctor):
+for verb in (
+    *(scenarios, drivers, drive, train, evaluate, model, report, reproduce),
+    *(export, verify, watch, bench, doctor),
+):
     app.command()(verb)
 
 

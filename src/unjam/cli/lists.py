@@ -104,7 +104,7 @@ def _draw(scenario: Any, name: str, path: Path) -> None:
 
 
 def _common_facts(scenario: Any) -> list[tuple[str, str]]:
-    from unjam.drivers.local_state import OBSERVATION_NAMES
+    from unjam.drivers.local_state import OBSERVED
 
     step = scenario.simulation_step
     return [
@@ -115,7 +115,7 @@ def _common_facts(scenario: Any) -> list[tuple[str, str]]:
         ),
         ("people", scenario.people_in_words),
         ("action", f"acceleration within ±{scenario.action_limit:g} m/s2, {scenario.actuation}"),
-        ("observation", "; ".join(OBSERVATION_NAMES["local"])),
+        ("observation", "; ".join(map(str, OBSERVED["local"]))),
         ("reward", scenario.reward),
     ]
 

@@ -3,7 +3,7 @@
 from array import array
 from typing import Any, ClassVar
 
-from unjam.drivers.local_state import LocalState
+from unjam.drivers.local_state import LocalState, Observed
 from unjam.physics.arrays import Array
 
 Memory = dict[str, Any]
@@ -31,6 +31,9 @@ class Driver:
 
     needs_loop: ClassVar[bool] = False
     """True where it must know its place on a closed road"""
+
+    observed_memory: ClassVar[tuple[Observed, ...]] = ()
+    """what `memory_features` are, in order"""
 
     native: ClassVar[bool] = False
     """True where the simulator itself drives (a human driver): `act` is then not asked."""

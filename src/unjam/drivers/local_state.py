@@ -43,18 +43,42 @@ ObservationPart = Literal["local", "expert_acceleration", "expert_memory", "loop
 """Parts of an observation: the paper's five numbers; the expert's acceleration; what the expert remembers;
 the length of the closed road; the place on it."""
 
-OBSERVATION_NAMES: dict[str, tuple[str, ...]] = {
-    "local": (
-        f"own speed / {SPEED_SCALE:g} m/s",
-        f"leader's speed - own / {RELATIVE_SPEED_SCALE:g} m/s",
-        f"gap to the leader / {GAP_SCALE:g} m",
-        f"follower's speed - own / {RELATIVE_SPEED_SCALE:g} m/s",
-        f"gap to the follower / {GAP_SCALE:g} m",
-    ),
-    "expert_acceleration": (f"expert's acceleration / {ACCELERATION_SCALE:g} m/s2",),
-    "loop_length": (f"length of the closed road / {LOOP_LENGTH_SCALE:g} m",),
-    "place": ("cosine of the place on the lap", "sine of the place on the lap"),
+STATE_UNITS = {
+    "speed": "m/s",
+    "leader_speed": "m/s",
+    "leader_gap": "m",
+    "follower_speed": "m/s",
+    "follower_gap": "m",
+    "route_position": "m",
+    "loop_length": "m",
 }
+"""units of a `LocalState`, in its order"""
+
+
+class Observed(NamedTuple):
+    """One number that a network sees: a quantity divided by a fixed scale."""
+
+    name: str
+    scale: float
+    unit: str
+
+    def __str__(self) -> str:
+        return f"{self.name} / {self.scale:g} {self.unit}".strip()
+
+
+OBSERVED: dict[str, tuple[Observed, ...]] = {
+    "local": (
+        Observed("own speed", SPEED_SCALE, "m/s"),
+        Observed("leader's speed - own", RELATIVE_SPEED_SCALE, "m/s"),
+        Observed("gap to the leader", GAP_SCALE, "m"),
+        Observed("follower's speed - own", RELATIVE_SPEED_SCALE, "m/s"),
+        Observed("gap to the follower", GAP_SCALE, "m"),
+    ),
+    "expert_acceleration": (Observed("expert's acceleration", ACCELERATION_SCALE, "m/s2"),),
+    "loop_length": (Observed("length of the closed road", LOOP_LENGTH_SCALE, "m"),),
+    "place": (Observed("cosine of the place on the lap", 1.0, ""), Observed("sine of the same", 1.0, "")),
+}
+"""what each part of an observation holds, in order; what an expert remembers is its own to say"""
 
 
 def lap_place(state: LocalState) -> Array:

@@ -10,7 +10,7 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from unjam.drivers.driver import Driver, Memory
-from unjam.drivers.local_state import LocalState
+from unjam.drivers.local_state import LocalState, Observed
 from unjam.parameters import STRICT, NotNegative, Positive
 from unjam.physics.arrays import Array, as_column, at_least, namespace
 
@@ -32,6 +32,7 @@ class Pacer(Driver):
     plain_numbers: ClassVar[bool] = True
     tensors: ClassVar[bool] = True
     needs_loop: ClassVar[bool] = True
+    observed_memory: ClassVar[tuple[Observed, ...]] = (Observed("all have gathered", 1.0, ""),)
 
     lap_time: Positive = 69.0
     """time for a lap [s]: 6.5 m/s at a radius of 32 m, 7.1 m/s at 35 m"""

@@ -7,7 +7,7 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from unjam.drivers.driver import Driver, Memory
-from unjam.drivers.local_state import SPEED_SCALE, LocalState
+from unjam.drivers.local_state import SPEED_SCALE, LocalState, Observed
 from unjam.drivers.speed_history import empty_window, fill, mean_speed, slide
 from unjam.parameters import STRICT, NotNegative, Positive
 from unjam.physics.arrays import Array, at_least, clip, namespace, stack_columns
@@ -26,6 +26,10 @@ class PISaturation(Driver):
 
     plain_numbers: ClassVar[bool] = True
     tensors: ClassVar[bool] = True
+    observed_memory: ClassVar[tuple[Observed, ...]] = (
+        Observed("mean own speed", SPEED_SCALE, "m/s"),
+        Observed("commanded speed", SPEED_SCALE, "m/s"),
+    )
 
     window: Positive = 38.0
     """time over which the own speed is averaged [s]"""

@@ -139,6 +139,16 @@ def recipe_of(driver: Driver, prefix: str = "") -> tuple[Recipe, dict[str, np.nd
     raise wrong("driver", type(driver).__name__, f"{driver_names()} (put your class in a file: path.py:name)")
 
 
+def files_of(recipe: Any) -> list[Recipe]:
+    """Return the recipes of the users' own files within `recipe`: their drivers are Python code."""
+    if not isinstance(recipe, dict):
+        return []
+    parts = recipe.get("drivers", [])
+    inner = [recipe.get("expert"), *(parts if isinstance(parts, list) else [])]
+    own = [recipe] if recipe.get("kind") == "file" else []
+    return own + [found for part in inner for found in files_of(part)]
+
+
 def driver_from_recipe(recipe: Recipe, arrays: dict[str, np.ndarray], prefix: str = "") -> Driver:
     """Return the driver that `recipe_of` wrote down; raise `InputError` where the recipe is not valid."""
     kind = recipe.get("kind") if isinstance(recipe, dict) else recipe

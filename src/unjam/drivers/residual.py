@@ -10,8 +10,10 @@ from unjam.drivers.driver import Driver, Memory
 from unjam.drivers.local_state import (
     ACCELERATION_SCALE,
     LOOP_LENGTH_SCALE,
+    OBSERVED,
     LocalState,
     ObservationPart,
+    Observed,
     lap_place,
     local_vector,
 )
@@ -95,6 +97,11 @@ class ResidualDriver(Driver):
         """Whether the expert must know its place on a closed road."""
         return self.expert.needs_loop
 
+    @property
+    def observed_memory(self) -> tuple[Observed, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """What the expert's `memory_features` are."""
+        return self.expert.observed_memory
+
     @cached_property
     def _keys(self) -> tuple[str, str]:
         """Names of the held residual and its age in the memory: others than those of an expert like this."""
@@ -164,6 +171,14 @@ class ResidualDriver(Driver):
     def memory_features(self, memory: Memory) -> Array | None:
         """Return the expert's."""
         return self.expert.memory_features(memory)
+
+
+def observed(parts: tuple[ObservationPart, ...], expert: Driver) -> tuple[Observed, ...]:
+    """Return what the network sees with this expert, in the order of `observe`."""
+    remembered = observation_size(parts, expert) - sum(len(OBSERVED.get(part, ())) for part in parts)
+    unnamed = tuple(Observed(f"expert's memory {number}", 1.0, "") for number in range(remembered))
+    names = {**OBSERVED, "expert_memory": expert.observed_memory or unnamed}
+    return tuple(number for part in parts for number in names[part])
 
 
 def observation_size(parts: tuple[ObservationPart, ...], expert: Driver) -> int:

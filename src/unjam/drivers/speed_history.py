@@ -6,12 +6,15 @@ from typing import Any
 
 import numpy as np
 
+from unjam.errors import wrong
 from unjam.physics.arrays import Array, clip, namespace
 
 Window = dict[str, Any]
 
 SPARE_STEPS = 64
 """a tape is never written anew more often than after so many steps"""
+LONGEST = 1_000_000
+"""steps of a window: beyond it the memory of one vehicle would fill that of a machine"""
 
 
 @dataclass
@@ -48,6 +51,30 @@ class PastSpeeds:
         return PastSpeeds(tape, start + 1, self.steps), oldest
 
 
+@dataclass(frozen=True)
+class WrittenRows:
+    """A window of torch rows in the order of `empty_window`, moved on without anything shared.
+
+    Slower than a tape, but a pure function of its rows: what a graph of a whole controller needs.
+    """
+
+    rows: Array
+    """[m/s], shape (n, steps)"""
+    seen: Array
+    """how many speeds were seen since the beginning, shape (n,)"""
+
+    @property
+    def steps(self) -> int:
+        """Steps of the window."""
+        return self.rows.shape[1]
+
+    def slide(self, speed: Array) -> tuple["WrittenRows", Array]:
+        """Return the window moved on by one step, and the speed that it left behind, shape (n,)."""
+        place = (self.seen % self.steps).long()[:, None]
+        oldest = self.rows.gather(1, place)[:, 0]
+        return WrittenRows(self.rows.scatter(1, place, speed[:, None]), self.seen + 1.0), oldest
+
+
 def _new_tape(speeds: Array) -> _Tape:
     """Return a tape that begins with `speeds`, shape (steps, n), and has room for more."""
     steps, n = speeds.shape
@@ -70,7 +97,12 @@ def empty_window(n: int, window: float, time_step: float) -> Window:
     Returns:
         `window` (n, steps): the last speeds, a new one in the place of the oldest, zeros where nothing was
         seen yet; `total` (n,): their sum; `seen` (n,): how many speeds were seen since the beginning.
+
+    Raises:
+        InputError: the window has too many steps.
     """
+    if window / time_step > LONGEST:
+        raise wrong("window", window, f"at most {LONGEST:,} steps of {time_step:g} s")
     steps = max(1, round(window / time_step))
     return {"window": np.zeros((n, steps)), "total": np.zeros(n), "seen": np.zeros(n)}
 
@@ -78,7 +110,7 @@ def empty_window(n: int, window: float, time_step: float) -> Window:
 def slide(memory: Window, speed: Array) -> Window:
     """Return the window moved on by one step, `speed` [m/s] of shape (n,) being the newest.
 
-    The old window stays as it is; that of torch rows becomes `PastSpeeds`.
+    The old window stays as it is; that of torch rows becomes `PastSpeeds`, unless it is `WrittenRows`.
     """
     window, seen = memory["window"], memory["seen"]
     if type(speed) is float:
@@ -92,7 +124,7 @@ def slide(memory: Window, speed: Array) -> Window:
         oldest = window[place]
         window[place] = speed
     else:
-        past = window if isinstance(window, PastSpeeds) else _past_speeds(window, seen)
+        past = window if isinstance(window, (PastSpeeds, WrittenRows)) else _past_speeds(window, seen)
         window, oldest = past.slide(speed)
     return {"window": window, "total": memory["total"] + speed - oldest, "seen": seen + 1.0}
 
@@ -100,7 +132,7 @@ def slide(memory: Window, speed: Array) -> Window:
 def mean_speed(memory: Window) -> Array:
     """Return the mean of what was seen [m/s], shape (n,); zero where nothing was."""
     window = memory["window"]
-    if isinstance(window, PastSpeeds):
+    if isinstance(window, (PastSpeeds, WrittenRows)):
         steps = window.steps
     else:
         steps = len(window) if isinstance(window, array) else window.shape[-1]

@@ -14,8 +14,10 @@ from unjam.scenarios.ring import Ring
 from unjam.traffic.network_files import cache_folder, sumo_program
 from unjam.traffic.workers import EpisodeTask, Workers
 
-TESTED_SUMO = "1.28"
-"""minor version of SUMO that the results were made with"""
+RESULTS_SUMO = "1.28.0"
+"""version of SUMO that all results of the documentation were made with"""
+TESTED_SUMO = RESULTS_SUMO.rpartition(".")[0]
+"""minor version of SUMO that is supported"""
 
 
 @dataclass(frozen=True)
@@ -38,6 +40,7 @@ def check_health() -> list[Check]:
         _sumo_package("libsumo"),
         _sumo_package("eclipse-sumo"),
         _sumo_package("traci", needed=False),
+        _sumo_of_results(),
         _try("netconvert", lambda: sumo_program("netconvert"), "pip install eclipse-sumo==1.28.0"),
         _package("torch"),
         _package("stable-baselines3"),
@@ -60,6 +63,15 @@ def _sumo_package(name: str, needed: bool = True) -> Check:
     check = _package(name)
     remedy = f"pip install {name}=={TESTED_SUMO}.0: results change with SUMO's version"
     return Check(name, check.ok and check.found.startswith(TESTED_SUMO), check.found, remedy, needed)
+
+
+def _sumo_of_results() -> Check:
+    check = _package("libsumo")
+    remedy = (
+        f"the results of the documentation were made with SUMO {RESULTS_SUMO}, and numbers change with it: "
+        f"pip install libsumo=={RESULTS_SUMO} eclipse-sumo=={RESULTS_SUMO}"
+    )
+    return Check("SUMO of the results", check.found == RESULTS_SUMO, check.found, remedy, needed=False)
 
 
 def _try(name: str, run: Callable[[], str], remedy: str) -> Check:

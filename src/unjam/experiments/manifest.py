@@ -10,6 +10,10 @@ from pathlib import Path
 from typing import Any
 
 from unjam import __version__
+from unjam.drivers.driver import Driver
+from unjam.drivers.registry import describe
+from unjam.scenarios.registry import scenario_recipe
+from unjam.scenarios.scenario import Scenario
 
 PACKAGES = ("libsumo", "eclipse-sumo", "numpy", "torch", "stable-baselines3", "sb3-contrib", "gymnasium")
 
@@ -20,11 +24,27 @@ def manifest() -> dict[str, Any]:
         "unjam": __version__,
         "commit": _commit(),
         "python": platform.python_version(),
-        "packages": {name: _version(name) for name in PACKAGES},
+        "packages": package_versions(),
         "machine": {"system": platform.platform(), "processor": platform.machine(), "cores": os.cpu_count()},
         "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
         "started": datetime.now(UTC).isoformat(timespec="seconds"),
     }
+
+
+def origin(scenario: Scenario, expert: Driver) -> dict[str, Any]:
+    """Return where a controller comes from, for its own manifest: the same for the same run."""
+    return {
+        "scenario": scenario_recipe(scenario),
+        "time_step": scenario.decision_step,
+        "action_limit": scenario.action_limit,
+        "expert": describe(expert),
+        "versions": package_versions(),
+    }
+
+
+def package_versions() -> dict[str, str | None]:
+    """Return the installed versions of what results depend on; None of what is not there."""
+    return {name: _version(name) for name in PACKAGES}
 
 
 def _version(package: str) -> str | None:

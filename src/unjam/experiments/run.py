@@ -14,15 +14,14 @@ from unjam.agents.state import learner_state, restore_learner
 from unjam.controller import controller_bytes
 from unjam.drivers.driver import Driver
 from unjam.drivers.network import Network
-from unjam.drivers.registry import describe
 from unjam.drivers.residual import ResidualDriver, observation_size
 from unjam.experiments.checkpoint import load_checkpoint, save_checkpoint
 from unjam.experiments.config import RunConfig
 from unjam.experiments.evaluate import VALIDATION, raise_failure
+from unjam.experiments.manifest import origin
 from unjam.files import append_line, to_json, write_whole
 from unjam.reports.metrics import measure
 from unjam.reports.results import read_progress
-from unjam.scenarios.registry import scenario_recipe
 from unjam.traffic.record import Episode
 from unjam.traffic.workers import EpisodeTask, Workers
 
@@ -167,8 +166,7 @@ class Run:
 
     def _keep_controller(self, network: Network) -> None:
         about = {
-            "scenario": scenario_recipe(self.scenario),
-            "expert": describe(self.expert),
+            **origin(self.scenario, self.expert),
             "iteration": self.learner.iteration,
             "actual_steps": self.learner.num_timesteps,
         }

@@ -1,29 +1,23 @@
-"""What the user's own SUMO files say, read before SUMO starts: SUMO crashes on some that are broken."""
+"""What the user's own SUMO files say, read before SUMO starts: SUMO crashes on some that are broken.
 
-import gzip
-import zlib
-from collections.abc import Iterator
+They are read in a process of their own with limits on memory and time: such files may come from anywhere.
+"""
+
+import json
+import subprocess
+import sys
 from dataclasses import dataclass
-from functools import lru_cache
-from math import isfinite, nan
 from pathlib import Path
-from typing import IO, Literal, NamedTuple
-from xml.etree import ElementTree
+from typing import Any, Literal
 
 from unjam.errors import InputError
+from unjam.scenarios import sumo_reader
+from unjam.scenarios.sumo_reader import stamp
 
-DEFAULT_TYPE = "DEFAULT_VEHTYPE"
-"""SUMO's type of vehicles that name none"""
-OTHER_DEFAULT_TYPES = {
-    "DEFAULT_BIKETYPE": "bicycle",
-    "DEFAULT_TAXITYPE": "taxi",
-    "DEFAULT_RAILTYPE": "rail",
-}
-"""vehicle classes of SUMO's other types that no file need define"""
-DEMAND = ("vehicle", "trip", "flow")
-UNITS = (1.0, 60.0, 3600.0, 86400.0)
-"""seconds, minutes, hours and days [s]: SUMO's times may be 1:30:00"""
-SYNONYMS = {"net": "net-file", "routes": "route-files", "additional": "additional-files"}
+LARGEST_MEMORY = 4 * 2**30
+"""bytes that reading may take"""
+LONGEST_TIME = 120
+"""seconds that reading may take"""
 
 
 @dataclass(frozen=True)
@@ -45,149 +39,73 @@ class SumoFiles:
     """types that vehicles have"""
 
 
+_known: dict[Path, tuple[dict[Path, tuple[int, int]], SumoFiles]] = {}
+"""what was read already, with the stamps of all files that were read for it"""
+
+
 def read_sumo_files(path: Path) -> SumoFiles:
-    """Return what a .sumocfg file and the files that it names say.
+    """Return what a .sumocfg file and the files that it names say; read again where one has changed.
 
     Raises:
-        InputError: one is missing or broken, the network has no version, or there are no vehicles.
+        InputError: one is missing, broken or too large, the network has no version, or there are no
+            vehicles.
     """
-    named = _named(path)
-    files = [named.network, *named.additional, *named.routes]
-    for file in (path, *files):
-        if not file.is_file():
-            raise InputError(f"{str(file)!r}: there is no such file")
-    found = [file.stat() for file in (path, *files)]
-    return _read(path, tuple((each.st_mtime_ns, each.st_size) for each in found))
-
-
-@lru_cache
-def _read(path: Path, changed: tuple[tuple[int, int], ...]) -> SumoFiles:
-    """Read all files; `changed`, time and size of each, makes a changed one be read again."""
-    options, network, additional, routes = _named(path)
-    _check_network(network)
-    demand = _Demand({}, {}, set())
-    for file in [*additional, *routes]:
-        _read_demand(file, demand)
-    if not demand.wanted:
-        raise InputError(f"{path.name}: its route and additional files have no vehicle, trip or flow")
-    used = frozenset().union(*(demand.mixtures.get(name, {name}) for name in demand.wanted))
-    demand.types.setdefault(DEFAULT_TYPE, {})
-    for name, kind in OTHER_DEFAULT_TYPES.items():
-        if name in used:
-            demand.types.setdefault(name, {"vClass": kind})
-    begin = _seconds(path, options, "begin", 0.0) or 0.0
-    ends = _seconds(path, options, "end", None)
-    if ends is not None and ends <= begin:
-        raise InputError(f"{path.name}: end: {ends:g} s is not allowed; allowed: after begin, {begin:g} s")
-    return SumoFiles(
-        path,
-        network,
-        additional,
-        begin,
-        ends,
-        _seconds(path, options, "step-length", 1.0) or 1.0,
-        demand.types,
-        used,
-    )
-
-
-class _Named(NamedTuple):
-    """What a .sumocfg file says, and the files that it names."""
-
-    options: dict[str, str]
-    network: Path
-    additional: tuple[Path, ...]
-    routes: tuple[Path, ...]
-
-
-def _named(path: Path) -> _Named:
-    if not path.is_file():
-        raise InputError(f"{str(path)!r}: there is no such file")
-    options = {
-        SYNONYMS.get(element.tag, element.tag): element.get("value", "")
-        for element in _elements(path, "end")
-        if element.get("value") is not None
+    if path in _known:
+        stamps, files = _known[path]
+        if all(file.is_file() and stamp(file) == before for file, before in stamps.items()):
+            return files
+    found = _ask("configuration", path)
+    stamps = {
+        Path(file): (time, size) for file, (time, size) in zip(found["files"], found["stamps"], strict=True)
     }
-    if not options.get("net-file"):
-        raise InputError(f"{path.name}: names no net-file")
-    additional, routes = (
-        tuple(path.parent / name for name in options.get(files, "").replace(",", " ").split())
-        for files in ("additional-files", "route-files")
+    files = SumoFiles(
+        path,
+        Path(found["network"]),
+        tuple(map(Path, found["additional_files"])),
+        found["begin"],
+        found["end"],
+        found["step"],
+        found["types"],
+        frozenset(found["used_types"]),
     )
-    return _Named(options, path.parent / options["net-file"], additional, routes)
+    _known[path] = stamps, files
+    return files
 
 
-def _seconds(path: Path, options: dict[str, str], name: str, otherwise: float | None) -> float | None:
-    """Return a time option [s]; SUMO writes -1 for no end."""
-    text = options.get(name)
-    if text is None or (name == "end" and text.strip() in ("-1", "-1.00")):
-        return otherwise
-    parts = text.split(":")
-    try:
-        value = sum(float(part) * unit for part, unit in zip(reversed(parts), UNITS, strict=False))
-    except ValueError:
-        value = nan
-    if (
-        not isfinite(value)
-        or value < 0
-        or len(parts) not in (1, 3, 4)
-        or (name == "step-length" and not value)
-    ):
-        allowed = "seconds > 0" if name == "step-length" else "seconds, hours:minutes:seconds"
-        raise InputError(f"{path.name}: {name}: {text!r} is not allowed; allowed: {allowed}")
-    return value
+def read_lanes(path: Path) -> list[tuple[str, float, list[tuple[float, float]]]]:
+    """Return edge, length [m] and centre line [(x, y), m] of each lane of a network file.
 
-
-def _check_network(path: Path) -> None:
-    """Raise `InputError` unless it is whole, and a network with a version.
-
-    SUMO itself would crash without a version, and says nothing of a file that is torn off.
+    Raises:
+        InputError: it is broken, or too large.
     """
-    elements = _elements(path, "start")
-    root = next(elements)
-    version = root.get("version")
-    for _ in elements:
-        root.clear()
-    if root.tag != "net":
-        raise InputError(f"{path.name}: is not a SUMO network: it begins with <{root.tag}>")
-    if not version:
-        raise InputError(
-            f"{path.name}: the network has no version; make it anew: netconvert -s {path.name} -o"
-        )
-
-
-class _Demand(NamedTuple):
-    """What files of routes hold."""
-
-    types: dict[str, dict[str, str]]
-    mixtures: dict[str, set[str]]
-    """types of each distribution; it may be used in another file than the one that defines it"""
-    wanted: set[str]
-    """types and distributions that vehicles have"""
-
-
-def _read_demand(path: Path, demand: _Demand) -> None:
-    """Add what a file defines, and what its vehicles have."""
-    for element in _elements(path, "end"):
-        name = element.get("id", "")
-        if element.tag == "vType":
-            demand.types[name] = dict(element.attrib)
-        elif element.tag == "vTypeDistribution":
-            inside = [child.get("id", "") for child in element if child.tag == "vType"]
-            demand.mixtures[name] = {*inside, *element.get("vTypes", "").split()}
-        elif element.tag in DEMAND:
-            demand.wanted.add(element.get("type", DEFAULT_TYPE))
-
-
-def _elements(path: Path, event: Literal["start", "end"]) -> Iterator[ElementTree.Element]:
-    """Yield the elements of an XML file, also of a compressed one, as they end (or start)."""
     try:
-        with _open(path) as file:
-            for _, element in ElementTree.iterparse(file, (event,)):
-                yield element
-    except (ElementTree.ParseError, OSError, EOFError, zlib.error, LookupError, ValueError) as error:
-        raise InputError(f"{path.name}: cannot be read: {' '.join(str(error).split())}") from None
+        return [
+            (edge, float(length), [_point(point) for point in shape.split()])
+            for edge, length, shape in _ask("lanes", path)
+        ]
+    except ValueError as error:
+        raise InputError(f"{path.name}: cannot be read: {error}") from None
 
 
-def _open(path: Path) -> IO[bytes]:
-    return gzip.open(path) if path.suffix == ".gz" else path.open("rb")  # type: ignore[return-value]
+def _point(text: str) -> tuple[float, float]:
+    x, y, *_ = text.split(",")
+    return float(x), float(y)
+
+
+def _ask(command: Literal["configuration", "lanes"], path: Path) -> Any:
+    """Return what the reader answers; raise `InputError` where it says what is wrong, or is lost."""
+    program = [sys.executable, "-I", "-S", sumo_reader.__file__, command, str(path)]
+    try:
+        done = subprocess.run(
+            [*program, str(LARGEST_MEMORY), str(LONGEST_TIME)],
+            capture_output=True,
+            timeout=LONGEST_TIME,
+            check=False,
+        )
+        answer = json.loads(done.stdout)
+    except (subprocess.TimeoutExpired, ValueError):
+        limits = f"{LARGEST_MEMORY / 2**30:g} GiB, {LONGEST_TIME:g} s"
+        raise InputError(f"{path.name}: its files cannot be read within {limits}") from None
+    if "broken" in answer:
+        raise InputError(answer["broken"])
+    return answer["found"]

@@ -1,16 +1,13 @@
 """SUMO's network files: made by netconvert, once for each content."""
 
-import gzip
 import hashlib
 import os
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Iterator
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from xml.etree import ElementTree
 
 import numpy as np
 import platformdirs
@@ -18,6 +15,7 @@ from numpy.typing import NDArray
 
 from unjam.errors import DISK_ERRNOS, EpisodeError, MissingPartError, disk_error
 from unjam.scenarios.road import PlainNetwork
+from unjam.scenarios.sumo_files import read_lanes
 
 
 def cache_folder() -> Path:
@@ -86,27 +84,15 @@ def network_file(plain: PlainNetwork) -> Path:
 def network_lines(path: Path) -> NDArray[np.float64]:
     """Return the centre lines of all lanes: rows (x, y) [m], a row of NaN between two lines."""
     rows: list[tuple[float, float]] = []
-    for lane in _lanes(path):
-        points = (point.split(",") for point in lane["shape"].split())
-        rows += [(float(x), float(y)) for x, y, *_ in points]
-        rows.append((float("nan"), float("nan")))
+    for _, _, points in read_lanes(path):
+        rows += [*points, (float("nan"), float("nan"))]
     return np.array(rows, np.float64).reshape(-1, 2)
 
 
 @cache
 def edge_lengths(path: Path) -> dict[str, float]:
     """Return the length of each edge [m]."""
-    return {lane["id"].rpartition("_")[0]: float(lane["length"]) for lane in _lanes(path)}
-
-
-def _lanes(path: Path) -> Iterator[dict[str, str]]:
-    """Yield the attributes of each lane of a network file."""
-    with gzip.open(path) if path.suffix == ".gz" else path.open("rb") as file:
-        for _, element in ElementTree.iterparse(file):
-            if element.tag == "lane":
-                yield dict(element.attrib)
-            if element.tag == "edge":
-                element.clear()
+    return {edge: length for edge, length, _ in read_lanes(path)}
 
 
 def _netconvert(plain: PlainNetwork, folder: Path) -> Path:

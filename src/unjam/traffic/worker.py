@@ -7,16 +7,20 @@ import gc
 import os
 import sys
 import time
+from contextlib import suppress
 from typing import Any, BinaryIO
 
 from unjam.drivers.registry import driver_from_recipe
 from unjam.errors import DISK_ERRNOS, UnjamError, disk_error
+from unjam.scenarios.own_network import OwnNetwork
 from unjam.scenarios.registry import scenario_from_recipe
 from unjam.traffic.episode import run_episode
 from unjam.traffic.messages import Arrays, read_message, write_message
 from unjam.traffic.record import failed_episode, pack_episode
 from unjam.traffic.simulation import Simulation
 
+NETWORK_MEMORY = 16 * 2**30
+"""bytes that a worker may take once it drives on a network of the user's own, which may come from anywhere"""
 SIGN_OF_LIFE = 0.2
 """seconds between two reports of progress"""
 
@@ -45,6 +49,15 @@ def main() -> None:
             simulation.close()
 
 
+def _limit_memory() -> None:
+    """Make a file that would fill the machine's memory end this process alone; not possible on Windows."""
+    with suppress(ImportError):
+        import resource
+
+        _, most = resource.getrlimit(resource.RLIMIT_AS)
+        resource.setrlimit(resource.RLIMIT_AS, (NETWORK_MEMORY, most))
+
+
 def _known(error: Exception) -> Exception:
     """Return an error in the words of unjam."""
     if isinstance(error, OSError) and error.errno in DISK_ERRNOS:
@@ -64,8 +77,11 @@ def _run(facts: dict[str, Any], arrays: Arrays, simulation: Simulation, answers:
             except BrokenPipeError:
                 sys.exit()  # the parent is gone
 
+    scenario = scenario_from_recipe(facts["scenario"])
+    if isinstance(scenario, OwnNetwork):
+        _limit_memory()
     return run_episode(
-        scenario_from_recipe(facts["scenario"]),
+        scenario,
         driver_from_recipe(facts["driver"], arrays),
         facts["seed"],
         facts["reward"],

@@ -1,0 +1,58 @@
+"""Drives a vehicle of a running SUMO by a .unjam controller, over TraCI; needs traci and run_controller.py.
+
+    sumo -c my.sumocfg --remote-port 8813 &
+    python examples/traci_client.py ring.unjam 8813 VEHICLE
+
+The vehicle's type should have the car-following model Krauss: SUMO then carries out each command exactly
+until it is unsafe. Whoever can reach that port can steer SUMO: do not open it to a network.
+"""
+
+import sys
+from typing import Any
+
+import traci
+from run_controller import Controller, State
+
+LARGEST_GAP = 100.0
+"""[m]; stands for `nobody there`"""
+OBEDIENT = {"Accel": 20.0, "Decel": 20.0, "EmergencyDecel": 20.0, "ApparentDecel": 20.0, "MinGap": 0.5}
+"""limits of SUMO's own that are wider than any command; only its check for a safe speed stays"""
+
+
+def perceive(vehicles: Any, name: str) -> State:
+    """What the vehicle perceives now. SUMO's gaps lack the gap that whoever is behind keeps."""
+    speed, seen = vehicles.getSpeed(name), []
+    leader, gap = vehicles.getLeader(name, LARGEST_GAP) or ("", 0.0)
+    follower, gap_behind = vehicles.getFollower(name, LARGEST_GAP)
+    for other, distance, keeper in ((leader, gap, name), (follower, gap_behind, follower)):
+        bumper = distance + vehicles.getMinGap(keeper) if other else LARGEST_GAP
+        there = bumper < LARGEST_GAP
+        seen += [vehicles.getSpeed(other) if there else speed, min(max(bumper, 0.0), LARGEST_GAP)]
+    return State(speed, *seen)
+
+
+def drive(sumo: Any, controller: Controller, name: str) -> int:
+    """Drive the vehicle from its entry to its exit; return the number of decisions."""
+    step, decisions = sumo.simulation.getDeltaT(), 0
+    vehicles, held = sumo.vehicle, max(1, round(controller.time_step / step))
+    while name not in vehicles.getIDList():
+        if not sumo.simulation.getMinExpectedNumber():
+            raise SystemExit(f"no vehicle {name!r} has entered")
+        sumo.simulationStep()
+    for limit, value in {**OBEDIENT, "Tau": step, "Imperfection": 0.0}.items():
+        getattr(vehicles, f"set{limit}")(name, value)
+    while name in vehicles.getIDList():
+        acceleration = controller.act(*perceive(vehicles, name))
+        decisions += 1
+        for _ in range(held):
+            if name in vehicles.getIDList():
+                vehicles.setSpeed(name, max(0.0, vehicles.getSpeed(name) + acceleration * step))
+                sumo.simulationStep()
+    return decisions
+
+
+if __name__ == "__main__":
+    file, port, vehicle = sys.argv[1:]
+    connection = traci.connect(int(port), host="127.0.0.1")
+    print(f"{vehicle}: {drive(connection, Controller(file), vehicle)} decisions")
+    connection.close()

@@ -1,0 +1,127 @@
+"""A whole controller as an ONNX graph: what is perceived and remembered in, acceleration and memory out."""
+
+import io
+import logging
+import warnings
+from collections.abc import Callable
+from contextlib import redirect_stdout
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from unjam.controller.graph import ACCELERATION, input_name, output_name
+from unjam.drivers.driver import Driver, Memory
+from unjam.drivers.local_state import LocalState
+from unjam.drivers.registry import describe
+from unjam.drivers.speed_history import WrittenRows
+from unjam.errors import InputError, MissingPartError
+from unjam.physics.arrays import clip
+
+OPSET = 20
+"""version of ONNX's operators"""
+ROWS = 2
+"""of the example that the graph is drawn from; it takes any number of CAVs"""
+
+
+class Whole(nn.Module):
+    """A driver and the bounds of its action as a pure function of tensors, in the order of the graph."""
+
+    def __init__(self, driver: Driver, limit: float) -> None:
+        super().__init__()
+        self.driver = driver
+        self.limit = limit
+        self.remembered = tuple(driver.initial_memory(1))
+
+    def forward(self, *arrays: Tensor) -> tuple[Tensor, ...]:
+        """Return the acceleration [m/s2] and what is remembered, for the state and memory `arrays`."""
+        count = len(LocalState._fields)
+        state = LocalState(*arrays[:count])
+        memory = _with_windows(dict(zip(self.remembered, arrays[count:], strict=True)))
+        wanted, after = self.driver.act(state, memory)
+        kept = (after[name] for name in self.remembered)
+        rows = (value.rows if isinstance(value, WrittenRows) else value.clone() for value in kept)
+        return clip(wanted, -self.limit, self.limit), *rows
+
+
+def _with_windows(memory: Memory) -> Memory:
+    """Return the memory with each window of speeds in the form that a graph can be drawn of."""
+
+    def seen(name: str) -> Tensor:
+        return memory[f"{name.removesuffix('window')}seen"]
+
+    return {
+        name: WrittenRows(value, seen(name)) if name.rpartition(".")[2] == "window" else value
+        for name, value in memory.items()
+    }
+
+
+def _exact_constant() -> Callable[..., Any]:
+    """Return how a plain number enters the graph: onnxscript's own way would cut it to float32.
+
+    Raises:
+        MissingPartError: onnxscript is not installed.
+    """
+    try:
+        import onnx_ir
+        from onnxscript import opset20 as operators
+    except ImportError:
+        raise MissingPartError("onnxscript is not installed; install it: pip install 'unjam[onnx]'") from None
+
+    def constant(value: float, dtype: int = onnx_ir.DataType.DOUBLE, **_: Any) -> Any:
+        exact = np.asarray(value, onnx_ir.DataType(dtype).numpy())
+        return operators.Constant(value=onnx_ir.tensor(exact))  # pyright: ignore[reportArgumentType]
+
+    return constant
+
+
+def onnx_graph(driver: Driver, limit: float) -> bytes:
+    """Return the ONNX graph of a driver whose acceleration is clipped to `limit` [m/s2], in float64.
+
+    Inputs are the fields of `LocalState`, and `memory.NAME` for all that it remembers; outputs are
+    `acceleration`, and `next.NAME`. The first axis of each is the CAV's row.
+
+    Raises:
+        InputError: the driver is not made of formulas that torch can follow.
+        MissingPartError: onnxscript is not installed.
+    """
+    if not driver.tensors or driver.native:
+        raise InputError(f"onnx: {describe(driver)} is not allowed; allowed: drivers that run on tensors")
+    exact = {torch.ops.aten.scalar_tensor.default: _exact_constant()}
+    memory = driver.initial_memory(ROWS)
+    state = [torch.ones(ROWS, dtype=torch.float64) for _ in LocalState._fields]
+    arrays = (*state, *(torch.as_tensor(value, dtype=torch.float64) for value in memory.values()))
+    rows = torch.export.Dim("cavs")
+    with torch.no_grad(), warnings.catch_warnings(), redirect_stdout(io.StringIO()):
+        warnings.simplefilter("ignore")
+        logging.getLogger("torch.onnx").setLevel(logging.ERROR)
+        program: Any = torch.onnx.export(
+            Whole(driver, limit),
+            arrays,
+            input_names=[*LocalState._fields, *map(input_name, memory)],
+            output_names=[ACCELERATION, *map(output_name, memory)],
+            dynamic_shapes=(tuple({0: rows} for _ in arrays),),
+            opset_version=OPSET,
+            dynamo=True,
+            optimize=False,
+            custom_translation_table=exact,
+            verbose=False,
+        )
+    _simplify(program.model)
+    return program.model_proto.SerializeToString()
+
+
+def _simplify(model: Any) -> None:
+    """Work out what is constant, and drop what the graph does not need: names of files of this machine too.
+
+    The exporter's own optimiser breaks a graph in which one clip follows another.
+    """
+    from onnx_ir.passes import common
+    from onnxscript import optimizer
+
+    optimizer.fold_constants(model)
+    common.LiftConstantsToInitializersPass(lift_all_constants=True, size_limit=0)(model)
+    common.CommonSubexpressionEliminationPass()(model)
+    common.RemoveUnusedNodesPass()(model)
+    common.ClearMetadataAndDocStringPass()(model)

@@ -1,0 +1,110 @@
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from unjam.controller.manifest import description
+from unjam.drivers import IDM, Driver, FollowerStopper, LocalState, Pacer, PISaturation
+from unjam.drivers.check import random_state
+from unjam.drivers.from_file import FileDriver
+from unjam.drivers.mixed import Mixed
+from unjam.drivers.residual import observed
+
+from .test_file import ALL_PARTS, residual
+
+DRIVERS: dict[str, Driver] = {
+    "expert": PISaturation(window=20),
+    "nothing remembered": IDM(),
+    "residual": residual(PISaturation()),
+    "held": residual(Pacer(), hold=7),
+    "nested": residual(residual(PISaturation(), 1, hold=3), 2),
+    "mixed": Mixed((residual(FollowerStopper()), IDM())),
+}
+
+
+@pytest.mark.parametrize("name", DRIVERS)
+def test_memory_is_what_the_driver_starts_with(name: str) -> None:
+    driver, said = DRIVERS[name], description(DRIVERS[name])["memory"]
+    memory = driver.initial_memory(1)
+    assert [entry["name"] for entry in said] == list(memory)
+    for entry in said:
+        first = np.nan if entry["first"] is None else entry["first"]
+        np.testing.assert_array_equal(np.full((1, *entry["shape"]), first), memory[entry["name"]])
+
+
+@pytest.mark.parametrize("name", DRIVERS)
+def test_it_is_plain_json(name: str) -> None:
+    said = description(DRIVERS[name], 1.5)
+    assert json.loads(json.dumps(said, allow_nan=False)) == said
+
+
+def test_what_is_observed_is_in_the_order_of_a_local_state() -> None:
+    said = description(IDM())["observation"]
+    assert [entry["name"] for entry in said] == list(LocalState._fields)
+    assert {entry["unit"] for entry in said} == {"m", "m/s"}
+
+
+def test_what_a_network_sees_is_told_with_its_scale() -> None:
+    """A local state in which every number is its scale is seen as ones."""
+    said = description(residual(PISaturation()))["networks"]
+    assert list(said) == [""]
+    scales = {entry["name"]: entry["scale"] for entry in said[""]}
+    speed, loop = np.array([scales["own speed"]]), np.array([scales["length of the closed road"]])
+    state = LocalState(
+        speed,
+        speed + scales["leader's speed - own"],
+        np.array([scales["gap to the leader"]]),
+        speed + scales["follower's speed - own"],
+        np.array([scales["gap to the follower"]]),
+        speed,
+        loop,
+    )
+    driver = residual(PISaturation())
+    seen = driver.observation(state, driver.initial_memory(1))[0]
+    expected = [1.0] * len(said[""])
+    for index, entry in enumerate(said[""]):
+        if "sine" in entry["name"] or entry["name"] in ("expert's acceleration", "commanded speed"):
+            expected[index] = seen[index]  # what the expert makes of it; the mean of one speed is that speed
+    np.testing.assert_allclose(seen, expected)
+
+
+def test_the_networks_are_named_as_their_weights_are() -> None:
+    assert list(description(DRIVERS["nested"])["networks"]) == ["", "expert."]
+    assert list(description(DRIVERS["mixed"])["networks"]) == ["0."]
+    assert description(IDM())["networks"] == {}
+
+
+@pytest.mark.parametrize("expert", [PISaturation(), Pacer(), IDM(), residual(PISaturation())])
+def test_as_many_numbers_are_named_as_are_seen(expert: Driver) -> None:
+    driver = residual(expert)
+    state = random_state(np.random.default_rng(0), 1)
+    seen = driver.observation(state, driver.initial_memory(1))
+    assert seen.shape == (1, len(observed(ALL_PARTS, expert)))
+
+
+def test_what_a_users_own_expert_remembers_has_numbers_for_names(tmp_path: Path) -> None:
+    (tmp_path / "own.py").write_text(
+        "import numpy as np\n"
+        "class Own:\n"
+        "    def initial_memory(self, n): return {}\n"
+        "    def act(self, state, memory): return state.speed * 0.0, memory\n"
+        "    def memory_features(self, memory): return np.zeros((1, 2))\n"
+    )
+    expert = FileDriver(tmp_path / "own.py", "Own")
+    assert [str(number) for number in observed(("expert_memory",), expert)] == [
+        "expert's memory 0 / 1",
+        "expert's memory 1 / 1",
+    ]
+
+
+def test_the_bounds_are_the_drivers_own_or_the_roads() -> None:
+    assert description(residual(IDM()), 9.0)["action"]["high"] == 1.0
+    assert description(IDM(), 1.5)["action"] | {} == {
+        "name": "acceleration",
+        "unit": "m/s2",
+        "low": -1.5,
+        "high": 1.5,
+    }
+    assert description(IDM())["action"]["low"] is None
+    assert description(residual(IDM(), hold=7))["hold"] == 7

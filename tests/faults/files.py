@@ -1,0 +1,148 @@
+"""Faults in what is read and written: checkpoints, controllers, configurations, the disk."""
+
+import resource
+import time
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from tests.controller.test_verify import HELD, content_of, mutated
+from tests.faults.outcome import Outcome, one_line
+from unjam.controller import controller_bytes, load_controller
+from unjam.controller.verify import verify_controller
+from unjam.errors import DiskError, InputError
+from unjam.experiments.checkpoint import STATE, TENSORS, load_checkpoint, save_checkpoint
+from unjam.experiments.config import load_config, to_toml
+
+MUTATIONS = ("change", "cut", "insert", "double", "swap")
+LONGEST = 2.0
+"""seconds in which a wrong configuration is refused"""
+JUNK = [
+    "nan",
+    "-1",
+    "1e400",
+    '""',
+    '"ghost"',
+    "[]",
+    "{}",
+    "true",
+    "9" * 30,
+    "[[[[1]]]]",
+    "0",
+    "1979-05-27",
+    "=",
+]
+
+
+def save(folder: Path, iteration: int) -> None:
+    """Save a small checkpoint that is all its iteration's own."""
+    tensors = {"policy.weight": torch.full((20, 5), float(iteration)), "step": torch.tensor(iteration)}
+    save_checkpoint(folder, {"iteration": iteration, "validation_best": 0.1 * iteration}, tensors)
+
+
+def loaded(folder: Path) -> int:
+    """Return of which iteration the checkpoint is that is loaded, all of it."""
+    found = load_checkpoint(folder)
+    assert found is not None
+    state, tensors = found
+    assert state["validation_best"] == 0.1 * state["iteration"]
+    assert (tensors["policy.weight"] == state["iteration"]).all()
+    return state["iteration"]
+
+
+def any_mutation(content: bytes, generator: np.random.Generator) -> bytes:
+    """Return `content` with something changed, cut off, put in, doubled or swapped."""
+    other = generator.bytes(int(generator.integers(1, 5)))
+    return mutated(content, str(generator.choice(MUTATIONS)), generator.random(), other)
+
+
+def checkpoints(count: int, folder: Path, generator: np.random.Generator) -> Outcome:
+    """Damage the newest checkpoint: its bytes, parts of another, an older schema, nothing at all."""
+    outcome = Outcome()
+    for number in range(count):
+        place = folder / str(number)
+        save(place, 1)
+        save(place, 2)
+        part = place / "000002" / str(generator.choice([STATE, TENSORS]))
+        kind = generator.choice(["bytes", "bytes", "bytes", "empty", "missing", "another's", "old schema"])
+        if kind == "bytes":
+            part.write_bytes(any_mutation(part.read_bytes(), generator))
+        elif kind == "empty":
+            part.write_bytes(b"")
+        elif kind == "missing":
+            part.unlink()
+        elif kind == "another's":
+            part.write_bytes((place / "000001" / part.name).read_bytes())
+        else:
+            (place / "000002" / STATE).write_text('{"iteration": 2, "format": 0}')
+        newest = loaded(place)
+        outcome.happened["the generation before was used" if newest == 1 else "nothing was lost"] += 1
+    return outcome
+
+
+def controllers(count: int, folder: Path, generator: np.random.Generator) -> Outcome:
+    """Damage a controller."""
+    outcome, content, path = Outcome(), content_of(), folder / "it.unjam"
+    whole = controller_bytes(HELD, {})
+    for _ in range(count):
+        path.write_bytes(any_mutation(content, generator))
+        try:
+            verify_controller(path)
+        except InputError as error:
+            one_line(error)
+            outcome.happened["refused in one line"] += 1
+            continue
+        assert controller_bytes(load_controller(path), {}) == whole
+        outcome.happened["nothing was lost"] += 1
+    return outcome
+
+
+def configurations(count: int, folder: Path, generator: np.random.Generator) -> Outcome:
+    """Put nonsense into a configuration."""
+    outcome, path, slowest = Outcome(), folder / "config.toml", 0.0
+    lines = to_toml(load_config()).splitlines()
+    for _ in range(count):
+        changed, place = list(lines), int(generator.integers(len(lines)))
+        key, equals, _ = changed[place].partition(" = ")
+        kind = generator.choice(["value", "value", "value", "name", "twice", "bytes"])
+        if kind == "value" and equals:
+            changed[place] = f"{key} = {generator.choice(JUNK)}"
+        elif kind == "name":
+            changed[place] = f"ghost_{changed[place]}"
+        else:
+            changed.insert(place, changed[place])
+        content = "\n".join(changed).encode()
+        path.write_bytes(any_mutation(content, generator) if kind == "bytes" else content)
+        started = time.monotonic()
+        try:
+            load_config(path)
+            outcome.happened["it was still a valid one"] += 1
+        except InputError as error:
+            one_line(error)
+            outcome.happened["refused in one line before anything started"] += 1
+        slowest = max(slowest, time.monotonic() - started)
+    assert slowest < LONGEST
+    outcome.facts["slowest [s]"] = round(slowest, 3)
+    return outcome
+
+
+def full_disks(count: int, folder: Path, generator: np.random.Generator) -> Outcome:
+    """Let the disk be full after some bytes of a checkpoint."""
+    outcome, before = Outcome(), resource.getrlimit(resource.RLIMIT_FSIZE)
+    newest = 1
+    save(folder, newest)
+    for _ in range(count):
+        resource.setrlimit(resource.RLIMIT_FSIZE, (int(generator.integers(0, 1500)), before[1]))
+        try:
+            save(folder, newest + 1)
+            newest += 1
+            outcome.happened["it still had room"] += 1
+        except DiskError as error:
+            one_line(error)
+            outcome.happened["the checkpoint before was whole, exit code 74"] += 1
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        assert loaded(folder) == newest
+        assert not list(folder.rglob("*.part"))
+    return outcome

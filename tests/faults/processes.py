@@ -1,0 +1,217 @@
+"""Faults of processes: lost workers, networks that break SUMO, thousands of episodes, killed runs."""
+
+import hashlib
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import psutil
+
+from tests.faults.files import any_mutation
+from tests.faults.outcome import Outcome, one_line
+from tests.traffic.own_roads import straight
+from tests.traffic.test_record import fingerprint
+from tests.traffic.test_workers import processes
+from unjam.drivers import IDM, PISaturation
+from unjam.errors import InputError
+from unjam.experiments.checkpoint import load_checkpoint
+from unjam.scenarios import Ring, make_scenario
+from unjam.traffic.episode import run_episode
+from unjam.traffic.simulation import Simulation
+from unjam.traffic.workers import EpisodeTask, Workers
+
+LARGEST_GROWTH = 20.0
+"""MB of memory that any number of resets may cost"""
+SIGNALS = {signal.SIGKILL: 0.5, signal.SIGSEGV: 0.4, signal.SIGSTOP: 0.1}
+"""how a worker is lost, and how often so"""
+SILENCE = 3.0
+"""seconds after which a stopped worker counts as hung here"""
+NUMBERS = ("nan", "-1", "1e30", "inf", "", "0", "ghost", "1e-30")
+DEMAND = (
+    '<vehicle id="a" type="car" route="along" depart="0"/>'
+    '<trip id="b" type="car" depart="1" from="road" to="road"/>'
+)
+
+
+def resets(count: int, folder: Path, generator: np.random.Generator) -> Outcome:
+    """Start one episode after the other in one process, on roads of eleven lengths."""
+    outcome, process, first = Outcome(), psutil.Process(), 0
+    with Simulation() as simulation:
+        for number in range(count):
+            length = 220 + 5 * int(generator.integers(11))
+            episode = run_episode(
+                Ring(length=(length, length), horizon=2), IDM(), (number,), simulation=simulation
+            )
+            assert episode.ok
+            outcome.happened["the episode ran"] += 1
+            if number == count // 10:
+                first = process.memory_info().rss
+    growth = (process.memory_info().rss - first) / 1e6
+    assert growth <= LARGEST_GROWTH
+    outcome.facts["memory growth [MB]"] = round(growth, 1)
+    return outcome
+
+
+def lost_workers(count: int, folder: Path, generator: np.random.Generator) -> Outcome:
+    """Kill, crash or stop workers in the middle of episodes."""
+    outcome, road, slowest = Outcome(), Ring(horizon=8000), 0.0
+    expected = fingerprint(run_episode(road, PISaturation(), (0,)))
+    with Workers(1, silence=SILENCE) as workers:
+        losses: list[signal.Signals] = []
+
+        def disturb(task: int, steps: int) -> None:
+            if len(losses) < min(2, count - outcome.injected) and 0 < steps < road.horizon:
+                how = list(SIGNALS)[generator.choice(len(SIGNALS), p=list(SIGNALS.values()))]
+                losses.append(how)
+                os.kill(processes(workers)[0], how)
+
+        while outcome.injected < count:
+            losses.clear()
+            started = time.monotonic()
+            (found,) = workers.run([EpisodeTask(road, PISaturation(), (0,))], disturb)
+            slowest = max(slowest, time.monotonic() - started)
+            assert fingerprint(found) == expected
+            for how in losses:
+                outcome.happened[f"{how.name}: the episode was repeated to the same bytes"] += 1
+    outcome.facts["longest episode with its repetitions [s]"] = round(slowest, 1)
+    return outcome
+
+
+def networks(count: int, folder: Path, generator: np.random.Generator) -> Outcome:
+    """Break a network of the user's own, its demand or its configuration, and drive on it."""
+    outcome = Outcome()
+    path = straight(folder, DEMAND, length=200.0)
+    names = ("road.net.xml", "demand.rou.xml", "straight.sumocfg")
+    whole = {name: (folder / name).read_bytes() for name in names}
+    with Workers(1, silence=10.0, attempts=1) as workers:
+        assert driven(path, workers) == DRIVEN
+        for _ in range(count):
+            for name, content in whole.items():
+                (folder / name).write_bytes(content)
+            name = str(generator.choice(names))
+            (folder / name).write_bytes(broken(whole[name], generator))
+            outcome.happened[driven(path, workers)] += 1
+    return outcome
+
+
+DRIVEN = "driven: the damage does not matter"
+
+
+def driven(path: Path, workers: Workers) -> str:
+    """Return what becomes of five decisions on a network."""
+    try:
+        road = make_scenario(str(path), {"cav_types": ["car"], "horizon": 5})
+    except InputError as error:
+        one_line(error)
+        return "refused in one line before SUMO started"
+    (episode,) = workers.run([EpisodeTask(road, IDM(), (0,))])
+    if episode.ok:
+        return DRIVEN
+    assert "\n" not in episode.reason
+    if "workers were lost" in episode.reason:
+        return "SUMO crashed in the worker, which was replaced"
+    return "refused in SUMO's words"
+
+
+def broken(content: bytes, generator: np.random.Generator) -> bytes:
+    """Return an XML file with bytes, a value, an attribute or an element changed."""
+    kind = generator.choice(["bytes", "value", "value", "attribute", "element"])
+    if kind == "bytes":
+        return any_mutation(content, generator)
+    text = content.decode()
+    pattern = {"value": r'"[^"]*"', "attribute": r' [\w:]+="[^"]*"', "element": r"<[^>]*>"}[str(kind)]
+    found = list(re.finditer(pattern, text))
+    place = found[int(generator.integers(len(found)))]
+    instead = f'"{generator.choice(NUMBERS)}"' if kind == "value" else ""
+    return (text[: place.start()] + instead + text[place.end() :]).encode()
+
+
+TINY = {
+    "ring": ["ring", "--length", "60", "--vehicles", "5", "--set", "road.horizon=100"],
+    "figure-eight": ["figure-eight", "--set", "road.horizon=100"],
+    "merge": ["merge", "--set", "road.horizon=40", "--set", "road.penetration=0.5"],
+    "own-network": ["straight.sumocfg", "--cav-types", "car", "--set", "road.horizon=100"],
+}
+LEARNERS = ("trpo", "sac", "ppo")
+SETTINGS = [
+    *("evaluation.episodes=1", "evaluation.validation_episodes=1", "evaluation.every=2"),
+    *("policy.hidden=[8]", "trpo.batch_steps=100", "ppo.batch_steps=100", "ppo.epochs=3"),
+    *("sac.batch_steps=100", "sac.start_steps=200", "sac.updates_per_step=0.05", "sac.batch=16"),
+]
+ITERATIONS = 6
+
+
+def killed_runs(count: int, folder: Path, generator: np.random.Generator) -> Outcome:
+    """Kill a training run (signal 9) at random moments, and let it go on; on each road, with each learner."""
+    outcome = Outcome()
+    straight(folder, '<flow id="f" type="car" route="along" begin="0" end="60" period="3"/>', length=300.0)
+    pairs = [(road, LEARNERS[number % len(LEARNERS)]) for number, road in enumerate(TINY)]
+    shares = np.diff(np.linspace(0, count, len(pairs) + 1).round().astype(int))
+    for (road, agent), kills in zip(pairs, shares, strict=True):
+        if kills == 0:
+            continue
+        words = f"{road}, {agent}: the run ended with the same hashes"
+        command = ["train", *TINY[road], "--agent", agent, "--workers", "1"]
+        command += [part for setting in SETTINGS for part in ("--set", setting)]
+        steps = 100 * ITERATIONS if road != "merge" else 120 * ITERATIONS
+        last = ["--steps", str(steps), "--json"]
+        whole = unjam(folder, [*command, *last, "--out", f"{road}-whole"])
+        assert whole.wait() == 0, (folder / "words.txt").read_text()
+        run = folder / f"{road}-killed"
+        start = [*command, *last, "--out", run.name]
+        for _ in range(kills):
+            killed_at_random(folder, start, run, generator)
+            outcome.happened[words] += 1
+            start = ["train", "--resume", run.name, "--json"] if (run / "config.toml").exists() else start
+        process = unjam(folder, start)
+        assert process.wait() == 0, (folder / "words.txt").read_text()
+        assert hashes(run) == hashes(folder / f"{road}-whole")
+    return outcome
+
+
+def unjam(folder: Path, arguments: list[str]) -> "subprocess.Popen[bytes]":
+    """Start the command line."""
+    command = [sys.executable, "-m", "unjam", *arguments]
+    with (folder / "words.txt").open("wb") as words:
+        return subprocess.Popen(command, cwd=folder, stdout=subprocess.DEVNULL, stderr=words)
+
+
+def killed_at_random(folder: Path, command: list[str], run: Path, generator: np.random.Generator) -> None:
+    """Start a run, and kill it some time after its first rows, before its end."""
+    progress = run / "progress.jsonl"
+    before = rows(progress)
+    process = unjam(folder, command)
+    more = int(generator.integers(0, 3))
+    while process.poll() is None and rows(progress) < min(before + more, ITERATIONS - 1):
+        time.sleep(0.02)
+    time.sleep(float(generator.uniform(0.0, 1.0)))
+    process.kill()
+    process.wait()
+
+
+def rows(progress: Path) -> int:
+    """Return how many rows a run has written."""
+    return progress.read_bytes().count(b"\n") if progress.exists() else 0
+
+
+def hashes(run: Path) -> dict[str, str]:
+    """Return the hashes of a run's parameters, of its metrics, and of its controller."""
+    found = load_checkpoint(run / "checkpoint")
+    assert found is not None
+    parameters = b"".join(name.encode() + found[1][name].numpy().tobytes() for name in sorted(found[1]))
+    made = [json.loads(line) for line in (run / "progress.jsonl").read_text().splitlines()]
+    metrics = json.dumps([{key: row[key] for key in row if key != "seconds"} for row in made])
+    judged = json.dumps(json.loads((run / "evaluation.json").read_text())["rows"])
+    parts = {
+        "parameters": parameters,
+        "metrics": metrics.encode(),
+        "evaluation": judged.encode(),
+        "controller": (run / "controller.unjam").read_bytes(),
+    }
+    return {name: hashlib.sha256(part).hexdigest() for name, part in parts.items()}

@@ -1,0 +1,49 @@
+"""Injects thousands of faults, and writes down what happened: results/soak/soak.json. Takes half an hour.
+
+Run: python tests/faults/soak.py [NAME ...]
+"""
+
+import json
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+
+ROOT = Path(__file__).parents[2]
+sys.path.insert(0, str(ROOT))
+
+from tests.faults.registry import FAULTS  # noqa: E402
+from unjam.errors import wrong_name  # noqa: E402
+from unjam.experiments.manifest import manifest  # noqa: E402
+from unjam.files import to_json, write_whole  # noqa: E402
+
+TARGET = ROOT / "results" / "soak" / "soak.json"
+
+
+def soak(names: list[str]) -> None:
+    """Inject the faults of these names; the rows of others stay as they were measured before."""
+    rows = {row["name"]: row for row in json.loads(TARGET.read_text())["rows"]} if TARGET.exists() else {}
+    for name in names:
+        fault, started = FAULTS[name], time.monotonic()
+        with tempfile.TemporaryDirectory() as folder:
+            outcome = fault.inject(fault.long, Path(folder), np.random.default_rng(list(FAULTS).index(name)))
+        rows[name] = {
+            "name": name,
+            "about": fault.about,
+            "injected": outcome.injected,
+            "happened": dict(sorted(outcome.happened.items())),
+            "facts": outcome.facts,
+            "seconds": round(time.monotonic() - started, 1),
+        }
+        print(json.dumps(rows[name]), flush=True)
+        ordered = [rows[each] for each in FAULTS if each in rows]
+        write_whole(TARGET, to_json({"manifest": manifest(), "rows": ordered}, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    for name in sys.argv[1:]:
+        if name not in FAULTS:
+            raise SystemExit(str(wrong_name("fault", name, FAULTS)))
+    soak(sys.argv[1:] or list(FAULTS))

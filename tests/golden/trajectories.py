@@ -1,0 +1,98 @@
+"""Golden trajectories: short episodes of every expert on every road, as they once were.
+
+They differ where SUMO, a formula or a road has changed: numbers in the documentation then no longer hold.
+"""
+
+import hashlib
+import json
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from tests.traffic.own_roads import straight
+from unjam.drivers.registry import DRIVERS, named_driver
+from unjam.scenarios.registry import make_scenario
+from unjam.scenarios.scenario import Scenario
+from unjam.traffic.episode import run_episode
+from unjam.traffic.network_files import sumo_version
+from unjam.traffic.record import Episode
+from unjam.traffic.simulation import Simulation
+
+ROADS = {
+    "ring": ("ring", {"horizon": 200}),
+    "ring-warm": ("ring-warm", {"horizon": 100, "warmup": 300}),
+    "figure-eight": ("figure-eight", {"horizon": 400}),
+    "merge": ("merge", {"horizon": 60}),
+    "own-network": ("", {"horizon": 250, "cav_types": ["van"]}),
+}
+VANS = "".join(
+    f'<vehicle id="{number}" type="{"car" if number % 3 else "van"}" route="along" '
+    f'depart="{2 * number}" departSpeed="8"/>'
+    for number in range(9)
+)
+SHOWN_EVERY = 25
+"""decisions between two rows of a CSV"""
+GRAIN = 1e-4
+"""[m/s] and [m]: what is finer than this may differ from one processor to another"""
+SEED = (20,)
+
+
+def folder(version: str | None = None) -> Path:
+    """Return where the golden trajectories of a version of SUMO are; of the installed one by default."""
+    return Path(__file__).parent / (version or sumo_version())
+
+
+def cases() -> list[tuple[str, str]]:
+    """Return every road with every driver that may drive on it."""
+    return [
+        (road, driver)
+        for road in ROADS
+        for driver, kind in DRIVERS.items()
+        if road not in ("merge", "own-network") or not kind.needs_loop
+    ]
+
+
+def scenario_of(road: str, network: Path) -> Scenario:
+    """Return a road of the list, short; `network` is a folder for the user's own."""
+    name, changes = ROADS[road]
+    if not name:
+        path = network / "straight.sumocfg"
+        name = str(path if path.exists() else straight(network, VANS, length=600.0))
+    return make_scenario(name, dict(changes))
+
+
+def drive_all() -> Iterator[tuple[str, Episode]]:
+    """Yield the name and the episode of each case."""
+    with tempfile.TemporaryDirectory() as network, Simulation() as simulation:
+        for road, driver in cases():
+            scenario = scenario_of(road, Path(network))
+            expert = named_driver(driver, scenario.decision_step)
+            yield f"{road}-{driver}", run_episode(scenario, expert, SEED, simulation=simulation)
+
+
+def hash_of(episode: Episode) -> str:
+    """Return the hash of all speeds and positions, rounded to `GRAIN`."""
+    grains = [np.rint(np.nan_to_num(each, nan=-1e6) / GRAIN) for each in (episode.speeds, episode.positions)]
+    content = b"".join(each.astype("<i8").tobytes() for each in grains)
+    return hashlib.sha256(repr(episode.vehicle_ids).encode() + content).hexdigest()
+
+
+def table_of(episode: Episode) -> str:
+    """Return the speeds of all vehicles [m/s] now and then, as CSV; empty where one is not on the road."""
+    lines = [",".join(["decision", *episode.vehicle_ids])]
+    for decision in range(0, len(episode.speeds), SHOWN_EVERY):
+        speeds = ("" if np.isnan(speed) else f"{speed:.4f}" for speed in episode.speeds[decision])
+        lines.append(",".join([str(decision), *speeds]))
+    return "\n".join(lines) + "\n"
+
+
+def read_hashes(place: Path) -> dict[str, str]:
+    """Return the golden hashes by case."""
+    return json.loads((place / "hashes.json").read_text())
+
+
+def fingerprint(hashes: dict[str, str]) -> str:
+    """Return a short hash of all hashes: what a line of the changelog names."""
+    return hashlib.sha256(json.dumps(hashes, sort_keys=True).encode()).hexdigest()[:12]
