@@ -120,6 +120,6 @@ TUNED: dict[float, dict[str, Any]] = {
 }
 """what `varying` uses, by the length of the lap [m], found by results/experts/tune_pacer.py.
 
-Of the figure eight with radii 30, 32, 33, 34 and 35 m; at 34 m 0.1 m/s slower than what the search found there,
+Of the figure eight with radii 30, 32, 33, 34 and 35 m; at 34 m 0.1 m/s slower than what the search found,
 which broke on one seed of ten.
 """
