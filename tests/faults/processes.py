@@ -65,13 +65,14 @@ def lost_workers(count: int, folder: Path, generator: np.random.Generator) -> Ou
     outcome, road, slowest = Outcome(), Ring(horizon=8000), 0.0
     expected = fingerprint(run_episode(road, PISaturation(), (0,)))
     with Workers(1, silence=SILENCE, attempts=ATTEMPTS) as workers:
-        losses: list[signal.Signals] = []
+        losses: dict[int, signal.Signals] = {}
 
         def disturb(task: int, steps: int) -> None:
-            if len(losses) < min(2, count - outcome.injected) and 0 < steps < road.horizon:
-                how = list(SIGNALS)[generator.choice(len(SIGNALS), p=list(SIGNALS.values()))]
-                losses.append(how)
-                os.kill(processes(workers)[0], how)
+            (worker,) = processes(workers)
+            wanted = min(2, count - outcome.injected)
+            if len(losses) < wanted and worker not in losses and 0 < steps < road.horizon:
+                losses[worker] = list(SIGNALS)[generator.choice(len(SIGNALS), p=list(SIGNALS.values()))]
+                os.kill(worker, losses[worker])
 
         while outcome.injected < count:
             losses.clear()
@@ -80,7 +81,7 @@ def lost_workers(count: int, folder: Path, generator: np.random.Generator) -> Ou
             slowest = max(slowest, time.monotonic() - started)
             assert found.ok, found.reason
             assert fingerprint(found) == expected
-            for how in losses[: count - outcome.injected]:
+            for how in losses.values():
                 outcome.happened[f"{how.name}: the episode was repeated to the same bytes"] += 1
     outcome.facts["longest episode with its repetitions [s]"] = round(slowest, 1)
     return outcome
