@@ -23,7 +23,7 @@ def manifest_of(path: Path) -> dict[str, Any]:
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("runs") / "run"
-    train(small_config(), folder)
+    train(small_config(steps=300, virtual__virtual_ratio=0.0), folder)
     return folder
 
 
