@@ -1,0 +1,140 @@
+"""Calibrating the IDM on people: the parameters with which the simulated gap is nearest to the real one.
+
+Least squares on single accelerations would degenerate: the model then hardly reacts. On the simulated gap it
+has to drive. Source of the method: Treiber and Kesting, Traffic Flow Dynamics (2013), chapter 16.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from pydantic.dataclasses import dataclass as checked_dataclass
+
+from unjam.following.open_loop import Limits, always, drive_behind, idm_follow, open_loop
+from unjam.following.pairs import Floats, Pair, Stretches, stretches_of
+from unjam.parameters import STRICT, Count, CountOrNone, Positive
+from unjam.physics.idm import IDMParameters, IDMRows
+
+Range = tuple[Positive, Positive]
+
+
+@checked_dataclass(frozen=True, config=STRICT)
+class CalibrationSettings:
+    """What is searched, and how long; the exponent stays 4."""
+
+    desired_speed: Range = (5.0, 40.0)
+    """v0 [m/s]"""
+    time_headway: Range = (0.1, 4.0)
+    """T [s]"""
+    max_acceleration: Range = (0.1, 4.0)
+    """a [m/s2]"""
+    comfortable_deceleration: Range = (0.1, 6.0)
+    """b [m/s2]"""
+    minimum_gap: Range = (0.5, 6.0)
+    """s0 [m]"""
+    limits: Limits = (-4.0, 2.0)
+    """within which the acceleration is kept [m/s2]: where a gap is nearly used up the IDM alone brakes beyond
+    all bounds"""
+    seconds: Positive = 120.0
+    """longer trajectories are cut into stretches of this length, each of which starts with the recorded gap"""
+    candidates: Count = 8
+    """sets of parameters that are tried at once, for each of the five parameters"""
+    generations: Count = 80
+    """of differential evolution, at most"""
+    seed: CountOrNone = 0
+
+
+SEARCHED = ("desired_speed", "time_headway", "max_acceleration", "comfortable_deceleration", "minimum_gap")
+
+
+@dataclass(frozen=True)
+class Calibrated:
+    """What came of a calibration."""
+
+    parameters: IDMParameters
+    gap_error: float
+    """root mean squared error of the simulated gap [m]"""
+    speed_error: float
+    """of the simulated speed [m/s]"""
+    collided: int
+    """stretches in which the model used the gap up"""
+    seconds: float
+    """of driving that it was calibrated on"""
+    bounds: tuple[str, ...] = field(default=())
+    """parameters that lie at the end of what was searched: the data do not tell them"""
+
+
+def calibrate(pairs: Sequence[Pair], settings: CalibrationSettings | None = None) -> Calibrated:
+    """Return the parameters that suit `pairs` best when all are driven by one and the same IDM.
+
+    Differential evolution over the root mean squared error of the simulated gap; all candidates and all
+    stretches are simulated at once.
+
+    Raises:
+        InputError: the pairs have different time steps.
+    """
+    from scipy.optimize import differential_evolution  # half a second that help need not wait
+
+    settings = settings or CalibrationSettings()
+    stretches = stretches_of(pairs, settings.seconds)
+    found = differential_evolution(
+        gap_objective(stretches, settings.limits),
+        bounds=[getattr(settings, name) for name in SEARCHED],
+        popsize=settings.candidates,
+        maxiter=settings.generations,
+        tol=1e-3,
+        rng=settings.seed,
+        vectorized=True,
+        updating="deferred",
+        polish=False,
+    )
+    parameters = IDMParameters(**dict(zip(SEARCHED, map(float, found.x), strict=True)))
+    drove = open_loop(always(idm_follow(parameters, settings.limits)), stretches)
+    weights = drove.moments / drove.moments.sum()
+    return Calibrated(
+        parameters,
+        float(np.sqrt((drove.gap_square * weights).sum())),
+        float(np.sqrt((drove.speed_square * weights).sum())),
+        int(drove.collided.sum()),
+        sum(pair.seconds for pair in pairs),
+        tuple(name for name in SEARCHED if _at_an_end(getattr(parameters, name), getattr(settings, name))),
+    )
+
+
+def calibrate_each(
+    groups: Sequence[Sequence[Pair]],
+    settings: CalibrationSettings | None = None,
+    told: Callable[[int], None] | None = None,
+) -> list[Calibrated]:
+    """Return a calibration of each group of pairs, for instance of each driver; `told` counts them."""
+    found = []
+    for number, pairs in enumerate(groups, 1):
+        found.append(calibrate(pairs, settings))
+        if told is not None:
+            told(number)
+    return found
+
+
+def gap_objective(stretches: Stretches, limits: Limits) -> Callable[[Floats], Floats]:
+    """Return the root mean squared error of the gap [m] as a function of candidates, (5, S) -> (S,)."""
+    speeds, paths, step = stretches.leader_speed, stretches.leader_path, stretches.step
+    moments = stretches.present[1:].sum()
+
+    def objective(candidates: Floats) -> Floats:
+        columns = (values[:, None] for values in np.atleast_2d(candidates.T).T)
+        v0, headway, acceleration, deceleration, minimum_gap = columns
+        rows = IDMRows(v0, headway, acceleration, deceleration, 4.0, minimum_gap)
+        shape = (v0.shape[0], paths.shape[1])
+        start = (np.broadcast_to(stretches.speed[0], shape), np.broadcast_to(stretches.gap[0], shape))
+        total = np.zeros(shape)
+        driven = drive_behind(idm_follow(rows, limits), start, (speeds, paths), step)
+        for moment, (_, gap) in enumerate(driven, 1):
+            total += np.square(gap - stretches.gap[moment]) * stretches.present[moment]
+        return np.sqrt(total.sum(1) / moments)
+
+    return objective
+
+
+def _at_an_end(value: float, within: Range) -> bool:
+    low, high = within
+    return min(value - low, high - value) < 0.01 * (high - low)

@@ -1,0 +1,146 @@
+"""Learning to drive on from one's own predictions: a residual trained through the simulated steps.
+
+A network that learned single accelerations has never seen where its own small errors lead. Here the loss is the
+error of the simulated gap, and its gradient runs back through every step of driving behind a recorded leader.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Annotated
+
+import numpy as np
+import torch
+from pydantic import Field
+from pydantic.dataclasses import dataclass as checked_dataclass
+from torch import Tensor
+from torch.nn.functional import smooth_l1_loss
+
+from unjam.errors import UnjamError
+from unjam.following.network import FollowingNetwork, NetworkSettings, inputs_of, network_follow
+from unjam.following.open_loop import Follow, Limits, drive_behind, open_loop
+from unjam.following.pairs import Pair, Stretches, rows_of, stretches_of
+from unjam.parameters import STRICT, Count, NotNegative, Positive
+from unjam.physics.arrays import clip
+
+LARGEST_GRADIENT = 1.0
+"""norm to which gradients are cut: those through many steps can be very long"""
+
+
+@checked_dataclass(frozen=True, config=STRICT)
+class MultiStepSettings:
+    """How a residual learns from simulated driving."""
+
+    hidden: Annotated[tuple[Count, ...], Field(min_length=1)] = (64, 64)
+    """units of the hidden layers"""
+    authority: Positive = 2.0
+    """largest residual [m/s2]"""
+    seconds: Positive = 30.0
+    """length of the stretches that are simulated"""
+    batch: Count = 64
+    """stretches in a gradient step"""
+    steps: Count = 1000
+    """gradient steps"""
+    rate: Positive = 1e-3
+    """learning rate of Adam, which falls to zero as a cosine"""
+    tolerance: Positive = 2.0
+    """errors of the gap beyond this count linearly, not by their square [m]: a driver who leaves a hundred
+    metres has other reasons than the car ahead"""
+    speed_weight: NotNegative = 2.0
+    """how much an error of the speed by 1 m/s counts beside one of the gap by 1 m"""
+    residual_weight: NotNegative = 0.1
+    """how much the squared residual counts: where data are silent, the base drives"""
+    validate_every: Count = 50
+    """gradient steps between two looks at the validation trajectories, which choose the weights"""
+
+
+@dataclass(frozen=True)
+class MultiStepFit:
+    """A residual, and how it came to be."""
+
+    network: FollowingNetwork
+    validation: list[float]
+    """mean over the validation trajectories of the root mean squared error of the gap [m], by look; the
+    first is the base's"""
+
+
+def fit_multi_step(
+    pairs: Sequence[Pair],
+    validation: Sequence[Pair],
+    base: Follow,
+    limits: Limits,
+    settings: MultiStepSettings,
+    seed: int,
+    told: Callable[[int], None] | None = None,
+) -> MultiStepFit:
+    """Return a residual on `base` that makes the simulated gaps those of `pairs`.
+
+    It starts at zero, so that what drives at first is the base alone, and ends with the weights that were
+    best on whole trajectories of `validation`; these may be the first.
+
+    Args:
+        pairs: to learn from.
+        validation: of other drivers.
+        base: what is known; it answers torch tensors too.
+        limits: of the acceleration [m/s2].
+        settings: of network and learning.
+        seed: of the first weights and the order of the stretches.
+        told: told the number of each gradient step.
+
+    Raises:
+        UnjamError: a loss is not finite.
+    """
+    torch.set_num_threads(1)
+    shape = NetworkSettings(hidden=settings.hidden, authority=settings.authority)
+    network = FollowingNetwork(shape, rows_of(pairs), seed, zero=True)
+    stretches, judged = stretches_of(pairs, settings.seconds), stretches_of(validation)
+    optimizer = torch.optim.Adam(network.parameters(), lr=settings.rate)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, settings.steps)
+    generator = np.random.default_rng(seed)
+    found = [_judged(network, base, limits, judged)]
+    kept = {name: value.clone() for name, value in network.state_dict().items()}
+    for step in range(1, settings.steps + 1):
+        chosen = generator.choice(stretches.gap.shape[1], settings.batch)
+        loss = _loss(network, base, limits, stretches.some(chosen), settings)
+        if not torch.isfinite(loss):
+            raise UnjamError(f"following network: the loss of step {step} is not finite")
+        optimizer.zero_grad()
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(network.parameters(), LARGEST_GRADIENT)
+        optimizer.step()
+        schedule.step()
+        if step % settings.validate_every == 0:
+            found.append(_judged(network, base, limits, judged))
+            if found[-1] <= min(found):
+                kept = {name: value.clone() for name, value in network.state_dict().items()}
+        if told is not None:
+            told(step)
+    network.load_state_dict(kept)
+    return MultiStepFit(network, found)
+
+
+def _judged(network: FollowingNetwork, base: Follow, limits: Limits, judged: Stretches) -> float:
+    drove = open_loop(model_with(network.as_driver(), base, limits), judged)
+    return float(np.sqrt(drove.gap_square).mean())
+
+
+def _loss(
+    network: FollowingNetwork, base: Follow, limits: Limits, real: Stretches, settings: MultiStepSettings
+) -> Tensor:
+    """Return the loss of driving behind the leaders of some stretches."""
+    speeds, leader_speeds, gaps, paths = (
+        torch.as_tensor(values, dtype=torch.float32)
+        for values in (real.speed, real.leader_speed, real.gap, real.leader_path)
+    )
+    present = torch.as_tensor(real.present)[1:]
+    residuals = []
+
+    def follow(speed: Tensor, leader_speed: Tensor, gap: Tensor) -> Tensor:
+        residuals.append(network(inputs_of(speed, leader_speed, gap)))
+        return clip(base(speed, leader_speed, gap) + residuals[-1], *limits)
+
+    driven = list(drive_behind(follow, (speeds[0], gaps[0]), (leader_speeds, paths), real.step))
+    speed, gap = (torch.stack(each)[present] for each in zip(*driven, strict=True))
+    gap_loss = smooth_l1_loss(gap, gaps[1:][present], beta=settings.tolerance)
+    speed_loss = smooth_l1_loss(speed, speeds[1:][present], beta=1.0)
+    left = torch.stack(residuals)[present].square().mean()
+    return gap_loss + settings.speed_weight * speed_loss + settings.residual_weight * left

@@ -1,0 +1,109 @@
+"""Driving behind a recorded leader: what a model of a driver is worth over a whole trajectory.
+
+One step ahead, errors say little: models that are better there collide more often when they drive on from
+their own predictions.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from unjam.drivers.idm import SMALLEST_GAP
+from unjam.following.pairs import Floats, Stretches
+from unjam.physics.arrays import Array, at_least, clip
+from unjam.physics.idm import IDMParameters, IDMRows, idm_acceleration
+from unjam.physics.kinematics import next_position, next_speed
+
+Follow = Callable[[Array, Array, Array], Array]
+"""a model of a driver: (own speed, leader's speed, gap) -> acceleration; [m/s], [m] and [m/s2]"""
+
+Model = Callable[[Array, Array], Follow]
+"""a driver who takes over: (speed, gap) at that moment -> how it drives on"""
+
+Limits = tuple[float, float]
+
+
+def always(follow: Follow) -> Model:
+    """Return the driver that drives alike wherever it takes over."""
+    return lambda speed, gap: follow
+
+
+def idm_follow(parameters: IDMParameters | IDMRows, limits: Limits | None = None) -> Follow:
+    """Return the IDM as a model of a driver, its acceleration kept within `limits` [m/s2]."""
+
+    def follow(speed: Array, leader_speed: Array, gap: Array) -> Array:
+        found = idm_acceleration(speed, leader_speed, at_least(gap, SMALLEST_GAP), parameters)
+        return found if limits is None else clip(found, *limits)
+
+    return follow
+
+
+def drive_behind(follow: Follow, start: tuple[Array, Array], leader: Any, step: float) -> Iterator[Any]:
+    """Yield (speed, gap) after each step of driving behind a recorded leader.
+
+    Args:
+        follow: who drives.
+        start: speed [m/s] and gap [m] at the first moment, shape (..., n).
+        leader: (speeds, paths), each of shape (T, n); paths as in `Pair.leader_path`.
+        step: time between two moments [s].
+    """
+    (speed, gap), (leader_speeds, paths) = start, leader
+    position = gap * 0.0
+    for moment in range(len(paths) - 1):
+        acceleration = follow(speed, leader_speeds[moment], gap)
+        speed = next_speed(speed, acceleration, step)
+        position = next_position(position, speed, step)
+        gap = paths[moment + 1] - position
+        yield speed, gap
+
+
+@dataclass(frozen=True, eq=False)
+class OpenLoop:
+    """How a model drove behind recorded leaders, beside those who really did; n stretches of T moments."""
+
+    speed: Floats
+    """[m/s], shape (T, n)"""
+    gap: Floats
+    """[m], shape (T, n)"""
+    speed_square: Floats
+    """mean squared error of the speed, of each stretch, shape (n,)"""
+    gap_square: Floats
+    """mean squared error of the gap, shape (n,)"""
+    collided: NDArray[np.bool_]
+    """whether the gap was used up, shape (n,)"""
+    moments: NDArray[np.int64]
+    """moments of each stretch but the first, shape (n,)"""
+    owner: NDArray[np.int64]
+    """which pair each stretch is of, shape (n,)"""
+
+
+def open_loop(model: Model, stretches: Stretches) -> OpenLoop:
+    """Drive behind the leader of each stretch from its first moment on, and compare with the follower."""
+    follow = model(stretches.speed[0], stretches.gap[0])
+    speeds, gaps = [stretches.speed[0]], [stretches.gap[0]]
+    leader = (stretches.leader_speed, stretches.leader_path)
+    for speed, gap in drive_behind(follow, (speeds[0], gaps[0]), leader, stretches.step):
+        speeds.append(speed)
+        gaps.append(gap)
+    speed, gap, present = np.stack(speeds), np.stack(gaps), stretches.present
+    moments = present[1:].sum(0)
+    return OpenLoop(
+        speed,
+        gap,
+        (np.square(speed - stretches.speed) * present).sum(0) / moments,
+        (np.square(gap - stretches.gap) * present).sum(0) / moments,
+        ((gap <= 0.0) & present).any(0),
+        moments,
+        stretches.owner,
+    )
+
+
+def one_step_error(model: Model, stretches: Stretches) -> Floats:
+    """Return the mean squared error of the acceleration until the next moment [(m/s2)2], shape (n,)."""
+    follow = model(stretches.speed[0], stretches.gap[0])
+    predicted = follow(stretches.speed[:-1], stretches.leader_speed[:-1], stretches.gap[:-1])
+    error = predicted - np.diff(stretches.speed, axis=0) / stretches.step
+    return (np.square(error) * stretches.present[1:]).sum(0) / stretches.present[1:].sum(0)
