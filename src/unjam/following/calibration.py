@@ -6,13 +6,14 @@ has to drive. Source of the method: Treiber and Kesting, Traffic Flow Dynamics (
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 from pydantic.dataclasses import dataclass as checked_dataclass
 
-from unjam.following.open_loop import Limits, always, drive_behind, idm_follow, open_loop
+from unjam.following.open_loop import Limits, Model, drive_behind, open_loop, personal_idm
 from unjam.following.pairs import Floats, Pair, Stretches, stretches_of
-from unjam.parameters import STRICT, Count, CountOrNone, Positive
+from unjam.parameters import STRICT, Count, CountOrNone, NotNegative, Positive
 from unjam.physics.idm import IDMParameters, IDMRows
 
 Range = tuple[Positive, Positive]
@@ -32,6 +33,11 @@ class CalibrationSettings:
     """b [m/s2]"""
     minimum_gap: Range = (0.5, 6.0)
     """s0 [m]"""
+    kept_headway: tuple[NotNegative, NotNegative] = (0.0, 0.0)
+    """share of the headway with which a driver was found that it keeps, see `personal_idm`"""
+    every: Literal["trajectory", "moment"] = "trajectory"
+    """what counts alike: `trajectory`: the mean of their root mean squared errors; `moment`: one root mean
+    square over all of them, in which the few who leave very large gaps decide"""
     limits: Limits = (-4.0, 2.0)
     """within which the acceleration is kept [m/s2]: where a gap is nearly used up the IDM alone brakes beyond
     all bounds"""
@@ -39,12 +45,15 @@ class CalibrationSettings:
     """longer trajectories are cut into stretches of this length, each of which starts with the recorded gap"""
     candidates: Count = 8
     """sets of parameters that are tried at once, for each of the five parameters"""
-    generations: Count = 80
+    generations: Count = 100
     """of differential evolution, at most"""
+    tolerance: Positive = 1e-3
+    """spread of the candidates' errors, relative to their mean, at which it ends"""
     seed: CountOrNone = 0
 
 
 SEARCHED = ("desired_speed", "time_headway", "max_acceleration", "comfortable_deceleration", "minimum_gap")
+KEPT = "kept_headway"
 
 
 @dataclass(frozen=True)
@@ -52,6 +61,8 @@ class Calibrated:
     """What came of a calibration."""
 
     parameters: IDMParameters
+    kept_headway: float
+    """of `personal_idm`"""
     gap_error: float
     """root mean squared error of the simulated gap [m]"""
     speed_error: float
@@ -63,12 +74,16 @@ class Calibrated:
     bounds: tuple[str, ...] = field(default=())
     """parameters that lie at the end of what was searched: the data do not tell them"""
 
+    def model(self, limits: Limits) -> Model:
+        """Return it as a driver."""
+        return personal_idm(self.parameters, self.kept_headway, limits)
+
 
 def calibrate(pairs: Sequence[Pair], settings: CalibrationSettings | None = None) -> Calibrated:
-    """Return the parameters that suit `pairs` best when all are driven by one and the same IDM.
+    """Return the parameters that suit `pairs` best when all are driven by one IDM.
 
-    Differential evolution over the root mean squared error of the simulated gap; all candidates and all
-    stretches are simulated at once.
+    Differential evolution over the error of the simulated gap; all candidates and all stretches are simulated
+    at once.
 
     Raises:
         InputError: the pairs have different time steps.
@@ -78,21 +93,23 @@ def calibrate(pairs: Sequence[Pair], settings: CalibrationSettings | None = None
     settings = settings or CalibrationSettings()
     stretches = stretches_of(pairs, settings.seconds)
     found = differential_evolution(
-        gap_objective(stretches, settings.limits),
-        bounds=[getattr(settings, name) for name in SEARCHED],
+        gap_objective(stretches, settings.limits, settings.every),
+        bounds=[getattr(settings, name) for name in (*SEARCHED, KEPT)],
         popsize=settings.candidates,
         maxiter=settings.generations,
-        tol=1e-3,
+        tol=settings.tolerance,
         rng=settings.seed,
         vectorized=True,
         updating="deferred",
         polish=False,
     )
-    parameters = IDMParameters(**dict(zip(SEARCHED, map(float, found.x), strict=True)))
-    drove = open_loop(always(idm_follow(parameters, settings.limits)), stretches)
+    *searched, kept = map(float, found.x)
+    parameters = IDMParameters(**dict(zip(SEARCHED, searched, strict=True)))
+    drove = open_loop(personal_idm(parameters, kept, settings.limits), stretches)
     weights = drove.moments / drove.moments.sum()
     return Calibrated(
         parameters,
+        kept,
         float(np.sqrt((drove.gap_square * weights).sum())),
         float(np.sqrt((drove.speed_square * weights).sum())),
         int(drove.collided.sum()),
@@ -115,22 +132,23 @@ def calibrate_each(
     return found
 
 
-def gap_objective(stretches: Stretches, limits: Limits) -> Callable[[Floats], Floats]:
-    """Return the root mean squared error of the gap [m] as a function of candidates, (5, S) -> (S,)."""
-    speeds, paths, step = stretches.leader_speed, stretches.leader_path, stretches.step
-    moments = stretches.present[1:].sum()
+def gap_objective(stretches: Stretches, limits: Limits, every: str) -> Callable[[Floats], Floats]:
+    """Return the error of the simulated gap [m] as a function of candidates, shape (6, S) -> (S,)."""
+    leader = (stretches.leader_speed, stretches.leader_path)
+    moments = stretches.present[1:].sum(0)
 
     def objective(candidates: Floats) -> Floats:
-        columns = (values[:, None] for values in np.atleast_2d(candidates.T).T)
-        v0, headway, acceleration, deceleration, minimum_gap = columns
+        v0, headway, acceleration, deceleration, minimum_gap, kept = candidates.reshape(6, -1, 1)
         rows = IDMRows(v0, headway, acceleration, deceleration, 4.0, minimum_gap)
-        shape = (v0.shape[0], paths.shape[1])
+        shape = (v0.shape[0], len(moments))
         start = (np.broadcast_to(stretches.speed[0], shape), np.broadcast_to(stretches.gap[0], shape))
+        follow = personal_idm(rows, kept, limits)(*start)
         total = np.zeros(shape)
-        driven = drive_behind(idm_follow(rows, limits), start, (speeds, paths), step)
-        for moment, (_, gap) in enumerate(driven, 1):
+        for moment, (_, gap) in enumerate(drive_behind(follow, start, leader, stretches.step), 1):
             total += np.square(gap - stretches.gap[moment]) * stretches.present[moment]
-        return np.sqrt(total.sum(1) / moments)
+        if every == "trajectory":
+            return np.sqrt(total / moments).mean(1)
+        return np.sqrt(total.sum(1) / moments.sum())
 
     return objective
 

@@ -1,7 +1,7 @@
 """Learning to drive on from one's own predictions: a residual trained through the simulated steps.
 
-A network that learned single accelerations has never seen where its own small errors lead. Here the loss is the
-error of the simulated gap, and its gradient runs back through every step of driving behind a recorded leader.
+A network that learned single accelerations has never seen where its own small errors lead. Here the loss is
+the error of the simulated gap, and its gradient runs back through every step behind a recorded leader.
 """
 
 from collections.abc import Callable, Sequence
@@ -13,15 +13,15 @@ import torch
 from pydantic import Field
 from pydantic.dataclasses import dataclass as checked_dataclass
 from torch import Tensor
-from torch.nn.functional import smooth_l1_loss
 
 from unjam.errors import UnjamError
-from unjam.following.network import FollowingNetwork, NetworkSettings, inputs_of, network_follow
-from unjam.following.open_loop import Follow, Limits, drive_behind, open_loop
+from unjam.following.network import FollowingNetwork, NetworkSettings, on_rows
+from unjam.following.open_loop import Limits, Model, drive_behind, open_loop, with_residual
 from unjam.following.pairs import Pair, Stretches, rows_of, stretches_of
 from unjam.parameters import STRICT, Count, NotNegative, Positive
-from unjam.physics.arrays import clip
 
+SMALLEST = 1e-2
+"""what is added to a mean square before its root [m2]: a perfect trajectory has no infinite slope"""
 LARGEST_GRADIENT = 1.0
 """norm to which gradients are cut: those through many steps can be very long"""
 
@@ -30,7 +30,7 @@ LARGEST_GRADIENT = 1.0
 class MultiStepSettings:
     """How a residual learns from simulated driving."""
 
-    hidden: Annotated[tuple[Count, ...], Field(min_length=1)] = (64, 64)
+    hidden: Annotated[tuple[Count, ...], Field(min_length=1)] = (32, 32)
     """units of the hidden layers"""
     authority: Positive = 2.0
     """largest residual [m/s2]"""
@@ -38,18 +38,15 @@ class MultiStepSettings:
     """length of the stretches that are simulated"""
     batch: Count = 64
     """stretches in a gradient step"""
-    steps: Count = 1000
+    steps: Count = 120
     """gradient steps"""
     rate: Positive = 1e-3
     """learning rate of Adam, which falls to zero as a cosine"""
-    tolerance: Positive = 2.0
-    """errors of the gap beyond this count linearly, not by their square [m]: a driver who leaves a hundred
-    metres has other reasons than the car ahead"""
     speed_weight: NotNegative = 2.0
     """how much an error of the speed by 1 m/s counts beside one of the gap by 1 m"""
     residual_weight: NotNegative = 0.1
     """how much the squared residual counts: where data are silent, the base drives"""
-    validate_every: Count = 50
+    validate_every: Count = 20
     """gradient steps between two looks at the validation trajectories, which choose the weights"""
 
 
@@ -66,7 +63,7 @@ class MultiStepFit:
 def fit_multi_step(
     pairs: Sequence[Pair],
     validation: Sequence[Pair],
-    base: Follow,
+    base: Model,
     limits: Limits,
     settings: MultiStepSettings,
     seed: int,
@@ -80,7 +77,7 @@ def fit_multi_step(
     Args:
         pairs: to learn from.
         validation: of other drivers.
-        base: what is known; it answers torch tensors too.
+        base: what is known of drivers; it answers torch tensors too.
         limits: of the acceleration [m/s2].
         settings: of network and learning.
         seed: of the first weights and the order of the stretches.
@@ -118,13 +115,13 @@ def fit_multi_step(
     return MultiStepFit(network, found)
 
 
-def _judged(network: FollowingNetwork, base: Follow, limits: Limits, judged: Stretches) -> float:
-    drove = open_loop(model_with(network.as_driver(), base, limits), judged)
+def _judged(network: FollowingNetwork, base: Model, limits: Limits, judged: Stretches) -> float:
+    drove = open_loop(with_residual(base, on_rows(network.as_driver()), limits), judged)
     return float(np.sqrt(drove.gap_square).mean())
 
 
 def _loss(
-    network: FollowingNetwork, base: Follow, limits: Limits, real: Stretches, settings: MultiStepSettings
+    network: FollowingNetwork, base: Model, limits: Limits, real: Stretches, settings: MultiStepSettings
 ) -> Tensor:
     """Return the loss of driving behind the leaders of some stretches."""
     speeds, leader_speeds, gaps, paths = (
@@ -132,15 +129,16 @@ def _loss(
         for values in (real.speed, real.leader_speed, real.gap, real.leader_path)
     )
     present = torch.as_tensor(real.present)[1:]
-    residuals = []
+    residuals: list[Tensor] = []
 
-    def follow(speed: Tensor, leader_speed: Tensor, gap: Tensor) -> Tensor:
-        residuals.append(network(inputs_of(speed, leader_speed, gap)))
-        return clip(base(speed, leader_speed, gap) + residuals[-1], *limits)
+    def noted(inputs: Tensor) -> Tensor:
+        residuals.append(network(inputs))
+        return residuals[-1]
 
+    follow = with_residual(base, noted, limits)(speeds[0], gaps[0])
     driven = list(drive_behind(follow, (speeds[0], gaps[0]), (leader_speeds, paths), real.step))
-    speed, gap = (torch.stack(each)[present] for each in zip(*driven, strict=True))
-    gap_loss = smooth_l1_loss(gap, gaps[1:][present], beta=settings.tolerance)
-    speed_loss = smooth_l1_loss(speed, speeds[1:][present], beta=1.0)
-    left = torch.stack(residuals)[present].square().mean()
-    return gap_loss + settings.speed_weight * speed_loss + settings.residual_weight * left
+    speed, gap = (torch.stack(each) for each in zip(*driven, strict=True))
+    moments = present.sum(0)
+    squares = (gap - gaps[1:]).square() + (settings.speed_weight * (speed - speeds[1:])).square()
+    left = torch.stack(residuals).square()[present].mean()
+    return ((squares * present).sum(0) / moments + SMALLEST).sqrt().mean() + settings.residual_weight * left

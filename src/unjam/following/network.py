@@ -13,13 +13,9 @@ from torch import Tensor, nn
 
 from unjam.drivers.network import Network
 from unjam.errors import UnjamError
-from unjam.following.open_loop import Follow, Limits
+from unjam.following.open_loop import INPUTS, Follow, Residual, inputs_of
 from unjam.following.pairs import Floats, Rows
 from unjam.parameters import STRICT, Count, Positive
-from unjam.physics.arrays import Array, clip, stack_columns
-
-INPUTS = ("speed", "leader's speed minus own", "gap")
-"""what a network sees"""
 
 
 @checked_dataclass(frozen=True, config=STRICT)
@@ -38,11 +34,6 @@ class NetworkSettings:
     """passes without progress on the validation rows after which learning ends (the paper names none)"""
     authority: Positive = 8.0
     """largest acceleration that it may answer [m/s2]: no network answers what no car can do"""
-
-
-def inputs_of(speed: Array, leader_speed: Array, gap: Array) -> Array:
-    """Return what a network sees, shape (..., 3), SI units."""
-    return stack_columns((speed, leader_speed - speed, gap))
 
 
 class FollowingNetwork(nn.Module):
@@ -90,17 +81,13 @@ class FollowingNetwork(nn.Module):
         return Network(tuple(layers), self.authority)
 
 
-def network_follow(network: Network, base: Follow | None = None, limits: Limits | None = None) -> Follow:
-    """Return a network as a model of a driver, on a base if there is one, kept within `limits` [m/s2]."""
+def on_rows(network: Network) -> Residual:
+    """Return a network that drives as one that takes inputs of any shape (..., 3)."""
 
-    def follow(speed: Floats, leader_speed: Floats, gap: Floats) -> Floats:
-        columns = (np.ravel(each) for each in (speed, leader_speed, gap))
-        found = network(inputs_of(*columns)).reshape(np.shape(speed))
-        if base is not None:
-            found = found + base(speed, leader_speed, gap)
-        return found if limits is None else clip(found, *limits)
+    def answer(inputs: Floats) -> Floats:
+        return network(inputs.reshape(-1, len(INPUTS))).reshape(inputs.shape[:-1])
 
-    return follow
+    return answer
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from unjam.drivers.idm import SMALLEST_GAP
 from unjam.following.pairs import Floats, Stretches
-from unjam.physics.arrays import Array, at_least, clip
+from unjam.physics.arrays import Array, at_least, clip, namespace
 from unjam.physics.idm import IDMParameters, IDMRows, idm_acceleration
 from unjam.physics.kinematics import next_position, next_speed
 
@@ -23,7 +23,16 @@ Follow = Callable[[Array, Array, Array], Array]
 Model = Callable[[Array, Array], Follow]
 """a driver who takes over: (speed, gap) at that moment -> how it drives on"""
 
+Residual = Callable[[Array], Array]
+"""a network: what it sees, shape (..., 3) -> acceleration"""
 Limits = tuple[float, float]
+
+INPUTS = ("speed", "leader's speed minus own", "gap")
+"""what a network sees"""
+SLOWEST = 2.0
+"""speed below which a time headway is not to be told from the gap [m/s]: it counts as this"""
+HEADWAYS = (0.2, 6.0)
+"""what a time headway may be [s]"""
 
 
 def always(follow: Follow) -> Model:
@@ -39,6 +48,50 @@ def idm_follow(parameters: IDMParameters | IDMRows, limits: Limits | None = None
         return found if limits is None else clip(found, *limits)
 
     return follow
+
+
+def personal_idm(parameters: IDMParameters | IDMRows, kept: Array, limits: Limits | None = None) -> Model:
+    """Return an IDM that keeps a part of the headway with which a driver was found.
+
+    People differ most in the distance they keep. Of a driver nothing is known but the moment of taking over,
+    whose time headway T0 = (gap - s0) / v says a part of it: the driver's own T is T^(1 - kept) T0^kept.
+
+    Args:
+        parameters: of people in general.
+        kept: 0: all drive alike; 1: everybody keeps the headway of that moment.
+        limits: of the acceleration [m/s2].
+    """
+    p = parameters
+
+    def begin(speed: Array, gap: Array) -> Follow:
+        found = clip((gap - p.minimum_gap) / at_least(speed, SLOWEST), *HEADWAYS)
+        own = p.time_headway ** (1.0 - kept) * found**kept
+        searched = (p.max_acceleration, p.comfortable_deceleration, p.exponent, p.minimum_gap)
+        return idm_follow(IDMRows(p.desired_speed, own, *searched), limits)
+
+    return begin
+
+
+def with_residual(base: Model | None, network: Residual, limits: Limits | None = None) -> Model:
+    """Return a network on a base, or alone where there is none, kept within `limits` [m/s2]."""
+
+    def begin(speed: Array, gap: Array) -> Follow:
+        known = base(speed, gap) if base is not None else None
+
+        def follow(speed: Array, leader_speed: Array, gap: Array) -> Array:
+            found = network(inputs_of(speed, leader_speed, gap))
+            if known is not None:
+                found = found + known(speed, leader_speed, gap)
+            return found if limits is None else clip(found, *limits)
+
+        return follow
+
+    return begin
+
+
+def inputs_of(speed: Array, leader_speed: Array, gap: Array) -> Array:
+    """Return what a network sees, shape (..., 3), SI units: INPUTS."""
+    return namespace(gap).stack([speed, leader_speed - speed, gap], -1)
 
 
 def drive_behind(follow: Follow, start: tuple[Array, Array], leader: Any, step: float) -> Iterator[Any]:

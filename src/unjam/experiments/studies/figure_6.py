@@ -16,12 +16,11 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from unjam.experiments.manifest import manifest
-from unjam.experiments.studies.parts import Part, Told, measure_parts, read_part
-from unjam.files import make_folder, to_json, write_whole
+from unjam.experiments.studies.parts import Part, Told, about_study, measure_parts, read_part
+from unjam.files import to_json, write_whole
 from unjam.following.four_regimes import SMALLEST_GAP, FourRegimes, four_regimes
-from unjam.following.network import NetworkSettings, fit_one_step, network_follow
-from unjam.following.open_loop import idm_follow
+from unjam.following.network import NetworkSettings, fit_one_step, on_rows
+from unjam.following.open_loop import always, idm_follow, with_residual
 from unjam.following.pairs import SPLITS, Floats, Rows, of_split, rows_of, split_by_trajectory
 from unjam.physics.arrays import at_least
 from unjam.physics.idm import PAPER_IDM, idm_acceleration
@@ -169,8 +168,9 @@ def _learned(task: Task, training: Rows, rows: Parted) -> tuple[Floats, dict[str
         np.random.default_rng(0).permutation(len(rows.validation))[:VALIDATION_ROWS]
     )
     network, losses = fit_one_step(training, validation, base, NetworkSettings(), task.repeat)
-    follow = network_follow(network.as_driver(), base)
-    predicted = follow(rows.test.speed, rows.test.leader_speed, rows.test.gap)
+    model = with_residual(always(base) if base else None, on_rows(network.as_driver()))
+    test = rows.test
+    predicted = model(test.speed[:1], test.gap[:1])(test.speed, test.leader_speed, test.gap)
     facts = {
         "epochs": len(losses.training),
         "training_loss": losses.training,
@@ -199,8 +199,7 @@ def run(folder: Path, workers: int = 2, told: Told | None = None) -> None:
 
     The study goes on where it was stopped: what is measured lies in `folder/parts`.
     """
-    make_folder(folder)
-    about = manifest()
+    about = about_study(folder)
     parts: dict[str, Part] = {task.name: (measure, (task,)) for task in tasks()}
     measure_parts(folder / "parts", parts, workers, told)
     rows = [read_part(folder / "parts", name) for name in parts]

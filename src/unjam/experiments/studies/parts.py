@@ -7,12 +7,23 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any
 
+from unjam.experiments.manifest import manifest
 from unjam.files import make_folder, to_json, write_whole
+
+MANIFEST = "manifest.json"
 
 Part = tuple[Callable[..., Any], tuple[Any, ...]]
 """a function of a module, and its arguments; it answers what JSON can hold"""
 Told = Callable[[str], None]
 """told each part's name when it is there"""
+
+
+def about_study(folder: Path) -> dict[str, Any]:
+    """Return where a study comes from: its first call's manifest, also when it goes on later."""
+    make_folder(folder)
+    if not (folder / MANIFEST).is_file():
+        write_whole(folder / MANIFEST, to_json(manifest(), indent=1))
+    return json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
 
 
 def measure_parts(folder: Path, parts: dict[str, Part], workers: int, told: Told | None = None) -> None:
