@@ -1,7 +1,7 @@
-"""Measures models of drivers on field data: python results/field/field.py FOLDER NGSIM.parquet ASTAZERO.parquet.
+"""Measures models of drivers on field data: python results/field/field.py FOLDER NGSIM ASTAZERO [WORKERS].
 
-Under two hours on two cores. It may be stopped and called again: it goes on where it was. FOLDER gets field.json
-and field.png, which are copied into results/field/.
+NGSIM and ASTAZERO are tables (.parquet). Under two hours on two cores. It may be stopped and called again: it
+goes on where it was. FOLDER gets field.json and field.png, which are copied into results/field/.
 """
 
 import sys

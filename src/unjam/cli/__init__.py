@@ -14,6 +14,7 @@ from unjam.cli.bench import bench
 from unjam.cli.doctor import doctor
 from unjam.cli.drive import drive
 from unjam.cli.evaluate import evaluate
+from unjam.cli.fit_drivers import fit_drivers
 from unjam.cli.lists import drivers, scenarios
 from unjam.cli.model import model
 from unjam.cli.report import report
@@ -48,7 +49,7 @@ def _root(
     pass
 
 
-for verb in (scenarios, drivers, drive, train, evaluate, model, report, watch, bench, doctor):
+for verb in (scenarios, drivers, drive, train, evaluate, model, fit_drivers, report, watch, bench, doctor):
     app.command()(verb)
 
 

@@ -5,7 +5,7 @@ has to drive. Source of the method: Treiber and Kesting, Traffic Flow Dynamics (
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -42,7 +42,7 @@ class CalibrationSettings:
     """within which the acceleration is kept [m/s2]: where a gap is nearly used up the IDM alone brakes beyond
     all bounds"""
     seconds: Positive = 120.0
-    """longer trajectories are cut into stretches of this length, each of which starts with the recorded gap"""
+    """longer trajectories are cut into stretches of this length, each starting with the recorded gap"""
     candidates: Count = 8
     """sets of parameters that are tried at once, for each of the five parameters"""
     generations: Count = 100
@@ -120,13 +120,21 @@ def calibrate(pairs: Sequence[Pair], settings: CalibrationSettings | None = None
 
 def calibrate_each(
     groups: Sequence[Sequence[Pair]],
+    typical: IDMParameters,
+    own: Sequence[str],
     settings: CalibrationSettings | None = None,
     told: Callable[[int], None] | None = None,
 ) -> list[Calibrated]:
-    """Return a calibration of each group of pairs, for instance of each driver; `told` counts them."""
+    """Return a calibration of each group of pairs, for instance of each driver.
+
+    Only the parameters `own` are searched, the others are those of `typical`: a minute of driving tells the
+    distance that somebody keeps, but not how fast they would like to be on an empty road. `told` counts.
+    """
+    fixed = {name: (getattr(typical, name),) * 2 for name in SEARCHED if name not in own}
+    searching = replace(settings or CalibrationSettings(), **fixed)
     found = []
     for number, pairs in enumerate(groups, 1):
-        found.append(calibrate(pairs, settings))
+        found.append(calibrate(pairs, searching))
         if told is not None:
             told(number)
     return found
@@ -155,4 +163,4 @@ def gap_objective(stretches: Stretches, limits: Limits, every: str) -> Callable[
 
 def _at_an_end(value: float, within: Range) -> bool:
     low, high = within
-    return min(value - low, high - value) < 0.01 * (high - low)
+    return low < high and min(value - low, high - value) < 0.01 * (high - low)

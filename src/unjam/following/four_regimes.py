@@ -6,10 +6,9 @@ one seed.
 """
 
 from dataclasses import field
-from typing import Annotated
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import model_validator
 from pydantic.dataclasses import dataclass
 
 from unjam.following.pairs import Floats, Pair
@@ -56,7 +55,7 @@ class FourRegimes:
     """cruising: leader's speed minus the follower's at the start, uniform [m/s]"""
     emergency_slower: Range = (4.0, 15.0)
     """emergency braking: by how much the leader is slower at the start, uniform [m/s]"""
-    acceleration: Annotated[Range, Field(description="start")] = (0.1, 0.5)
+    acceleration: Range = (0.1, 0.5)
     """acceleration: of the follower at the start, as a share of what an empty road would give, uniform"""
     deceleration: Range = (-2.0, 0.0)
     """deceleration: of the follower at the start, uniform [m/s2] (the paper)"""
@@ -68,8 +67,8 @@ class FourRegimes:
     def _possible(self) -> "FourRegimes":
         if self.speed[1] >= self.driver.desired_speed:
             raise ValueError(
-                f"speed: {self.speed[1]} m/s is not allowed at the start; allowed: below the driver's desired "
-                f"speed, {self.driver.desired_speed} m/s"
+                f"speed: {self.speed[1]} m/s is not allowed at the start; allowed: below the driver's "
+                f"desired speed, {self.driver.desired_speed} m/s"
             )
         return self
 

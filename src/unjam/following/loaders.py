@@ -64,7 +64,7 @@ def read_pairs(path: Path, format: str = "", reading: Reading | None = None) -> 
 
 
 def read_table(frame: pd.DataFrame, about: dict[str, str], path: Path, reading: Reading) -> Recorded:
-    """Return the trajectories of a plain table: the columns COLUMNS, and OPTIONAL where there are such."""
+    """Return the trajectories of a plain table with the columns COLUMNS, and OPTIONAL if there are such."""
     renamed = {other: name for name, others in ALIASES.items() for other in others if name not in frame}
     frame = frame.rename(columns=renamed)
     _check_columns(frame, COLUMNS, path)

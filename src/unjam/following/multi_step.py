@@ -10,15 +10,17 @@ from typing import Annotated
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from pydantic import Field
 from pydantic.dataclasses import dataclass as checked_dataclass
 from torch import Tensor
 
 from unjam.errors import UnjamError
 from unjam.following.network import FollowingNetwork, NetworkSettings, on_rows
-from unjam.following.open_loop import Limits, Model, drive_behind, open_loop, with_residual
+from unjam.following.open_loop import Limits, Model, drive_behind, open_loop, personal_idm, with_residual
 from unjam.following.pairs import Pair, Stretches, rows_of, stretches_of
 from unjam.parameters import STRICT, Count, NotNegative, Positive
+from unjam.physics.idm import IDMParameters, IDMRows, parameter_rows
 
 SMALLEST = 1e-2
 """what is added to a mean square before its root [m2]: a perfect trajectory has no infinite slope"""
@@ -60,24 +62,40 @@ class MultiStepFit:
     first is the base's"""
 
 
+@dataclass(frozen=True)
+class Known:
+    """Trajectories, and what is known of who drove them before a residual is learned."""
+
+    pairs: Sequence[Pair]
+    drivers: Sequence[IDMParameters]
+    """of each trajectory"""
+    kept_headway: float = 0.0
+    """of `personal_idm`"""
+
+    def model(self, owner: NDArray[np.int64], limits: Limits, tensors: bool = False) -> Model:
+        """Return the base of stretches that are of the trajectories `owner`; for NumPy or for torch."""
+        rows = parameter_rows([self.drivers[number] for number in owner])
+        if tensors:
+            rows = IDMRows(*(torch.as_tensor(values, dtype=torch.float32) for values in rows))
+        return personal_idm(rows, self.kept_headway, limits)
+
+
 def fit_multi_step(
-    pairs: Sequence[Pair],
-    validation: Sequence[Pair],
-    base: Model,
+    known: Known,
+    validation: Known,
     limits: Limits,
     settings: MultiStepSettings,
     seed: int,
     told: Callable[[int], None] | None = None,
 ) -> MultiStepFit:
-    """Return a residual on `base` that makes the simulated gaps those of `pairs`.
+    """Return a residual on what is known that makes the simulated gaps those of the trajectories.
 
     It starts at zero, so that what drives at first is the base alone, and ends with the weights that were
     best on whole trajectories of `validation`; these may be the first.
 
     Args:
-        pairs: to learn from.
+        known: to learn from.
         validation: of other drivers.
-        base: what is known of drivers; it answers torch tensors too.
         limits: of the acceleration [m/s2].
         settings: of network and learning.
         seed: of the first weights and the order of the stretches.
@@ -88,16 +106,18 @@ def fit_multi_step(
     """
     torch.set_num_threads(1)
     shape = NetworkSettings(hidden=settings.hidden, authority=settings.authority)
-    network = FollowingNetwork(shape, rows_of(pairs), seed, zero=True)
-    stretches, judged = stretches_of(pairs, settings.seconds), stretches_of(validation)
+    network = FollowingNetwork(shape, rows_of(known.pairs), seed, zero=True)
+    stretches, judged = stretches_of(known.pairs, settings.seconds), stretches_of(validation.pairs)
     optimizer = torch.optim.Adam(network.parameters(), lr=settings.rate)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, settings.steps)
     generator = np.random.default_rng(seed)
+    base = validation.model(judged.owner, limits)
     found = [_judged(network, base, limits, judged)]
     kept = {name: value.clone() for name, value in network.state_dict().items()}
     for step in range(1, settings.steps + 1):
         chosen = generator.choice(stretches.gap.shape[1], settings.batch)
-        loss = _loss(network, base, limits, stretches.some(chosen), settings)
+        part = stretches.some(chosen)
+        loss = _loss(network, known.model(part.owner, limits, tensors=True), limits, part, settings)
         if not torch.isfinite(loss):
             raise UnjamError(f"following network: the loss of step {step} is not finite")
         optimizer.zero_grad()

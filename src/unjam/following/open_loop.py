@@ -97,6 +97,9 @@ def inputs_of(speed: Array, leader_speed: Array, gap: Array) -> Array:
 def drive_behind(follow: Follow, start: tuple[Array, Array], leader: Any, step: float) -> Iterator[Any]:
     """Yield (speed, gap) after each step of driving behind a recorded leader.
 
+    Who uses the gap up touches the leader and is no faster, until it brakes: without that, a network that has
+    driven through its leader would be asked what nobody can know.
+
     Args:
         follow: who drives.
         start: speed [m/s] and gap [m] at the first moment, shape (..., n).
@@ -110,6 +113,10 @@ def drive_behind(follow: Follow, start: tuple[Array, Array], leader: Any, step: 
         speed = next_speed(speed, acceleration, step)
         position = next_position(position, speed, step)
         gap = paths[moment + 1] - position
+        touches, xp = gap <= 0.0, namespace(gap)
+        gap = at_least(gap, 0.0)
+        position = paths[moment + 1] - gap
+        speed = xp.where(touches & (speed > leader_speeds[moment + 1]), leader_speeds[moment + 1], speed)
         yield speed, gap
 
 

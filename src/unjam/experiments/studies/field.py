@@ -1,8 +1,8 @@
 """Models of drivers on field data: one step ahead, and driving on behind a recorded leader.
 
-The data are the user's files: the reconstructed NGSIM I-80 as leader-follower pairs with a published split, and
-OpenACC's AstaZero platoons, as tables with the columns of `unjam.following.loaders`. AstaZero has no published
-split; here one day (or platoon) is for learning, another for judging.
+The data are the user's files: the reconstructed NGSIM I-80 as leader-follower pairs with a published split,
+and OpenACC's AstaZero platoons, as plain tables (`unjam.following.loaders`). AstaZero has no published split;
+here one day (or platoon) is for learning, another for judging.
 """
 
 from collections.abc import Callable, Sequence
@@ -15,9 +15,9 @@ import numpy as np
 
 from unjam.experiments.studies.parts import Part, Told, about_study, measure_parts, read_part
 from unjam.files import to_json, write_whole
-from unjam.following.calibration import CalibrationSettings, calibrate, calibrate_each
+from unjam.following.calibration import SEARCHED, CalibrationSettings, calibrate, calibrate_each
 from unjam.following.loaders import Reading, read_pairs
-from unjam.following.multi_step import MultiStepSettings, fit_multi_step
+from unjam.following.multi_step import Known, MultiStepSettings, fit_multi_step
 from unjam.following.network import NetworkSettings, fit_one_step, on_rows
 from unjam.following.open_loop import (
     Follow,
@@ -31,7 +31,7 @@ from unjam.following.open_loop import (
     with_residual,
 )
 from unjam.following.pairs import Pair, Stretches, of_split, rows_of, split_by_trajectory, stretches_of
-from unjam.physics.idm import PAPER_IDM, IDMParameters, parameter_rows
+from unjam.physics.idm import PAPER_IDM, parameter_rows
 
 LIMITS: Limits = (-4.0, 2.0)
 SEEDS = 3
@@ -47,8 +47,9 @@ DRAWS = 2000
 IDMS = ("paper's IDM", "paper's IDM, clipped", "IDM, every moment", "IDM", "IDM, headway kept")
 NETWORKS = ("vanilla", "knowledge, paper's IDM", "knowledge, paper's IDM clipped", "knowledge, IDM")
 MULTI_STEPS = ("IDM + multi-step", "IDM, headway kept + multi-step")
-EACH = "IDM, each driver"
-"""calibrated on the first half of each test trajectory: judged on the second halves alone"""
+OWN = {"IDM, own headway": ("time_headway",), "IDM, all own": SEARCHED}
+"""what is each driver's own, calibrated on the first half of each test trajectory: judged on the second halves
+alone"""
 
 
 @dataclass(frozen=True)
@@ -58,6 +59,8 @@ class Data:
     learn: list[Pair]
     test: dict[str, list[Pair]]
     """by name; the first is the main one"""
+    whole: bool = False
+    """whether trajectories are judged whole, or in stretches"""
 
 
 @dataclass(frozen=True)
@@ -80,7 +83,9 @@ class Task:
 def _ngsim(path: Path) -> Data:
     pairs = read_pairs(path, "table", Reading(driver=("period", "follower"))).pairs
     others = of_split(pairs, "extra")
-    return Data(of_split(pairs, "paper_train"), {"test": of_split(pairs, "paper_test"), "others": others})
+    return Data(
+        of_split(pairs, "paper_train"), {"test": of_split(pairs, "paper_test"), "others": others}, True
+    )
 
 
 def _astazero(kind: str, learn: Sequence[str], test: Sequence[str]) -> Callable[[Path], Data]:
@@ -119,7 +124,7 @@ def tasks(files: dict[str, str]) -> list[Task]:
     found = []
     for data in DATA:
         file = files[data.partition("-")[0]]
-        found += [Task(data, file, model) for model in (*IDMS, EACH)]
+        found += [Task(data, file, model) for model in (*IDMS, *OWN)]
         found += [Task(data, file, model, seed) for seed in range(SEEDS) for model in NETWORKS]
         multi_steps = MULTI_STEPS if data == "ngsim" else MULTI_STEPS[1:]
         found += [Task(data, file, model, seed) for seed in range(SEEDS) for model in multi_steps]
@@ -129,14 +134,14 @@ def tasks(files: dict[str, str]) -> list[Task]:
 def measure(task: Task) -> dict[str, Any]:
     """Return what a model is worth on each test set, trajectory by trajectory."""
     data = data_of(task.data, task.file)
-    if task.model == EACH:
-        model, facts = _each(next(iter(data.test.values())))
+    if task.model in OWN:
+        model, facts = _each(data, OWN[task.model])
         judged = {"second halves": model}
     else:
         made, facts = _made(task, data)
         judged = dict.fromkeys([*data.test, "second halves"], made)
     tests = {**data.test, "second halves": halves(next(iter(data.test.values())))[1]}
-    longest = None if task.data == "ngsim" else STRETCH
+    longest = None if data.whole else STRETCH
     found = {name: judge(model, stretches_of(tests[name], longest)) for name, model in judged.items()}
     return {"data": task.data, "model": task.model, "seed": task.seed, **facts, "tests": found}
 
@@ -183,11 +188,14 @@ def _made(task: Task, data: Data) -> tuple[Model, dict[str, Any]]:
     learn, validation = of_split(chosen, "train"), of_split(chosen, "validation")
     if task.model in MULTI_STEPS:
         # The base must not have seen who decides whether a residual is better than none.
-        base = calibrate(learn, _calibration(task.model.removesuffix(" + multi-step"))).model(LIMITS)
-        fitted = fit_multi_step(learn, validation, base, LIMITS, MULTI_STEP, task.seed)
+        found = calibrate(learn, _calibration(task.model.removesuffix(" + multi-step")))
+        known, judges = (
+            Known(pairs, [found.parameters] * len(pairs), found.kept_headway) for pairs in (learn, validation)
+        )
+        fitted = fit_multi_step(known, judges, LIMITS, MULTI_STEP, task.seed)
         best = int(np.argmin(fitted.validation)) * MULTI_STEP.validate_every
         facts = {"validation": fitted.validation, "best_step": best}
-        return with_residual(base, on_rows(fitted.network.as_driver()), LIMITS), facts
+        return with_residual(found.model(LIMITS), on_rows(fitted.network.as_driver()), LIMITS), facts
     base = _base(task.model, learn)
     rows, judges = rows_of(learn), rows_of(validation)
     apart = ROWS_APART[task.data.partition("-")[0]]
@@ -211,13 +219,16 @@ def _calibration(model: str) -> CalibrationSettings:
     return replace(settings, kept_headway=(0.0, 1.0)) if "headway kept" in model else settings
 
 
-def _each(pairs: Sequence[Pair]) -> tuple[Model, dict[str, Any]]:
-    """Return the IDM of each driver, calibrated on the first half of its trajectory."""
-    found = calibrate_each([[pair] for pair in halves(pairs)[0]], _calibration("IDM"))
-    longest = None if pairs[0].seconds < STRETCH else STRETCH
-    owner = stretches_of(halves(pairs)[1], longest).owner
-    drivers: list[IDMParameters] = [found[number].parameters for number in owner]
-    return personal_idm(parameter_rows(drivers), 0.0, LIMITS), {"calibrated": [asdict(one) for one in found]}
+def _each(data: Data, own: Sequence[str]) -> tuple[Model, dict[str, Any]]:
+    """Return IDMs of which some parameters are calibrated on the first half of each test trajectory."""
+    settings = _calibration("IDM")
+    first, second = halves(next(iter(data.test.values())))
+    typical = calibrate(data.learn, settings).parameters
+    found = calibrate_each([[pair] for pair in first], typical, own, settings)
+    longest = None if data.whole else STRETCH
+    owner = stretches_of(second, longest).owner
+    model = personal_idm(parameter_rows([found[number].parameters for number in owner]), 0.0, LIMITS)
+    return model, {"calibrated": [asdict(one) for one in found]}
 
 
 def run(folder: Path, ngsim: Path, astazero: Path, workers: int = 2, told: Told | None = None) -> None:
@@ -238,7 +249,7 @@ def run(folder: Path, ngsim: Path, astazero: Path, workers: int = 2, told: Told 
 
 
 def summary(parts: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return a row for each model, test set and seed: errors with bootstrap intervals over the trajectories."""
+    """Return a row for each model, test set and seed: errors, intervals from a bootstrap over trajectories."""
     rows = []
     for part in parts:
         facts = {key: value for key, value in part.items() if key != "tests"}
