@@ -33,8 +33,8 @@ class FitDriversSettings:
 
     calibration: CalibrationSettings = field(default_factory=CalibrationSettings)
     own: Annotated[tuple[str, ...], Field(min_length=1)] = ("time_headway",)
-    """parameters of the IDM that each driver has for itself; the others are those that suit all. On NGSIM, with
-    a minute of each driver, own headways predicted the other half of the way better than one IDM for all, and
+    """parameters of the IDM that each driver has for itself; the others are those that suit all. On NGSIM,
+    with half a minute of each driver, own headways predict the next half better than one IDM for all, and
     all parameters own far worse"""
     residual: bool = False
     """whether a network learns what all drivers do beside their own IDM, from simulated driving"""

@@ -156,8 +156,8 @@ def _behind_leaders(vehicles: pd.DataFrame, path: Path, reading: Reading) -> Rec
     typical = float(vehicles["length"].median())
     if not low <= typical <= high:
         raise InputError(
-            f"{path.name}: half of the vehicles are longer than {typical:.1f} m; allowed: {low:g} to {high:g} "
-            "m: the units are not those of this format"
+            f"{path.name}: the median length of its vehicles would be {typical:.1f} m; allowed: {low:g} to "
+            f"{high:g} m; are the units those of this format?"
         )
     leaders = vehicles[["place", "time", "vehicle", "front", "speed", "length"]]
     leaders = leaders.drop_duplicates(["place", "time", "vehicle"])

@@ -108,7 +108,7 @@ def _bad_rows(frame: pd.DataFrame) -> list[BadRow]:
         allowed = f"{low:g} to {high:g}" if name in ALLOWED else "finite"
         for line, value in zip(frame["line"][wrong], values[wrong], strict=True):
             found.setdefault(int(line), f"{name}: {value:g} is not allowed; allowed: {allowed}")
-    twice = frame.duplicated(["pair", "time"])
+    twice = frame.assign(time=frame["time"].round(6)).duplicated(["pair", "time"])
     for line, time in zip(frame["line"][twice], frame["time"][twice], strict=True):
         found.setdefault(int(line), f"time: {time:g} is there twice in its pair")
     return [BadRow(line, found[line]) for line in sorted(found)]

@@ -2,8 +2,8 @@
 
 A network alone (`vanilla`) and one that learns what the paper's IDM leaves (`knowledge`) are trained on
 shares of the four-regime set, and judged on trajectories that neither has seen, the same for all. The paper
-is silent on who made its data. Here it is either a driver of other parameters than the paper's IDM (`other`), or
-that very IDM (`same`), so that the base is the truth.
+is silent on who made its data. Here it is either a driver of other parameters than the paper's IDM (`other`),
+or that very IDM (`same`), so that the base is the truth.
 """
 
 from collections.abc import Sequence
