@@ -1,13 +1,14 @@
-"""Measures Fig. 6 anew: python results/figure-6/figure_6.py FOLDER. Under half an hour on two cores.
+"""Measures Fig. 6 anew: python results/figure-6/figure_6.py FOLDER [WORKERS [REPEATS]].
 
-It may be stopped and called again: it goes on where it was. FOLDER gets figure-6.json and figure-6.png, which
-are copied into results/figure-6/.
+Under half an hour on two cores. It may be stopped and called again: it goes on where it was. FOLDER gets
+figure-6.json and figure-6.png, which are copied into results/figure-6/.
 """
 
 import sys
 from pathlib import Path
 
-from unjam.experiments.studies.figure_6 import run
+from unjam.experiments.studies.figure_6 import REPEATS, run
 
 if __name__ == "__main__":
-    run(Path(sys.argv[1]), workers=int(sys.argv[2]) if len(sys.argv) > 2 else 2, told=print)
+    workers, repeats = [*map(int, sys.argv[2:]), *(2, REPEATS)[len(sys.argv) - 2 :]]
+    run(Path(sys.argv[1]), workers, print, repeats)

@@ -69,8 +69,10 @@ def test_tensors_drive_as_arrays_do() -> None:
     start = (pair.speed[:1], pair.gap[:1])
     model = personal_idm(PAPER_IDM, 0.4, (-4.0, 2.0))
     arrays = list(drive_behind(model(*start), start, leader, 0.1))
-    start, leader = (tuple(map(torch.as_tensor, both)) for both in (start, leader))
-    tensors = list(drive_behind(model(*start), start, leader, 0.1))
+    speed, gap = map(torch.as_tensor, start)
+    tensors = list(
+        drive_behind(model(speed, gap), (speed, gap), [torch.as_tensor(one) for one in leader], 0.1)
+    )
     for one, other in zip(arrays, tensors, strict=True):
         np.testing.assert_allclose(other[1].numpy(), one[1])
 

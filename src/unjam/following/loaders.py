@@ -73,7 +73,7 @@ def read_table(frame: pd.DataFrame, about: dict[str, str], path: Path, reading: 
             _check_columns(frame, columns, path)
             frame[name] = _joined(frame, columns)
     kept = ["line", *COLUMNS, *(name for name in OPTIONAL if name in frame)]
-    return trajectories_of(_numbers(frame[kept], COLUMNS[1:]), path, reading.cut_bad, reading.shortest)
+    return trajectories_of(_numbers(frame.loc[:, kept], COLUMNS[1:]), path, reading.cut_bad, reading.shortest)
 
 
 def read_ngsim(frame: pd.DataFrame, about: dict[str, str], path: Path, reading: Reading) -> Recorded:
@@ -129,7 +129,7 @@ def read_openacc(frame: pd.DataFrame, about: dict[str, str], path: Path, reading
     for number in numbers:
         columns = ["Time", f"Speed{number}", f"Speed{number + 1}", f"IVS{number}"]
         _check_columns(frame, columns, path)
-        part = _numbers(frame[["line", *columns]], columns)
+        part = _numbers(frame.loc[:, ["line", *columns]], columns)
         part.columns = ["line", "time", "leader_speed", "speed", "gap"]
         driven = f"Driver{number + 1}"
         kind = frame[driven].astype(str) if driven in frame else pd.Series("", frame.index)
@@ -153,14 +153,14 @@ FORMATS: dict[str, Callable[[pd.DataFrame, dict[str, str], Path, Reading], Recor
 def _behind_leaders(vehicles: pd.DataFrame, path: Path, reading: Reading) -> Recorded:
     """Return the trajectories of a table of single vehicles, each of which names its leader."""
     low, high = VEHICLE_LENGTHS
-    typical = float(vehicles["length"].median())
+    typical = float(np.nanmedian(vehicles["length"]))
     if not low <= typical <= high:
         raise InputError(
             f"{path.name}: the median length of its vehicles would be {typical:.1f} m; allowed: {low:g} to "
             f"{high:g} m; are the units those of this format?"
         )
-    leaders = vehicles[["place", "time", "vehicle", "front", "speed", "length"]]
-    leaders = leaders.drop_duplicates(["place", "time", "vehicle"])
+    leaders = vehicles.loc[:, ["place", "time", "vehicle", "front", "speed", "length"]]
+    leaders = leaders.drop_duplicates(subset=["place", "time", "vehicle"])
     joined = vehicles.merge(
         leaders,
         left_on=["place", "time", "leader"],
@@ -169,7 +169,7 @@ def _behind_leaders(vehicles: pd.DataFrame, path: Path, reading: Reading) -> Rec
         suffixes=("", "_ahead"),
     )
     alone = joined["front_ahead"].isna() & joined["front"].notna()
-    joined = joined[~alone]
+    joined = joined.loc[~alone]
     name = _joined(joined, ("place", "vehicle", "leader", "lane"))
     frame = pd.DataFrame(
         {
@@ -183,7 +183,7 @@ def _behind_leaders(vehicles: pd.DataFrame, path: Path, reading: Reading) -> Rec
             "gap": joined["front_ahead"] - joined["length_ahead"] - joined["front"],
         }
     )
-    left_out = {"nobody ahead, or not recorded": int(alone.sum())}
+    left_out = {"nobody ahead, or not recorded": int(np.count_nonzero(alone))}
     return trajectories_of(frame, path, reading.cut_bad, reading.shortest, left_out)
 
 

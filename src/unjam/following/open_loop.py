@@ -155,7 +155,7 @@ def open_loop(model: Model, stretches: Stretches) -> OpenLoop:
         gap,
         (np.square(speed - stretches.speed) * present).sum(0) / moments,
         (np.square(gap - stretches.gap) * present).sum(0) / moments,
-        ((gap <= 0.0) & present).any(0),
+        np.any((gap <= 0.0) & present, axis=0),
         moments,
         stretches.owner,
     )

@@ -111,9 +111,15 @@ class Stretches:
     def some(self, chosen: NDArray[np.int64]) -> "Stretches":
         """Return the chosen stretches, as long as the longest of them."""
         long = int(self.present[:, chosen].sum(0).max())
-        arrays = (self.speed, self.leader_speed, self.gap, self.leader_path, self.present)
-        values = (array[:long, chosen] for array in arrays)
-        return Stretches(*values, self.step, self.owner[chosen])
+        return Stretches(
+            self.speed[:long, chosen],
+            self.leader_speed[:long, chosen],
+            self.gap[:long, chosen],
+            self.leader_path[:long, chosen],
+            self.present[:long, chosen],
+            self.step,
+            self.owner[chosen],
+        )
 
 
 def stretches_of(pairs: Sequence[Pair], seconds: float | None = None) -> Stretches:

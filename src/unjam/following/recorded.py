@@ -77,22 +77,24 @@ def trajectories_of(
     if bad and not cut_bad:
         more = f" ({len(bad)} bad rows)" if len(bad) > 1 else ""
         raise InputError(f"{path.name}: line {bad[0].line}: {bad[0].why}{more}; --cut-bad leaves them out")
-    good = frame[~frame["line"].isin([row.line for row in bad])]
-    good = good.sort_values(["pair", "time"], kind="stable")
+    good = frame.loc[~frame["line"].isin([row.line for row in bad])]
+    good = good.sort_values(by=["pair", "time"], kind="stable")
     step = _step(good)
     runs = _runs(good, step)
-    pairs, short = [], 0
-    for (name, _), rows in good.groupby([good["pair"], runs], sort=False):
+    pairs: list[Pair] = []
+    parts: dict[str, int] = {}
+    short = 0
+    for _, rows in good.groupby(runs, sort=False):
         if (len(rows) - 1) * step < shortest or len(rows) < 2:
             short += len(rows)
             continue
         first = rows.iloc[0]
+        pair = str(first["pair"])
         speed, leader_speed, gap = (rows[name].to_numpy(np.float64) for name in COLUMNS[2:])
         driver, kind, split = (str(first[name]) if name in rows else "" for name in OPTIONAL)
-        number = "" if len(pairs) == 0 or pairs[-1].name.partition("/")[0] != str(name) else f"/{len(pairs)}"
-        pairs.append(
-            Pair(f"{name}{number}", driver or str(name), step, speed, leader_speed, gap, kind, split)
-        )
+        parts[pair] = parts.get(pair, 0) + 1
+        name = pair if parts[pair] == 1 else f"{pair}/{parts[pair]}"
+        pairs.append(Pair(name, driver or pair, step, speed, leader_speed, gap, kind, split))
     if not pairs:
         raise InputError(f"{path.name}: no trajectory lasts {shortest:g} s")
     why = {**(left_out or {}), f"trajectories shorter than {shortest:g} s": short}

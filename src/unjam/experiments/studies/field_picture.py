@@ -53,6 +53,7 @@ def _dots(
     axes: Axes, rows: Sequence[dict[str, Any]], name: str, colour: str, shift: float, label: str
 ) -> None:
     """Draw each seed as a dot with its interval; who collides has an open one."""
+    labelled = False
     for place, model in enumerate(list(NAMES)[::-1]):
         found = [row for row in rows if row["model"] == model]
         for seed, row in enumerate(found):
@@ -66,5 +67,6 @@ def _dots(
                 ms=4.5,
                 color=colour,
                 mfc="white" if row["collided"] else colour,
-                label=label if (place, seed) == (0, 0) else None,
+                label=None if labelled else label,
             )
+            labelled = True

@@ -77,28 +77,29 @@ class Parted(NamedTuple):
     """share of the test rows that are also training rows"""
 
 
-def tasks() -> list[Task]:
+def tasks(repeats: int = REPEATS) -> list[Task]:
     """Return all fits of the study, the most telling first."""
+    fewer = min(FEWER_REPEATS, repeats)
     main = [
         Task("other", network, size, repeat)
-        for repeat in range(REPEATS)
+        for repeat in range(repeats)
         for size in SIZES
         for network in NETWORKS
     ]
     longer = [
         Task("other", network, SIZES[0], repeat, longer=True)
-        for repeat in range(FEWER_REPEATS)
+        for repeat in range(fewer)
         for network in NETWORKS
     ]
     same = [
         Task("same", network, size, repeat)
-        for repeat in range(FEWER_REPEATS)
+        for repeat in range(fewer)
         for size in SIZES[:2]
         for network in NETWORKS
     ]
     leaking = [
         Task("other", network, size, repeat, split)
-        for repeat in range(FEWER_REPEATS)
+        for repeat in range(fewer)
         for split in ("rows", "released")
         for size in LEAKING_SIZES
         for network in NETWORKS
@@ -181,12 +182,12 @@ def _learned(task: Task, training: Rows, rows: Parted) -> tuple[Floats, dict[str
 
 def _nearest(training: Rows, test: Rows) -> Floats:
     """Return the acceleration of the training row that is most similar to each test row."""
-    from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
 
     seen = np.column_stack([training.speed, training.leader_speed, training.gap])
     scale = seen.std(0)
     wanted = np.column_stack([test.speed, test.leader_speed, test.gap])
-    _, places = cKDTree(seen / scale).query(wanted / scale)
+    _, places = KDTree(seen / scale).query(wanted / scale)
     return training.acceleration[np.asarray(places, np.int64)]
 
 
@@ -194,13 +195,13 @@ def _root(error: NDArray[np.float64]) -> float:
     return float(np.sqrt(np.square(error).mean()))
 
 
-def run(folder: Path, workers: int = 2, told: Told | None = None) -> None:
+def run(folder: Path, workers: int = 2, told: Told | None = None, repeats: int = REPEATS) -> None:
     """Measure what is missing, and write `figure-6.json` and `figure-6.png` into `folder`.
 
     The study goes on where it was stopped: what is measured lies in `folder/parts`.
     """
     about = about_study(folder)
-    parts: dict[str, Part] = {task.name: (measure, (task,)) for task in tasks()}
+    parts: dict[str, Part] = {task.name: (measure, (task,)) for task in tasks(repeats)}
     measure_parts(folder / "parts", parts, workers, told)
     rows = [read_part(folder / "parts", name) for name in parts]
     write_whole(folder / "figure-6.json", to_json({"manifest": about, "rows": _small(rows)}, indent=1))
