@@ -53,24 +53,15 @@ def fit_drivers(
 
       unjam drive ring-jammed -d human -d pi --humans drivers.json
     """
-    from unjam.cli.output import aside, bar, console, print_json
+    from unjam.cli.output import Counted, aside, console, print_json
     from unjam.experiments.fit_drivers import fit_from_files
     from unjam.scenarios.population import write_population
 
     changes: dict[str, Any] = {"residual": residual, "seed": seed, **assignments(settings)}
     columns = tuple(name for name in driver.split(",") if name)
-    with bar() as shown:
-        task = shown.add_task("calibrating drivers", total=None)
-        found = fit_from_files(
-            data,
-            changes,
-            format,
-            cut_bad,
-            columns,
-            dict(_pairs(only)),
-            out,
-            told=lambda done, of: shown.update(task, completed=done, total=of),
-        )
+    with Counted("calibrating drivers") as told:
+        chosen = {name: str(value) for name, value in assignments(only).items()}
+        found = fit_from_files(data, changes, format, cut_bad, columns, chosen, out, told)
     write_population(out, found.population)
     if json:
         print_json({"population": str(out), "read": found.words, **found.facts()})
@@ -81,10 +72,6 @@ def fit_drivers(
     for line in found.verdict():
         console.print(line)
     aside.print(f"population: {out}")
-
-
-def _pairs(texts: list[str] | None) -> list[tuple[str, str]]:
-    return [(name, str(value)) for name, value in assignments(texts).items()]
 
 
 def _table(population: Any) -> Any:
