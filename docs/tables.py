@@ -46,48 +46,49 @@ def mean_of(name: str, driver: str, metric: str) -> float:
     return estimate([row[metric] for row in rows_of(name)[driver]]).mean
 
 
-KNOWLEDGE = "model/knowledge.json"
-
-
 def knowledge_rows(road: str) -> pd.DataFrame:
     """Return what the study of knowledge measured on a road: a row per model, number of steps and seed."""
-    rows = [row for row in json.loads((RESULTS / KNOWLEDGE).read_text())["rows"] if row["road"] == road]
-    return pd.json_normalize(rows)
+    rows = json.loads((RESULTS / "model/knowledge.json").read_text())["rows"]
+    return pd.json_normalize([row for row in rows if row["road"] == road])
 
 
-def knowledge_of(road: str, columns: dict[str, str]) -> pd.DataFrame:
-    """Return a table of the study of knowledge: mean over the seeds, with the smallest and the largest.
+def knowledge_of(road: str, columns: dict[str, str], ranges: bool = True) -> pd.DataFrame:
+    """Return a table of the study of knowledge: mean over the seeds, and the smallest and the largest.
 
     `columns` has the names of what was measured, with their headings.
     """
     table = []
     for (steps, model), rows in knowledge_rows(road).groupby(["steps", "model"], sort=False):
-        cells = {"actual steps": f"{steps:,}" if steps else "none", "model": model}
+        cells = {road: f"{steps:,} steps" if steps else "no data", "": model}
         for name, heading in columns.items():
             values = rows[name]
             cells[heading] = error_text(values.mean())
-            if len(values) > 1:
+            if ranges and len(values) > 1:
                 cells[heading] += f" [{error_text(values.min())}, {error_text(values.max())}]"
         table.append(cells)
-    return pd.DataFrame(table)
+    return pd.DataFrame(table).sort_values(road, key=lambda texts: texts.map(_steps_of), kind="stable")
 
 
-def knowledge_gain(road: str, name: str) -> pd.DataFrame:
-    """Return by how much an error is smaller with IDM + residual than with networks alone, same data."""
-    rows = knowledge_rows(road)
+def knowledge_gain(roads: Sequence[str], columns: dict[str, str]) -> pd.DataFrame:
+    """Return by how much errors are smaller with IDM + residual than with networks alone, same data paired.
+
+    In brackets the seeds of which that is true.
+    """
     table = []
-    for steps, found in rows[rows["steps"] > 0].groupby("steps"):
-        errors = found.pivot(index="seed", columns="model", values=name)
-        less = 1.0 - errors["IDM + residual"] / errors["networks alone"]
-        table.append(
-            {
-                "road": road,
-                "actual steps": f"{steps:,}",
-                "less error, mean": f"{100 * less.mean():+.0f} %",
-                "seeds where it is less": f"{(less > 0).sum()} of {len(less)}",
-            }
-        )
+    for road in roads:
+        rows = knowledge_rows(road)
+        for steps, found in rows[rows["steps"] > 0].groupby("steps"):
+            cells = {"road": road, "actual steps": f"{steps:,}"}
+            for name, heading in columns.items():
+                errors = found.pivot(index="seed", columns="model", values=name)
+                less = 1.0 - errors["IDM + residual"] / errors["networks alone"]
+                cells[heading] = f"{100 * less.mean():+.0f} % [{(less > 0).sum()} of {len(less)}]"
+            table.append(cells)
     return pd.DataFrame(table)
+
+
+def _steps_of(text: str) -> int:
+    return int("".join(digit for digit in text if digit.isdigit()) or 0)
 
 
 def show(table: pd.DataFrame, index: bool = False, digits: int = 3) -> HTML:

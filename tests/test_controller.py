@@ -35,7 +35,7 @@ from unjam.errors import InputError
 
 from .conftest import random_network
 
-ALL_PARTS = ("local", "expert_acceleration", "expert_memory", "loop_length")
+ALL_PARTS = ("local", "expert_acceleration", "expert_memory", "loop_length", "place")
 ABOUT = {"scenario": "ring", "iteration": 3}
 
 

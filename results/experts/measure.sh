@@ -30,6 +30,8 @@ for road in ring ring-warm ring-jammed figure-eight merge; do
         -d human -d idm -d pi:time_constant=0 -d pi -d follower-stopper -d acc -d lacc -d bcm -d ovm $pacer \
         -d constant -d constant:acceleration=0.1 >/dev/null
 done
+python results/experts/pacer_long.py "$runs/pacer"
+cp "$runs/pacer/pacer-long.json" results/experts/ && rm -r "$runs/pacer"
 # Copied at the end: until then the tree is as committed, and the manifests say so.
 for folder in "$runs"/*; do
     cp "$folder/evaluation.json" "results/experts/$(basename "$folder").json"

@@ -14,7 +14,9 @@ from typing import Any
 import numpy as np
 import torch
 from matplotlib import rc_context
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullFormatter
 
 from unjam.agents.algorithms import LEARNERS
 from unjam.agents.episodic import Training
@@ -45,7 +47,7 @@ TEST_EPISODES, TEST_SEED = 12, 2_000_000
 STARTS, SECONDS = 500, 5.0
 BASES: dict[str, BaseName] = {"IDM + residual": "idm", "networks alone": "none"}
 ALONE: dict[str, BaseName] = {"IDM alone": "idm", "nothing changes": "none"}
-WORKERS = 2
+WORKERS = 1
 
 
 def settings_for(base: BaseName, passes: int = 1) -> VirtualSettings:
@@ -144,34 +146,40 @@ PANELS = {
 
 
 def picture(rows: list[dict[str, Any]]) -> Figure:
-    """Return the errors by the number of actual steps: a row of panels per road."""
+    """Return the errors by the number of actual steps: a row of panels per road, a dot per seed."""
     with rc_context(STYLE):
-        figure = Figure(figsize=(10.5, 5.6), layout="constrained", dpi=130)
+        figure = Figure(figsize=(10.5, 5.8), layout="constrained", dpi=130)
         panels = figure.subplots(len(ROADS), len(PANELS), sharex=True, squeeze=False)
-        for (line, column), axes in np.ndenumerate(panels):
-            road, (name, label) = ROADS[line], list(PANELS.items())[column]
+        for road, line in zip(ROADS, panels, strict=True):
             here = [row for row in rows if row["road"] == road]
-            for alone, style in zip(ALONE, ("--", ":"), strict=True):
-                (value,) = (row[name] for row in here if row["model"] == alone)
-                axes.axhline(value, color=INK, lw=1.1, ls=style, label=alone)
-            for (model, colour), shift in zip(
-                zip(BASES, LINES[2:0:-1], strict=True), (0.96, 1.04), strict=True
-            ):
-                found = np.array(
-                    [[row[name] for row in here if (row["model"], row["steps"]) == (model, n)] for n in STEPS]
-                )
-                places = np.array(STEPS) * shift
-                axes.plot(places, found.mean(1), color=colour, lw=1.6, label=model)
-                axes.plot(places, found, color=colour, lw=0, marker="o", ms=3, alpha=0.5)
-            axes.set_xscale("log")
-            axes.set_yscale("log")
-            axes.set_xticks(STEPS, [f"{steps:,}" for steps in STEPS])
-            axes.minorticks_off()
-            axes.set_title(f"{road}: {label}", loc="left", fontsize=9, color=INK)
-            if line == len(ROADS) - 1:
-                axes.set_xlabel("actual steps")
+            for (name, label), axes in zip(PANELS.items(), line, strict=True):
+                errors(axes, here, name)
+                axes.set_title(f"{road}: {label}", loc="left", fontsize=9, color=INK)
+        for axes in panels[-1]:
+            axes.set_xlabel("actual steps")
         figure.legend(*panels[0, 0].get_legend_handles_labels(), loc="outside upper left", ncols=4)
         return figure
+
+
+def errors(axes: Axes, rows: list[dict[str, Any]], name: str) -> None:
+    """Draw one error of all models on a road."""
+    for alone, style in zip(ALONE, ("--", ":"), strict=True):
+        (value,) = (row[name] for row in rows if row["model"] == alone)
+        axes.axhline(value, color=INK, lw=1.1, ls=style, label=alone)
+    for (model, colour), shift in zip(zip(BASES, LINES[2:0:-1], strict=True), (0.95, 1.05), strict=True):
+        found = np.array(
+            [[row[name] for row in rows if (row["model"], row["steps"]) == (model, n)] for n in STEPS]
+        )
+        places = np.array(STEPS) * shift
+        axes.plot(places, found.mean(1), color=colour, lw=1.6, label=model)
+        axes.plot(places, found, color=colour, lw=0, marker="o", ms=3, alpha=0.5)
+    axes.set_xscale("log")
+    axes.set_xticks(STEPS, [f"{steps:,}" for steps in STEPS])
+    axes.xaxis.set_minor_formatter(NullFormatter())
+    axes.set_yscale("log")
+    axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    axes.yaxis.set_major_formatter("{x:g}")
+    axes.yaxis.set_minor_formatter(NullFormatter())
 
 
 def main(folder: Path) -> None:

@@ -3,7 +3,7 @@
 # an hour on one core.
 set -eu
 cd "$(dirname "$0")/../.."
-runs=runs/for-the-docs
+runs=runs/for-the-docs-knowledge
 rm -rf "$runs"
 python results/model/knowledge.py "$runs"
 # Copied at the end: until then the tree is as committed, and the manifest says so.

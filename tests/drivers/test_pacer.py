@@ -45,7 +45,38 @@ def test_pace_varies_over_the_lap_as_its_harmonics_say(place: float) -> None:
     assert found == pytest.approx(at(harmonics, place))
 
 
+@pytest.mark.parametrize(("gap", "faster"), [(270.0, 0.9), (225.0, 0.0), (180.0, -0.9)])
+def test_drives_faster_where_more_of_the_lap_is_free(gap: float, faster: float) -> None:
+    pacer = Pacer(lap_time=70, gain=0.02, wanted_gap=0.5)
+    assert wanted(pacer, state(gap=gap)) == pytest.approx(450 / 70 + faster)
+
+
+def test_never_stands_still_however_little_is_free() -> None:
+    pacer = Pacer(lap_time=70, gain=1.0, wanted_gap=0.9)
+    assert wanted(pacer, state(gap=200.0)) == pytest.approx(1.0)
+
+
+def test_waits_anew_when_the_queue_is_broken() -> None:
+    pacer = Pacer(lap_time=70, gathering_gap=0.5, regathering_gap=0.4)
+    together, longer, broken = (state(gap=share * 450) for share in (0.55, 0.45, 0.35))
+    assert wanted(pacer, together, longer) == pytest.approx(450 / 70)
+    assert wanted(pacer, together, broken) == pytest.approx(2.0)
+    assert wanted(pacer, together, broken, longer) == pytest.approx(2.0)
+    assert wanted(pacer, together, broken, together) == pytest.approx(450 / 70)
+
+
 @pytest.mark.parametrize("lap", TUNED)
-def test_varying_takes_the_harmonics_of_the_nearest_lap(lap: float) -> None:
-    found = wanted(Pacer(varying=True), state(gap=300.0, place=0.3, loop=lap + 2.0))
-    assert found == pytest.approx(at(TUNED[lap], 0.3))
+def test_varying_is_the_pacer_that_was_tuned_for_the_nearest_lap(lap: float) -> None:
+    here = state(gap=0.52 * lap, place=0.3, loop=lap + 2.0)
+    assert wanted(Pacer(varying=True), here) == pytest.approx(wanted(Pacer(**TUNED[lap]), here))
+
+
+def test_varying_rows_are_each_led_at_the_pace_of_their_own_lap() -> None:
+    laps = list(TUNED)
+    one_by_one = [wanted(Pacer(varying=True), state(gap=0.55 * lap, place=0.2, loop=lap)) for lap in laps]
+    columns = zip(*(state(gap=0.55 * lap, place=0.2, loop=lap) for lap in laps), strict=True)
+    rows = LocalState(*(np.concatenate(column) for column in columns))
+    pacer = Pacer(varying=True)
+    acceleration, memory = pacer.act(rows, pacer.initial_memory(len(laps)))
+    assert acceleration * pacer.time_constant == pytest.approx(one_by_one)
+    assert memory["gathered"].tolist() == [1.0] * len(laps)

@@ -10,7 +10,7 @@ from unjam.drivers.residual import observation_size
 
 from ..conftest import random_network
 
-ALL_PARTS = ("local", "expert_acceleration", "expert_memory", "loop_length")
+ALL_PARTS = ("local", "expert_acceleration", "expert_memory", "loop_length", "place")
 
 
 def zero_network(inputs: int) -> Network:

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from unjam.errors import InputError
 from unjam.experiments import model_facts
 from unjam.experiments.config import RunConfig
+from unjam.experiments.folder import read_config
 from unjam.experiments.model_facts import decisions_ahead, measure_model, newest_model_facts
-from unjam.experiments.train import read_config
 from unjam.reports.results import MODEL_FILE, read_progress
 from unjam.traffic.workers import Workers
 

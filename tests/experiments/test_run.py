@@ -17,8 +17,8 @@ from unjam.errors import InputError
 from unjam.experiments.checkpoint import TENSORS, load_checkpoint, save_checkpoint
 from unjam.experiments.config import RunConfig, load_config
 from unjam.experiments.evaluate import HELD_OUT, VALIDATION
+from unjam.experiments.folder import continue_folder, start_folder
 from unjam.experiments.run import Run
-from unjam.experiments.train import continue_folder, start_folder
 from unjam.reports.results import read_progress
 from unjam.traffic.workers import Workers
 

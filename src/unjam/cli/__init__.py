@@ -18,6 +18,7 @@ from unjam.cli.fit_drivers import fit_drivers
 from unjam.cli.lists import drivers, scenarios
 from unjam.cli.model import model
 from unjam.cli.report import report
+from unjam.cli.reproduce import reproduce
 from unjam.cli.train import train
 from unjam.cli.watch import watch
 from unjam.errors import DISK_ERRNOS, UnjamError, disk_error
@@ -49,7 +50,10 @@ def _root(
     pass
 
 
-for verb in (scenarios, drivers, drive, train, evaluate, model, fit_drivers, report, watch, bench, doctor):
+for verb in (
+    *(scenarios, drivers, drive, train, evaluate, model, fit_drivers),
+    *(report, reproduce, watch, bench, doctor),
+):
     app.command()(verb)
 
 

@@ -37,8 +37,9 @@ def evaluate(
     """
     from unjam.cli.output import aside, console, counting_steps, metrics_table, print_json
     from unjam.drivers.registry import DRIVERS
+    from unjam.experiments.folder import read_config
     from unjam.experiments.judge import among, comparison, judge
-    from unjam.experiments.train import TrainResult, gain_of, read_config
+    from unjam.experiments.train import TrainResult, gain_of
     from unjam.reports.html import write_report
     from unjam.reports.statistics import summarise
     from unjam.reports.story import signed

@@ -26,8 +26,8 @@ def model(
     from rich.table import Table
 
     from unjam.cli.output import aside, console, print_json
+    from unjam.experiments.folder import read_config
     from unjam.experiments.model_facts import newest_model_facts
-    from unjam.experiments.train import read_config
     from unjam.reports.html import write_report
     from unjam.reports.model_story import bound_of, cells, error_rows, headings, trust_of, verdict_of
     from unjam.reports.results import read_progress

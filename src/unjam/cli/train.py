@@ -84,8 +84,7 @@ def train(
       unjam train --resume runs/ring-001 --steps 2000000
     """
     from unjam.experiments.config import load_config
-    from unjam.experiments.train import read_config
-    from unjam.experiments.train import train as run
+    from unjam.experiments.folder import check_possible, read_config
 
     flags = {"scenario": scenario, "steps": steps, "seed": seed, "agent": agent, "expert": expert}
     changes: dict[str, Any] = {key: value for key, value in flags.items() if value is not None}
@@ -112,6 +111,9 @@ def train(
     else:
         made = load_config(config, preset, changes)
         folder = new_folder(out, made.scenario)
+    check_possible(made)
+    from unjam.experiments.train import train as run  # torch: seconds that nobody waits for a wrong word
+
     with nullcontext() if json else _Progress(made.steps, folder) as shown:
         result = run(made, folder, resume is not None, shown and shown.iteration, shown and shown.judging)
     _print_result(result, json)

@@ -1,8 +1,9 @@
 """What a CAV perceives, and the vector of numbers that a network sees of it: one place for both worlds."""
 
+from math import pi
 from typing import Literal, NamedTuple
 
-from unjam.physics.arrays import Array, stack_columns
+from unjam.physics.arrays import Array, namespace, stack_columns
 
 
 class LocalState(NamedTuple):
@@ -38,9 +39,9 @@ GAP_SCALE = 20.0
 ACCELERATION_SCALE = 1.0
 LOOP_LENGTH_SCALE = 250.0
 
-ObservationPart = Literal["local", "expert_acceleration", "expert_memory", "loop_length"]
+ObservationPart = Literal["local", "expert_acceleration", "expert_memory", "loop_length", "place"]
 """Parts of an observation: the paper's five numbers; the expert's acceleration; what the expert remembers;
-the length of the closed road."""
+the length of the closed road; the place on it."""
 
 OBSERVATION_NAMES: dict[str, tuple[str, ...]] = {
     "local": (
@@ -52,7 +53,19 @@ OBSERVATION_NAMES: dict[str, tuple[str, ...]] = {
     ),
     "expert_acceleration": (f"expert's acceleration / {ACCELERATION_SCALE:g} m/s2",),
     "loop_length": (f"length of the closed road / {LOOP_LENGTH_SCALE:g} m",),
+    "place": ("cosine of the place on the lap", "sine of the place on the lap"),
 }
+
+
+def lap_place(state: LocalState) -> Array:
+    """Return cosine and sine of the place on a closed road, 0 to 2 pi from its start.
+
+    Returns:
+        Shape (n, 2), no unit; a tuple of two for plain numbers.
+    """
+    xp = namespace(state.speed)
+    angle = 2.0 * pi * state.route_position / state.loop_length
+    return stack_columns((xp.cos(angle), xp.sin(angle)))
 
 
 def local_vector(state: LocalState) -> Array:

@@ -1,7 +1,9 @@
 """The pacer of the figure eight: leads all others in one queue that never meets its own tail."""
 
+from dataclasses import replace
+from functools import cached_property
 from math import pi
-from typing import Annotated, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 from pydantic import Field
@@ -10,22 +12,12 @@ from pydantic.dataclasses import dataclass
 from unjam.drivers.driver import Driver, Memory
 from unjam.drivers.local_state import LocalState
 from unjam.parameters import STRICT, NotNegative, Positive
-from unjam.physics.arrays import Array, as_column, namespace
+from unjam.physics.arrays import Array, as_column, at_least, namespace
 
 Harmonics = tuple[float, ...]
-
-TUNED: dict[float, Harmonics] = {
-    422.2: (7.88, -1.09, 1.26, -1.46, 2.5),
-    449.0: (8.22, -0.81, 2.37, -1.75, 1.46),
-    462.5: (8.51, -1.8, 1.96, -1.31, 0.86),
-    475.9: (8.7, -1.83, 1.96, -1.35, 0.95),
-    489.3: (8.93, -1.86, 1.96, -1.4, 1.05),
-}
-"""pace over the lap for each length of a lap [m]: mean and harmonics as in `Pacer.harmonics` [m/s].
-
-Of the figure eight with radii 30, 32, 33, 34 and 35 m, found by results/experts/tune_pacer.py;
-at 34 m one between those of its neighbours, which holds on more seeds than what the search found there.
-"""
+Share = Annotated[float, Field(ge=0, lt=1)]
+SLOWEST_PACE = 1.0
+"""[m/s]: whoever stands still never gathers anybody"""
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -46,12 +38,19 @@ class Pacer(Driver):
     harmonics: Annotated[Harmonics, Field(max_length=9)] = ()
     """(V, a1, b1, a2, b2, ...) [m/s] instead of `lap_time`: pace V + a1 cos x + b1 sin x + a2 cos 2x + ...,
     where x is the place on the lap, 0 to 2 pi from its start"""
+    gain: NotNegative = 0.0
+    """how much faster it drives for each metre of free road ahead beyond `wanted_gap` [1/s], and slower for
+    each that lacks: a queue that has grown long may close up"""
+    wanted_gap: Share = 0.5
+    """share of the lap that is free ahead at the pace itself"""
     varying: bool = False
-    """whether to use, instead of `lap_time`, harmonics tuned for the figure eight of the nearest radius"""
+    """whether to use, instead of all this, what was found for the figure eight of the nearest radius"""
     gathering_speed: NotNegative = 2.0
     """speed while the others gather behind [m/s]"""
-    gathering_gap: Annotated[float, Field(ge=0, lt=1)] = 0.4
+    gathering_gap: Share = 0.4
     """share of the lap that must be free ahead before the pace begins"""
+    regathering_gap: Share = 0.0
+    """share of the lap below which the queue counts as broken, and the others gather anew"""
     time_constant: Positive = 0.1
     """time over which the wanted speed is reached [s]"""
 
@@ -61,35 +60,63 @@ class Pacer(Driver):
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
         """Return the acceleration towards the pace, and whether all have gathered by now."""
+        if not self.varying:
+            return self._lead(state, memory)
+        loop = state.loop_length
+        xp = namespace(loop)
+        acceleration, gathered, nearest = loop * 0.0, loop * 0.0, loop * 0.0 + float("inf")
+        for lap, pacer in self._tuned.items():
+            found, after = pacer.act(state, memory)
+            closer = abs(loop - lap) < nearest
+            acceleration = xp.where(closer, found, acceleration)
+            gathered = xp.where(closer, after["gathered"], gathered)
+            nearest = xp.where(closer, abs(loop - lap), nearest)
+        return acceleration, {"gathered": gathered}
+
+    @cached_property
+    def _tuned(self) -> dict[float, "Pacer"]:
+        return {lap: replace(self, varying=False, **values) for lap, values in TUNED.items()}
+
+    def _lead(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
+        loop, free = state.loop_length, state.leader_gap
         xp = namespace(state.speed)
-        free = state.leader_gap - self.gathering_gap * state.loop_length
-        gathered = xp.where(free >= 0.0, free * 0.0 + 1.0, memory["gathered"])
-        wanted = xp.where(gathered > 0.0, self._pace(state), free * 0.0 + self.gathering_speed)
+        ready, broken = free >= self.gathering_gap * loop, free < self.regathering_gap * loop
+        gathered = xp.where(ready, free * 0.0 + 1.0, xp.where(broken, free * 0.0, memory["gathered"]))
+        pace = self._pace(state) + self.gain * (free - self.wanted_gap * loop)
+        pace = at_least(pace, SLOWEST_PACE)
+        wanted = xp.where(gathered > 0.0, pace, free * 0.0 + self.gathering_speed)
         return (wanted - state.speed) / self.time_constant, {"gathered": gathered}
 
     def _pace(self, state: LocalState) -> Array:
-        loop = state.loop_length
-        if self.varying:
-            xp = namespace(loop)
-            pace, nearest = loop * 0.0, loop * 0.0 + float("inf")
-            for lap, harmonics in TUNED.items():
-                closer = abs(loop - lap) < nearest
-                pace = xp.where(closer, _at(state, harmonics), pace)
-                nearest = xp.where(closer, abs(loop - lap), nearest)
-            return pace
-        return _at(state, self.harmonics) if self.harmonics else loop / self.lap_time
+        """Return the pace where the vehicles are, before what the free road ahead changes."""
+        if not self.harmonics:
+            return state.loop_length / self.lap_time
+        xp = namespace(state.speed)
+        mean, *rest = self.harmonics
+        place = 2.0 * pi * state.route_position / state.loop_length
+        pace = place * 0.0 + mean
+        for number, (cosine, sine) in enumerate(zip(rest[::2], rest[1::2], strict=True), start=1):
+            pace = pace + cosine * xp.cos(number * place) + sine * xp.sin(number * place)
+        return pace
 
     def memory_features(self, memory: Memory) -> Array:
         """Return whether all have gathered, shape (n, 1)."""
         return as_column(memory["gathered"])
 
 
-def _at(state: LocalState, harmonics: Harmonics) -> Array:
-    """Return the pace where the vehicles are."""
-    xp = namespace(state.speed)
-    mean, *rest = harmonics
-    place = 2.0 * pi * state.route_position / state.loop_length
-    pace = place * 0.0 + mean
-    for number, (cosine, sine) in enumerate(zip(rest[::2], rest[1::2], strict=True), start=1):
-        pace = pace + cosine * xp.cos(number * place) + sine * xp.sin(number * place)
-    return pace
+def _tuned(harmonics: Harmonics, gain: float, wanted_gap: float) -> dict[str, Any]:
+    """Return the fields of a tuned pacer; all gather until half the lap is free."""
+    gathering = {"gathering_gap": 0.5, "regathering_gap": 0.45}
+    return {"harmonics": harmonics, "gain": gain, "wanted_gap": wanted_gap, **gathering}
+
+
+TUNED: dict[float, dict[str, Any]] = {
+    449.0: _tuned((7.449, -2.059, 1.966, -0.94, 0.791, -0.028, 0.01), 0.047, 0.509),
+    462.5: _tuned((7.973, -1.865, 2.48, -0.422, 0.173, 0.027, 0.063), 0.038, 0.545),
+    475.9: _tuned((8.45, -2.057, 3.128, 0.477, 0.086, -0.086, 0.075), 0.04, 0.552),
+    489.3: _tuned((9.039, -1.791, 3.513, 1.051, 0.015, 0.024, 0.216), 0.044, 0.581),
+}
+"""what `varying` uses, by the length of the lap [m], found by results/experts/tune_pacer.py.
+
+Of the figure eight with radii 32, 33, 34 and 35 m.
+"""

@@ -12,6 +12,7 @@ from unjam.drivers.local_state import (
     LOOP_LENGTH_SCALE,
     LocalState,
     ObservationPart,
+    lap_place,
     local_vector,
 )
 from unjam.drivers.network import Network
@@ -50,6 +51,8 @@ def observe(
             blocks.append(local_vector(state))
         elif part == "loop_length":
             blocks.append(as_column(state.loop_length / LOOP_LENGTH_SCALE))
+        elif part == "place":
+            blocks.append(lap_place(state))
         elif part == "expert_acceleration":
             blocks.append(as_column(expert_acceleration / ACCELERATION_SCALE))
         else:

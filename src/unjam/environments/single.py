@@ -59,7 +59,8 @@ class RoadEnv(gymnasium.Env[Observation, Observation]):
             scenario: its name.
             reward: a name or `path.py:name`; empty: the scenario's own.
             expert: a driver to whose acceleration actions are added, named as in `unjam drive --driver`.
-            observe: parts of the observation: `local`, `expert_acceleration`, `expert_memory`, `loop_length`.
+            observe: parts of the observation: `local`, `expert_acceleration`, `expert_memory`, `loop_length`,
+                `place`.
             render_mode: `rgb_array`, or `human` for SUMO's own window.
             changes: to the scenario's parameters.
 

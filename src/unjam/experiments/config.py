@@ -12,8 +12,8 @@ from pydantic.dataclasses import dataclass
 from unjam.agents.settings import LearnerSettings, PolicySettings, PPOSettings, SACSettings, TRPOSettings
 from unjam.drivers.constant import Constant
 from unjam.drivers.driver import Driver
-from unjam.errors import InputError, wrong_name
-from unjam.experiments.presets import PRESETS
+from unjam.errors import InputError
+from unjam.experiments.presets import preset_values
 from unjam.parameters import STRICT, Count, CountOrNone, build
 from unjam.scenarios.registry import make_scenario
 from unjam.scenarios.scenario import Scenario
@@ -108,19 +108,17 @@ def load_config(
     Raises:
         InputError: an unknown key or preset, a value out of range, an unreadable file.
     """
-    values: dict[str, Any] = {}
-    if preset:
-        if preset not in PRESETS:
-            raise wrong_name("preset", preset, PRESETS)
-        values = merge(values, {**PRESETS[preset], "preset": preset})
-    if file is not None:
-        values = merge(values, read_toml(file))
+    given: dict[str, Any] = read_toml(file) if file is not None else {}
     for key, value in (changes or {}).items():
         nested: Any = value
         for part in reversed(key.split(".")):
             nested = {part: nested}
-        values = merge(values, nested)
-    return build(RunConfig, values, "")
+        given = merge(given, nested)
+    values: dict[str, Any] = {}
+    if preset:
+        started = preset_values(preset, str(given.get("scenario", RunConfig.scenario)))
+        values = {**started, "preset": preset}
+    return build(RunConfig, merge(values, given), "")
 
 
 def read_toml(path: Path) -> dict[str, Any]:

@@ -2,6 +2,8 @@
 
 from typing import Any
 
+from unjam.errors import wrong, wrong_name
+
 PRESETS: dict[str, dict[str, Any]] = {
     # What the paper says, where it says something: Tables B2 to B5, section 4.1.
     "paper": {
@@ -40,3 +42,21 @@ PRESETS: dict[str, dict[str, Any]] = {
     # Ends within about five minutes on two cores, evaluation included.
     "demo": {"steps": 300_000, "evaluation": {"every": 2}},
 }
+
+BEST: dict[str, dict[str, Any]] = {
+    "ring": {"steps": 300_000, "evaluation": {"every": 2}},
+    "figure-eight": {"expert": "pacer:varying=true", "steps": 300_000},
+    "merge": {"expert": "bcm", "steps": 300_000},
+}
+"""the preset `best`: what is known to reach furthest, road by road"""
+
+
+def preset_values(preset: str, scenario: str) -> dict[str, Any]:
+    """Return what a preset changes on a scenario; raise `InputError` where there is no such preset."""
+    if preset == "best":
+        if scenario not in BEST:
+            raise wrong("scenario", scenario, f"with the preset best: {', '.join(BEST)}")
+        return BEST[scenario]
+    if preset not in PRESETS:
+        raise wrong_name("preset", preset, [*PRESETS, "best"])
+    return PRESETS[preset]

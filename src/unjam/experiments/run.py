@@ -155,6 +155,8 @@ class Run:
             "return_validation": validation,
             "mean_speed": mean("mean_speed"),
             "speed_std_fleet": mean("speed_std_fleet"),
+            "cav_mean_speed": mean("cav_mean_speed"),
+            "speed_std_cav": mean("speed_std_cav"),
             "mean_abs_accel": mean("mean_abs_accel"),
             "shield_override_share": mean("shield_override_share"),
             "collisions": sum(row["collisions"] for row in measured),

@@ -1,25 +1,20 @@
 """Train: from a configuration to a folder with everything about the run. `unjam train`, `unjam.train`."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from unjam.controller import make_driver
 from unjam.drivers.registry import describe
-from unjam.drivers.residual import observation_size
-from unjam.errors import InputError
-from unjam.experiments.config import RunConfig, load_config, to_toml
+from unjam.experiments.config import RunConfig
+from unjam.experiments.folder import check_possible, continue_folder, start_folder
 from unjam.experiments.judge import TRAINED, judge
-from unjam.experiments.manifest import manifest
 from unjam.experiments.model_facts import write_model_facts
 from unjam.experiments.run import Run, Told
-from unjam.files import make_folder, to_json, write_whole
 from unjam.reports.html import write_report
 from unjam.reports.statistics import Estimate, paired_difference
-from unjam.traffic.reward import make_reward
 from unjam.traffic.workers import Workers
 
 
@@ -68,11 +63,7 @@ def train(
         DiskError: the disk is full; the last checkpoint is whole.
     """
     folder = Path(folder)
-    scenario = config.make_scenario()  # what is wrong is told before anything is written
-    observation_size(config.policy.observe, config.make_expert())
-    make_reward(config.reward or scenario.reward)
-    for name in config.evaluation.baselines:
-        make_driver(name, scenario.decision_step)
+    check_possible(config)  # what is wrong is told before anything is written
     if resume:
         continue_folder(folder, config)
     else:
@@ -92,36 +83,3 @@ def gain_of(config: RunConfig, rows: dict[str, list[dict[str, Any]]]) -> Estimat
     if config.expert == "none":
         return None
     return paired_difference(rows[TRAINED], rows[describe(config.make_expert())], "return")
-
-
-def start_folder(folder: Path, config: RunConfig) -> None:
-    """Make the folder of a new run and write what it is about.
-
-    Raises:
-        InputError: the folder holds something already.
-    """
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise InputError(f"out: {str(folder)!r} is not empty; allowed: a new folder, or --resume {folder}")
-    make_folder(folder)
-    write_whole(folder / "config.toml", to_toml(config))
-    write_whole(folder / "manifest.json", to_json(manifest(), indent=1))
-
-
-def read_config(folder: Path) -> RunConfig:
-    """Return the configuration of a run folder; raise `InputError` where it is none."""
-    if not (folder / "config.toml").is_file():
-        raise InputError(f"run: {str(folder)!r} is not a run folder: it has no config.toml")
-    return load_config(folder / "config.toml")
-
-
-def continue_folder(folder: Path, config: RunConfig) -> None:
-    """Check that `config` may go on with the run in `folder`, and write down its new budget.
-
-    Raises:
-        InputError: something else than the budget or the number of workers differs.
-    """
-    before = read_config(folder)
-    if replace(before, steps=config.steps, workers=config.workers) != config:
-        raise InputError("resume: only steps and workers may change; all else is the run's")
-    if config != before:
-        write_whole(folder / "config.toml", to_toml(config))

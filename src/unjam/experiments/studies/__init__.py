@@ -1,1 +1,22 @@
-"""What the paper reports, measured anew: a file for each study."""
+"""The studies of `unjam reproduce`: the paper's tables and figures."""
+
+from unjam.experiments.studies.comparison import FIGURE_9, TABLE_1, TABLE_2
+from unjam.experiments.studies.figure_5 import FIGURE_5
+from unjam.experiments.studies.figure_8 import FIGURE_8
+from unjam.experiments.studies.figure_10 import FIGURE_10
+from unjam.experiments.studies.study import Study
+from unjam.experiments.studies.theory import THEORY
+
+STUDIES: dict[str, Study] = {
+    "table-1": TABLE_1,
+    "figure-5": FIGURE_5,
+    "table-2": TABLE_2,
+    "figure-8": FIGURE_8,
+    "figure-9": FIGURE_9,
+    "figure-10": FIGURE_10,
+    "theory": THEORY,
+}
+"""every study by name"""
+
+DRAWN_WITH = {"figure-4": "table-1", "figure-7": "table-2"}
+"""figures that are drawn with a table, from the same trainings"""

@@ -1,0 +1,47 @@
+"""The paper's comparisons of learners: Table 1 and Figure 4, Table 2 and Figure 7, Figure 9."""
+
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+
+from unjam.experiments.studies.curves import curves_of, draw_curves
+from unjam.experiments.studies.plan import PAPERS_ROADS, planned
+from unjam.experiments.studies.pool import Pool
+from unjam.experiments.studies.study import Study
+from unjam.experiments.studies.table import best_expert, table_rows, write_table
+from unjam.files import to_json, write_whole
+
+LEARNERS = ("trpo", "ppo", "sac", "proposed", "without-model", "ours")
+ABLATION = (
+    *("trpo", "mb-trpo", "no-initial-policy", "without-model", "proposed"),
+    *("ours-without-model", "ours"),
+)
+FRAMEWORK = ("ppo", "sac", "proposed-ppo", "proposed-sac", "proposed")
+
+
+def _write(variants: Sequence[str], roads: Sequence[str], pool: Pool, seeds: int, folder: Path) -> None:
+    """Write table and curves of some variants on some roads."""
+    write_table([row for road in roads for row in table_rows(pool, road, variants, seeds)], folder)
+    by_road = {road: curves_of(pool, road, variants, seeds) for road in roads}
+    references = {}
+    for road in roads:
+        found = pool.references(road)
+        best = best_expert(found)
+        references[road] = {"all human": found["human"], "best expert": found[best]}
+    write_whole(folder / "curves.json", to_json(by_road))
+    draw_curves(by_road, references).savefig(folder / "curves.png")
+
+
+def comparison(title: str, variants: Sequence[str], roads: Sequence[str]) -> Study:
+    """Return the study that compares some variants on some roads."""
+    return Study(
+        title,
+        partial(planned, roads, variants),  # pyright: ignore[reportArgumentType]
+        partial(_write, variants, roads),
+        tuple(roads),
+    )
+
+
+TABLE_1 = comparison("TRPO, PPO, SAC and the proposed method on three roads", LEARNERS, PAPERS_ROADS)
+TABLE_2 = comparison("what each part of the method is worth, on the ring", ABLATION, ("ring",))
+FIGURE_9 = comparison("PPO and SAC within the framework, on the ring", FRAMEWORK, ("ring",))

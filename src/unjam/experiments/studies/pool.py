@@ -1,0 +1,118 @@
+"""What studies are made of, once it has been measured: trainings, and drivers that do not learn."""
+
+import hashlib
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import ceil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from unjam.experiments.folder import read_config
+from unjam.experiments.judge import TRAINED
+from unjam.experiments.studies.plan import PlannedRun
+from unjam.reports.results import Results, read_progress, read_results
+
+REFERENCES: dict[str, str] = {
+    "human": "human",
+    "zero": "constant",
+    "constant +0.1": "constant:acceleration=0.1",
+    "PI (paper)": "pi:time_constant=0",
+    "PI": "pi",
+    "FollowerStopper": "follower-stopper",
+    "IDM": "idm",
+    "ACC": "acc",
+    "LACC": "lacc",
+    "BCM": "bcm",
+    "OVM": "ovm",
+    "pacer": "pacer",
+    "varying pacer": "pacer:varying=true",
+}
+"""drivers that do not learn, beside those that do: label and how `unjam drive` names them"""
+EXPERTS = tuple(label for label in REFERENCES if label not in ("human", "zero", "constant +0.1"))
+LAST_SHARE = 0.1
+"""share of the iterations, the last ones, that the paper's convention is read from"""
+
+
+@dataclass(frozen=True)
+class TrainedRun:
+    """A finished training."""
+
+    run: PlannedRun
+    progress: list[dict[str, Any]]
+    rows: list[dict[str, Any]]
+    """of the trained controller, deterministic, on held-out seeds"""
+
+    @property
+    def last(self) -> list[dict[str, Any]]:
+        """The last tenth of the iterations."""
+        return self.progress[-ceil(LAST_SHARE * len(self.progress)) :]
+
+    def in_training(self, name: str) -> float:
+        """Return a number of the training batches, exploration included, in the last tenth of them."""
+        return float(np.mean([row[name] for row in self.last]))
+
+    def judged(self, name: str) -> float:
+        """Return the mean of a metric on the held-out seeds."""
+        return float(np.mean([row[name] for row in self.rows]))
+
+    @property
+    def seconds(self) -> float:
+        """Wall time of its iterations."""
+        return float(sum(sum(row["seconds"].values()) for row in self.progress))
+
+
+class Pool:
+    """A folder with the trainings and drives of all studies, each made once."""
+
+    def __init__(self, folder: Path) -> None:
+        """Look into a folder; nothing need be there yet."""
+        self.folder = folder
+
+    def folder_of(self, run: PlannedRun) -> Path:
+        """Return where a training is."""
+        return self.folder / "runs" / run.name
+
+    def drives_of(self, road: str) -> Path:
+        """Return where the drivers that do not learn are, on a road."""
+        return self.folder / "drives" / road
+
+    def has(self, run: PlannedRun) -> bool:
+        """Return whether a training is finished, with these settings."""
+        folder = self.folder_of(run)
+        return (folder / "evaluation.json").is_file() and read_config(folder) == run.config
+
+    def has_drives(self, road: str) -> bool:
+        """Return whether the drivers that do not learn have driven a road."""
+        return (self.drives_of(road) / "evaluation.json").is_file()
+
+    def trained(self, runs: Sequence[PlannedRun]) -> list[TrainedRun]:
+        """Return finished trainings."""
+        return [
+            TrainedRun(run, read_progress(folder), _rows(folder, TRAINED))
+            for run in runs
+            for folder in (self.folder_of(run),)
+        ]
+
+    def references(self, road: str) -> dict[str, list[dict[str, Any]]]:
+        """Return the rows of the drivers that do not learn, by label, on the seeds that judge."""
+        about = json.loads((self.drives_of(road) / "evaluation.json").read_text())
+        found: dict[str, list[dict[str, Any]]] = {}
+        for row in about["rows"]:
+            found.setdefault(row["driver"], []).append(row)
+        return found
+
+    def sha256(self, run: PlannedRun) -> str:
+        """Return the hash of a trained controller."""
+        return hashlib.sha256((self.folder_of(run) / "controller.unjam").read_bytes()).hexdigest()
+
+    def results(self, run: PlannedRun) -> Results:
+        """Return all that the folder of a training says, pictures included."""
+        return read_results(self.folder_of(run))
+
+
+def _rows(folder: Path, driver: str) -> list[dict[str, Any]]:
+    rows = json.loads((folder / "evaluation.json").read_text())["rows"]
+    return [row for row in rows if row["driver"] == driver]

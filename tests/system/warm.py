@@ -1,0 +1,57 @@
+"""Runs the command line in forks of a process that has imported everything already.
+
+An interpreter that imports torch needs four seconds before it reads its arguments. Reads one request a line
+from standard input, answers with the exit code.
+"""
+
+import json
+import os
+import signal
+import sys
+import traceback
+
+import torch._dynamo  # noqa: F401  # what the first optimiser of a process imports
+
+import unjam.cli
+import unjam.cli.output
+import unjam.experiments.drive
+import unjam.experiments.model_facts
+import unjam.experiments.train
+
+LONGEST = 300
+"""[s]"""
+
+
+def run(arguments: list[str], folder: str, out: str, errors: str) -> None:
+    """Become `unjam` with these arguments; never returns."""
+    signal.alarm(LONGEST)
+    os.chdir(folder)
+    for path, stream in ((out, 1), (errors, 2)):
+        os.dup2(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC), stream)
+    os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
+    sys.argv = ["unjam", *arguments]
+    sys.path[0] = str(os.path.dirname(sys.executable))
+    code = 1
+    try:
+        unjam.cli.main()
+    except SystemExit as end:
+        code = end.code if isinstance(end.code, int) else int(end.code is not None)
+    except BaseException:
+        traceback.print_exc()
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(code)
+
+
+def main() -> None:
+    """Answer requests until there are no more."""
+    for line in sys.stdin:
+        child = os.fork()
+        if child == 0:
+            run(**json.loads(line))
+        _, status = os.waitpid(child, 0)
+        print(os.waitstatus_to_exitcode(status), flush=True)
+
+
+if __name__ == "__main__":
+    main()
