@@ -1,17 +1,16 @@
+import numpy as np
 import pytest
 
 from tests.following.made_up import idm_driver
-from unjam.following.calibration import CalibrationSettings, calibrate, calibrate_each, gap_objective
+from unjam.following.calibration import CalibrationSettings, calibrate, gap_objective
 from unjam.following.pairs import stretches_of
-from unjam.physics.idm import PAPER_IDM, IDMParameters
+from unjam.physics.idm import IDMParameters
 
 QUICK = CalibrationSettings(generations=40)
 DRIVER = IDMParameters(time_headway=0.9, max_acceleration=1.4, comfortable_deceleration=2.0, minimum_gap=2.5)
 
 
 def test_the_true_parameters_have_no_error() -> None:
-    import numpy as np
-
     objective = gap_objective(stretches_of([idm_driver(DRIVER)]), (-4.0, 2.0), "trajectory")
     true = [30.0, 0.9, 1.4, 2.0, 2.5, 0.0]
     found = objective(np.array([true, [30.0, 1.4, 1.4, 2.0, 2.5, 0.0]]).T)
@@ -32,15 +31,6 @@ def test_the_result_depends_on_the_seed_alone() -> None:
     pairs = [idm_driver(DRIVER, seconds=10.0)]
     settings = CalibrationSettings(generations=3)
     assert calibrate(pairs, settings) == calibrate(pairs, settings)
-
-
-def test_each_driver_gets_its_own_of_what_is_own() -> None:
-    groups = [[idm_driver(IDMParameters(time_headway=headway))] for headway in (0.8, 1.6)]
-    told: list[int] = []
-    found = calibrate_each(groups, PAPER_IDM, ("time_headway",), QUICK, told.append)
-    assert [one.parameters.time_headway for one in found] == pytest.approx([0.8, 1.6], abs=0.02)
-    assert all(one.parameters.minimum_gap == PAPER_IDM.minimum_gap for one in found)
-    assert told == [1, 2]
 
 
 def test_a_parameter_at_the_end_of_what_is_searched_is_named() -> None:

@@ -5,7 +5,7 @@ has to drive. Source of the method: Treiber and Kesting, Traffic Flow Dynamics (
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -114,53 +114,41 @@ def calibrate(pairs: Sequence[Pair], settings: CalibrationSettings | None = None
         float(np.sqrt((drove.speed_square * weights).sum())),
         int(drove.collided.sum()),
         sum(pair.seconds for pair in pairs),
-        tuple(name for name in SEARCHED if _at_an_end(getattr(parameters, name), getattr(settings, name))),
+        tuple(name for name in SEARCHED if at_an_end(getattr(parameters, name), getattr(settings, name))),
     )
-
-
-def calibrate_each(
-    groups: Sequence[Sequence[Pair]],
-    typical: IDMParameters,
-    own: Sequence[str],
-    settings: CalibrationSettings | None = None,
-    told: Callable[[int], None] | None = None,
-) -> list[Calibrated]:
-    """Return a calibration of each group of pairs, for instance of each driver.
-
-    Only the parameters `own` are searched, the others are those of `typical`: a minute of driving tells the
-    distance that somebody keeps, but not how fast they would like to be on an empty road. `told` counts.
-    """
-    fixed = {name: (getattr(typical, name),) * 2 for name in SEARCHED if name not in own}
-    searching = replace(settings or CalibrationSettings(), **fixed)
-    found = []
-    for number, pairs in enumerate(groups, 1):
-        found.append(calibrate(pairs, searching))
-        if told is not None:
-            told(number)
-    return found
 
 
 def gap_objective(stretches: Stretches, limits: Limits, every: str) -> Callable[[Floats], Floats]:
     """Return the error of the simulated gap [m] as a function of candidates, shape (6, S) -> (S,)."""
-    leader = (stretches.leader_speed, stretches.leader_path)
     moments = stretches.present[1:].sum(0)
 
     def objective(candidates: Floats) -> Floats:
         v0, headway, acceleration, deceleration, minimum_gap, kept = candidates.reshape(6, -1, 1)
         rows = IDMRows(v0, headway, acceleration, deceleration, 4.0, minimum_gap)
-        shape = (v0.shape[0], len(moments))
-        start = (np.broadcast_to(stretches.speed[0], shape), np.broadcast_to(stretches.gap[0], shape))
-        follow = personal_idm(rows, kept, limits)(*start)
-        total = np.zeros(shape)
-        for moment, (_, gap) in enumerate(drive_behind(follow, start, leader, stretches.step), 1):
-            total += np.square(gap - stretches.gap[moment]) * stretches.present[moment]
+        squares = gap_squares(stretches, personal_idm(rows, kept, limits), len(v0))
         if every == "trajectory":
-            return np.sqrt(total / moments).mean(1)
-        return np.sqrt(total.sum(1) / moments.sum())
+            return np.sqrt(squares).mean(1)
+        return np.sqrt((squares * moments).sum(1) / moments.sum())
 
     return objective
 
 
-def _at_an_end(value: float, within: Range) -> bool:
+def gap_squares(stretches: Stretches, model: Model, candidates: int = 1) -> Floats:
+    """Return the mean squared error of the gap of each stretch [m2], shape (candidates, n).
+
+    As `open_loop`, but for many drivers at once, and without keeping where they were.
+    """
+    moments = stretches.present[1:].sum(0)
+    shape = (candidates, len(moments))
+    start = (np.broadcast_to(stretches.speed[0], shape), np.broadcast_to(stretches.gap[0], shape))
+    leader = (stretches.leader_speed, stretches.leader_path)
+    total = np.zeros(shape)
+    for moment, (_, gap) in enumerate(drive_behind(model(*start), start, leader, stretches.step), 1):
+        total += np.square(gap - stretches.gap[moment]) * stretches.present[moment]
+    return total / moments
+
+
+def at_an_end(value: float, within: Range) -> bool:
+    """Return whether a value lies at the end of what was searched: the data do not tell it."""
     low, high = within
     return low < high and min(value - low, high - value) < 0.01 * (high - low)

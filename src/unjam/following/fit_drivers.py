@@ -9,13 +9,8 @@ from pydantic.dataclasses import dataclass
 
 from unjam.drivers.network import Network
 from unjam.errors import wrong, wrong_name
-from unjam.following.calibration import (
-    SEARCHED,
-    Calibrated,
-    CalibrationSettings,
-    calibrate,
-    calibrate_each,
-)
+from unjam.following.calibration import SEARCHED, Calibrated, CalibrationSettings, calibrate
+from unjam.following.each_driver import calibrate_each
 from unjam.following.multi_step import Known, MultiStepSettings, fit_multi_step
 from unjam.following.pairs import Pair, of_split, split_by_trajectory
 from unjam.parameters import STRICT, CountOrNone

@@ -45,7 +45,11 @@ def test_processes_measure_the_same(tmp_path: Path) -> None:
     assert [read_part(tmp_path, f"of-{number}")["square"] for number in range(3)] == [0, 1, 4]
 
 
-def test_a_study_keeps_its_first_manifest(tmp_path: Path) -> None:
+def test_a_study_keeps_its_first_manifest_and_says_when_it_went_on(tmp_path: Path) -> None:
     first = about_study(tmp_path)
+    assert "went_on" not in first
     (tmp_path / "manifest.json").write_text(json.dumps({**first, "started": "long ago"}))
-    assert about_study(tmp_path)["started"] == "long ago"
+    about_study(tmp_path)
+    found = about_study(tmp_path)
+    assert found["started"] == "long ago"
+    assert [later["commit"] for later in found["went_on"]] == [first["commit"]] * 2

@@ -15,7 +15,8 @@ import numpy as np
 
 from unjam.experiments.studies.parts import Part, Told, about_study, measure_parts, read_part
 from unjam.files import to_json, write_whole
-from unjam.following.calibration import SEARCHED, CalibrationSettings, calibrate, calibrate_each
+from unjam.following.calibration import SEARCHED, CalibrationSettings, calibrate
+from unjam.following.each_driver import calibrate_each
 from unjam.following.loaders import Reading, read_pairs
 from unjam.following.multi_step import Known, MultiStepSettings, fit_multi_step
 from unjam.following.network import NetworkSettings, fit_one_step, on_rows

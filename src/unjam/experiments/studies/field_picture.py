@@ -23,8 +23,8 @@ NAMES = {
     "IDM, headway kept + multi-step": "headway kept + multi-step residual",
 }
 """of the models that are shown, from below to above"""
-LEFT = 12.0
-"""errors beyond this leave the picture [m]"""
+SHOWN = {"gap": (2.0, 12.0), "one_step": (0.4, 1.9)}
+"""errors beyond this leave the picture, and are written at its edge [m, m/s2]"""
 
 
 def picture(rows: Sequence[dict[str, Any]]) -> Figure:
@@ -40,10 +40,11 @@ def picture(rows: Sequence[dict[str, Any]]) -> Figure:
         left.axvline(PUBLISHED, color=INK, lw=0.9, ls=":")
         left.annotate("published", (PUBLISHED + 0.1, len(NAMES) - 0.45), fontsize=8, color=INK)
         left.set_yticks(range(len(NAMES)), list(NAMES.values())[::-1])
-        left.set_xlim(2, LEFT)
+        left.set_xlim(*SHOWN["gap"])
         left.set_ylim(-0.6, len(NAMES) - 0.2)
         left.set_xlabel("error of the gap, driving on [m]")
-        right.set_xlim(0.4, 1.8)
+        right.set_xlim(*SHOWN["one_step"])
+        left.plot([], [], "o", ms=4.5, color=INK, mfc="white", label="some collide")
         right.set_xlabel("error of the acceleration, one step [m/s²]")
         left.legend(loc="lower right")
         return figure
@@ -70,3 +71,8 @@ def _dots(
                 label=None if labelled else label,
             )
             labelled = True
+        most = SHOWN[name][1]
+        beyond = [row[name] for row in found if row[name] > most]
+        if beyond:
+            words = f"{sum(beyond) / len(beyond):.1f} →"
+            axes.annotate(words, (most, place + shift), ha="right", va="bottom", fontsize=8, color=colour)

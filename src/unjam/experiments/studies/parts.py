@@ -19,11 +19,15 @@ Told = Callable[[str], None]
 
 
 def about_study(folder: Path) -> dict[str, Any]:
-    """Return where a study comes from: its first call's manifest, also when it goes on later."""
+    """Return where a study comes from: the manifest of its first call, and when it went on, by what."""
     make_folder(folder)
-    if not (folder / MANIFEST).is_file():
-        write_whole(folder / MANIFEST, to_json(manifest(), indent=1))
-    return json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
+    about, now = {}, manifest()
+    if (folder / MANIFEST).is_file():
+        about = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
+        went_on = {"commit": now["commit"], "started": now["started"]}
+        about["went_on"] = [*about.get("went_on", []), went_on]
+    write_whole(folder / MANIFEST, to_json(about or now, indent=1))
+    return about or now
 
 
 def measure_parts(folder: Path, parts: dict[str, Part], workers: int, told: Told | None = None) -> None:

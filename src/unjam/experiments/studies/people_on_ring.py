@@ -24,7 +24,7 @@ from unjam.traffic.workers import EpisodeTask, Workers
 
 LENGTH = 230
 """[m], as in the experiment"""
-EPISODES = 10
+EPISODES = 5
 PAPERS, CALIBRATED, ONE_FOR_ALL = "paper's IDM", "calibrated drivers", "calibrated, all alike"
 TRAINED = "trained"
 """label of the controller that learned among the paper's people"""
