@@ -107,7 +107,6 @@ def ring() -> pd.DataFrame:
     """Return what happens on the ring, by who the people are and who drives the CAV."""
     table = []
     for (people, driver), found in rows_of("field/ring.json").groupby(["people", "driver"], sort=False):
-        dissolved = pd.to_numeric(found["time_to_dissolve"]).notna().sum()
         table.append(
             {
                 "people": people,
@@ -115,7 +114,6 @@ def ring() -> pd.DataFrame:
                 "mean speed, steady [m/s]": _mean(found["mean_speed_steady"], 2),
                 "speed std across vehicles, steady [m/s]": _mean(found["speed_std_fleet_steady"], 2),
                 "wave speed [m/s]": _mean(found["wave_speed"], 1),
-                "dissolved": f"{dissolved} of {len(found)}",
                 "collisions": int(found["collisions"].sum()),
             }
         )

@@ -1,6 +1,7 @@
-"""Puts calibrated people on the ring: python results/field/people_on_ring.py FOLDER DRIVERS.json CONTROLLER.
+"""Puts calibrated people on the ring: FOLDER CONTROLLER OWN_HEADWAY.json ALL_OWN.json [WORKERS].
 
-CONTROLLER is a run folder or a .unjam file, trained on the ring. FOLDER gets ring.json and ring.png.
+CONTROLLER is a run folder or a .unjam file, trained on the ring; the populations are of `unjam fit-drivers`.
+FOLDER gets ring.json and ring.png.
 """
 
 import sys
@@ -9,5 +10,6 @@ from pathlib import Path
 from unjam.experiments.studies.people_on_ring import run
 
 if __name__ == "__main__":
-    folder, population, controller = map(Path, sys.argv[1:4])
-    run(folder, population, controller, int(sys.argv[4]) if len(sys.argv) > 4 else 2, told=print)
+    folder, controller, headway, everything = map(Path, sys.argv[1:5])
+    populations = {"own headways": headway, "all parameters own": everything}
+    run(folder, populations, controller, int(sys.argv[5]) if len(sys.argv) > 5 else 2, told=print)

@@ -79,11 +79,21 @@ class Calibrated:
         return personal_idm(self.parameters, self.kept_headway, limits)
 
 
-def calibrate(pairs: Sequence[Pair], settings: CalibrationSettings | None = None) -> Calibrated:
+def calibrate(
+    pairs: Sequence[Pair],
+    settings: CalibrationSettings | None = None,
+    headways: Sequence[float] | None = None,
+) -> Calibrated:
     """Return the parameters that suit `pairs` best when all are driven by one IDM.
 
     Differential evolution over the error of the simulated gap; all candidates and all stretches are simulated
     at once.
+
+    Args:
+        pairs: trajectories.
+        settings: what is searched.
+        headways: by what factor the time headway of each trajectory's driver is known to differ; None: it is
+            not known.
 
     Raises:
         InputError: the pairs have different time steps.
@@ -92,8 +102,9 @@ def calibrate(pairs: Sequence[Pair], settings: CalibrationSettings | None = None
 
     settings = settings or CalibrationSettings()
     stretches = stretches_of(pairs, settings.seconds)
+    factors = 1.0 if headways is None else np.array(headways)[stretches.owner]
     found = differential_evolution(
-        gap_objective(stretches, settings.limits, settings.every),
+        gap_objective(stretches, settings.limits, settings.every, factors),
         bounds=[getattr(settings, name) for name in (*SEARCHED, KEPT)],
         popsize=settings.candidates,
         maxiter=settings.generations,
@@ -105,7 +116,8 @@ def calibrate(pairs: Sequence[Pair], settings: CalibrationSettings | None = None
     )
     *searched, kept = map(float, found.x)
     parameters = IDMParameters(**dict(zip(SEARCHED, searched, strict=True)))
-    drove = open_loop(personal_idm(parameters, kept, settings.limits), stretches)
+    driven = IDMRows(**{**vars(parameters), "time_headway": parameters.time_headway * factors})
+    drove = open_loop(personal_idm(driven, kept, settings.limits), stretches)
     weights = drove.moments / drove.moments.sum()
     return Calibrated(
         parameters,
@@ -118,13 +130,18 @@ def calibrate(pairs: Sequence[Pair], settings: CalibrationSettings | None = None
     )
 
 
-def gap_objective(stretches: Stretches, limits: Limits, every: str) -> Callable[[Floats], Floats]:
-    """Return the error of the simulated gap [m] as a function of candidates, shape (6, S) -> (S,)."""
+def gap_objective(
+    stretches: Stretches, limits: Limits, every: str, headways: Floats | float = 1.0
+) -> Callable[[Floats], Floats]:
+    """Return the error of the simulated gap [m] as a function of candidates, shape (6, S) -> (S,).
+
+    `headways` are factors on the time headway, of each stretch.
+    """
     moments = stretches.present[1:].sum(0)
 
     def objective(candidates: Floats) -> Floats:
         v0, headway, acceleration, deceleration, minimum_gap, kept = candidates.reshape(6, -1, 1)
-        rows = IDMRows(v0, headway, acceleration, deceleration, 4.0, minimum_gap)
+        rows = IDMRows(v0, headway * headways, acceleration, deceleration, 4.0, minimum_gap)
         squares = gap_squares(stretches, personal_idm(rows, kept, limits), len(v0))
         if every == "trajectory":
             return np.sqrt(squares).mean(1)

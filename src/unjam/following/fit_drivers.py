@@ -13,7 +13,8 @@ from unjam.following.calibration import SEARCHED, Calibrated, CalibrationSetting
 from unjam.following.each_driver import calibrate_each
 from unjam.following.multi_step import Known, MultiStepSettings, fit_multi_step
 from unjam.following.pairs import Pair, of_split, split_by_trajectory
-from unjam.parameters import STRICT, CountOrNone
+from unjam.parameters import STRICT, Count, CountOrNone
+from unjam.physics.idm import IDMParameters
 from unjam.scenarios.population import Population
 
 VALIDATION_SHARE = 0.2
@@ -31,6 +32,8 @@ class FitDriversSettings:
     """parameters of the IDM that each driver has for itself; the others are those that suit all. On NGSIM,
     with half a minute of each driver, own headways predict the next half better than one IDM for all, and
     all parameters own far worse"""
+    turns: Count = 3
+    """how often what is common and what is own are calibrated"""
     residual: bool = False
     """whether a network learns what all drivers do beside their own IDM, from simulated driving"""
     multi_step: MultiStepSettings = field(default_factory=MultiStepSettings)
@@ -65,22 +68,44 @@ def fit_drivers(
         raise wrong("drivers", len(names), f">= {FEWEST} for a residual")
     calibration = replace(settings.calibration, kept_headway=(0.0, 0.0))  # each has its own
     together = calibrate(pairs, calibration)
-    groups = [[pair for pair in pairs if pair.driver == name] for name in names]
-    each = calibrate_each(
-        groups, together.parameters, settings.own, calibration, lambda done: told and told(done, len(names))
-    )
-    found = dict(zip(names, each, strict=True))
+    typical, found = _levels(pairs, names, settings, calibration, told)
     residual, learned = None, {}
     if settings.residual:
         residual, learned = _residual(pairs, found, settings)
     return Population(
-        typical=together.parameters,
+        typical=typical,
         drivers=tuple(one.parameters for one in found.values()),
         limits=calibration.limits,
         residual=residual,
         details=tuple({"name": name, **_detail(one)} for name, one in found.items()),
         about={"fit": {"settings": asdict(settings), "together": _detail(together), **learned}},
     )
+
+
+def _levels(
+    pairs: Sequence[Pair],
+    names: Sequence[str],
+    settings: FitDriversSettings,
+    calibration: CalibrationSettings,
+    told: Callable[[int, int], None] | None,
+) -> tuple[IDMParameters, dict[str, Calibrated]]:
+    """Return what drivers have in common, and each driver's own, each calibrated given the other in turn.
+
+    One IDM for people who keep different distances is too soft: it must not react to gaps that are just the
+    driver's own. So what is common is calibrated with everybody's own headway.
+    """
+    groups = [[pair for pair in pairs if pair.driver == name] for name in names]
+    typical = calibrate(pairs, replace(calibration, kept_headway=(0.0, 1.0))).parameters
+    each: list[Calibrated] = []
+    for turn in range(settings.turns):
+        if turn:
+            own = {name: one.parameters.time_headway for name, one in zip(names, each, strict=True)}
+            factors = [own[pair.driver] / typical.time_headway for pair in pairs]
+            typical = calibrate(pairs, calibration, factors).parameters
+        each = calibrate_each(
+            groups, typical, settings.own, calibration, lambda done: told and told(done, len(names))
+        )
+    return typical, dict(zip(names, each, strict=True))
 
 
 def _residual(

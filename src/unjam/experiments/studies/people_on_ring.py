@@ -4,7 +4,6 @@ In the experiment of Sugiyama et al. (2008), 22 cars on 230 m, a jam arose by it
 traffic at about 20 km/h, 5.6 m/s; on motorways it is 15 to 20 km/h.
 """
 
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -17,41 +16,43 @@ from unjam.reports.figures import space_time
 from unjam.reports.metrics import measure
 from unjam.reports.results import read_results
 from unjam.reports.waves import wave_speed
-from unjam.scenarios.population import read_population
 from unjam.scenarios.registry import make_scenario
 from unjam.traffic.record import Episode
 from unjam.traffic.workers import EpisodeTask, Workers
 
-LENGTH = 230
-"""[m], as in the experiment"""
+ROAD: dict[str, Any] = {"length": (230, 230)}
+"""changes to `ring-jammed`: as long as in the experiment [m]"""
 EPISODES = 5
-PAPERS, CALIBRATED, ONE_FOR_ALL = "paper's IDM", "calibrated drivers", "calibrated, all alike"
+PAPERS = "paper's IDM"
 TRAINED = "trained"
 """label of the controller that learned among the paper's people"""
+TITLES = {"human": "no CAV", "pi": "PI", TRAINED: "PI + residual"}
 
 
-def run(folder: Path, population: Path, controller: Path, workers: int = 2, told: Told | None = None) -> None:
+def run(
+    folder: Path,
+    populations: dict[str, Path],
+    controller: Path,
+    workers: int = 2,
+    told: Told | None = None,
+) -> None:
     """Write `ring.json` and `ring.png` into `folder`: people alone, with PI, and with a trained controller.
 
     Args:
         folder: for the results.
-        population: file of `unjam fit-drivers`.
+        populations: files of `unjam fit-drivers`, by the label that they get.
         controller: run folder or .unjam file of a controller for the ring.
         workers: processes.
         told: told the name of each finished group of episodes.
     """
     make_folder(folder)
     about, rows = manifest(), []
-    typical = read_population(population).typical
-    roads: dict[str, dict[str, Any]] = {
-        PAPERS: {},
-        CALIBRATED: {"population": str(population.absolute())},
-        ONE_FOR_ALL: {"humans": asdict(typical)},
-    }
+    roads: dict[str, dict[str, Any]] = {PAPERS: {}}
+    roads |= {label: {"population": str(file.absolute())} for label, file in populations.items()}
     shown: dict[str, Episode] = {}
     with Workers(workers) as pool:
         for people, changes in roads.items():
-            scenario = make_scenario("ring-jammed", {"length": (LENGTH, LENGTH), **changes})
+            scenario = make_scenario("ring-jammed", {**ROAD, **changes})
             drivers = {name: make_driver(name, scenario.decision_step) for name in ("human", "pi")}
             drivers[TRAINED] = make_driver(str(controller), scenario.decision_step)
             for label, driver in drivers.items():
@@ -61,8 +62,7 @@ def run(folder: Path, population: Path, controller: Path, workers: int = 2, told
                 raise_failure(found)
                 for episode, row in zip(episodes, found, strict=True):
                     rows.append({"people": people, "driver": label, **row, "wave_speed": wave_speed(episode)})
-                if people != ONE_FOR_ALL:
-                    shown[f"{people}: {label}" if label != "human" else people] = episodes[0]
+                shown[f"{people}: {TITLES[label]}"] = episodes[0]
                 if told is not None:
                     told(f"{people}, {label}")
     write_whole(folder / "ring.json", to_json({"manifest": about, "rows": rows}, indent=1))
