@@ -19,8 +19,9 @@ EVERYWHERE = {"", "errors", "files", "parameters"}
 """what has no place in the order: it imports none of the layers"""
 ALLOWED = {
     "controller": {"drivers"},
+    "following": {"physics", "drivers", "scenarios"},
     "reports": {"physics", "drivers", "scenarios", "traffic"},
-    "experiments": {"controller", "reports"},
+    "experiments": {"controller", "following", "reports"},
     "cli": {"controller", "reports"},
     "environments": {"controller", "physics", "drivers", "scenarios", "traffic", "reports"},
 }
@@ -125,7 +126,7 @@ def test_sumo_is_imported_in_one_place() -> None:
 
 def test_learning_libraries_are_imported_only_where_we_learn() -> None:
     found = importers(TORCH)
-    assert {part_of(module) for module in found} <= {"agents", "experiments", "virtual"}
+    assert {part_of(module) for module in found} <= {"agents", "experiments", "following", "virtual"}
     assert "agents/policy.py" in found
 
 
@@ -193,7 +194,10 @@ except SystemExit as end:
 """
 
 
-@pytest.mark.parametrize("arguments", [["--help"], ["--version"], ["train", "--help"], ["drive", "--help"]])
+@pytest.mark.parametrize(
+    "arguments",
+    [["--help"], ["--version"], ["train", "--help"], ["drive", "--help"], ["fit-drivers", "--help"]],
+)
 def test_help_loads_nothing_that_takes_time(arguments: list[str]) -> None:
     found = loaded_by(HELP.format(arguments=arguments))
     assert "typer" in found

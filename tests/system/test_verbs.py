@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from tests.experiments.studies.test_field import table
 from tests.faults.processes import SETTINGS, TINY
 from tests.system.conftest import UNJAM, Run
 from tests.traffic.own_roads import game, straight
@@ -41,8 +42,8 @@ METRICS_OF_THE_DESIGN = [
     "speed_limit_ratio_steady",
 ]
 
-VERBS = ["scenarios", "drivers", "drive", "train", "evaluate", "model", "report", "export", "verify"]
-VERBS += ["watch", "bench", "doctor"]
+VERBS = ["scenarios", "drivers", "drive", "train", "evaluate", "model", "fit-drivers", "report"]
+VERBS += ["reproduce", "export", "verify", "watch", "bench", "doctor"]
 
 
 def document(ran: subprocess.CompletedProcess[str]) -> Any:
@@ -297,3 +298,24 @@ def test_a_reader_who_leaves_early_is_no_error(tmp_path: Path) -> None:
         assert process.stderr is not None
         process.stdout.close()
         assert b"Traceback" not in process.stderr.read()
+
+
+def test_calibrated_people_drive_on_a_road_and_judge_a_run_there(unjam: Run, tmp_path: Path) -> None:
+    table(tmp_path / "data.parquet", [{}, {}])
+    found = document(unjam("fit-drivers", "data.parquet", "--set", "calibration.generations=2", "--json"))
+    assert (found["drivers"], found["population"]) == (2, "drivers.json")
+    among = ["--humans", "drivers.json"]
+    people = [
+        document(unjam("drive", "ring", "-d", "human", "-n", 1, *SMALL, *each, "--json"))
+        for each in ([], among)
+    ]
+    assert people[0]["mean"]["mean_speed"] != people[1]["mean"]["mean_speed"]
+    ran = unjam(
+        *TINY_RUN, "--steps", 160, "--out", "run", *among, "--set", "virtual.base=population", "--json"
+    )
+    assert document(ran)["controller"] == "run/controller.unjam"
+    refused = unjam("evaluate", "run", *among)
+    assert (refused.returncode, refused.stderr.count("\n")) == (2, 1)
+    judged = document(unjam("evaluate", "run", "-n", 1, *among, "--out", "among", "--json"))
+    assert "trained" in {entry["driver"] for entry in judged["drivers"]}
+    assert (tmp_path / "among" / "report.html").is_file()

@@ -32,6 +32,9 @@ WRONG: dict[str, tuple[str, list[str]]] = {
     "no horizon": ("horizon: 0", ["drive ring --driver pi --set horizon=0"]),
     "unknown way of actuation": ("actuation: 'wild'", ["drive ring --driver pi --set actuation=wild"]),
     "setting without a value": ("key=value", ["drive ring --driver pi --set horizon"]),
+    "people that are missing": ("does not exist", ["drive ring --driver pi --humans none.json"]),
+    "people that are none": ("not a population", ["drive ring --driver pi --humans mine.py"]),
+    "trajectories that are missing": ("does not exist", ["fit-drivers none.csv"]),
     "unknown reward": ("released, released-merge, eq16", ["drive ring --driver pi --reward gold"]),
     "reward that is not in the file": ("has no 'ghost'", ["drive ring --driver pi --reward mine.py:ghost"]),
     "reward that is NaN": (

@@ -1,3 +1,4 @@
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -9,8 +10,11 @@ from hypothesis import strategies as st
 from unjam.drivers import LocalState
 from unjam.drivers.check import random_state
 from unjam.drivers.local_state import LARGEST_GAP
+from unjam.drivers.network import Network
 from unjam.physics import IDMParameters
 from unjam.scenarios import Ring
+from unjam.scenarios.population import Population, write_population
+from unjam.scenarios.registry import make_scenario
 from unjam.traffic.reward import make_reward
 from unjam.virtual.base import BASES, absent, base_reward, base_step
 
@@ -115,3 +119,22 @@ def test_the_reward_takes_the_mean_speed_of_those_that_are_there(name: str, kind
         headway = state.leader_gap[row] / max(state.speed[row], 1e-3)
         speeds = [float(getattr(state, n)[row]) for n in names]
         assert float(found[row]) == pytest.approx(expected_reward(name, speeds, headway, applied[row]))
+
+
+def test_the_typical_person_of_a_population_follows_with_its_residual(tmp_path: Path) -> None:
+    quarter = Network(((np.zeros((3, 1)), np.array([np.arctanh(0.5)])),), 0.5)
+    typical = IDMParameters(time_headway=1.3)
+    states = random_state(np.random.default_rng(0), 6)
+    applied, gentle = (
+        np.zeros(6),
+        states._replace(follower_speed=states.speed, follower_gap=states.speed * 2 + 3),
+    )
+    moved = {}
+    for residual in (None, quarter):
+        path = tmp_path / "drivers.json"
+        write_population(path, Population(typical, (typical,), (-4.0, 2.0), residual))
+        road = make_scenario("ring", {"population": str(path)})
+        moved[residual] = base_step("population", road, gentle, applied)
+    plain = base_step("idm", Ring(humans=typical), gentle, applied)
+    np.testing.assert_allclose(moved[None].follower_speed, plain.follower_speed)
+    np.testing.assert_allclose(moved[quarter].follower_speed, plain.follower_speed + 0.025)

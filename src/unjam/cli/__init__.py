@@ -15,6 +15,7 @@ from unjam.cli.doctor import doctor
 from unjam.cli.drive import drive
 from unjam.cli.evaluate import evaluate
 from unjam.cli.export import export
+from unjam.cli.fit_drivers import fit_drivers
 from unjam.cli.lists import drivers, scenarios
 from unjam.cli.model import model
 from unjam.cli.report import report
@@ -52,8 +53,8 @@ def _root(
 
 
 for verb in (
-    *(scenarios, drivers, drive, train, evaluate, model, report, reproduce),
-    *(export, verify, watch, bench, doctor),
+    *(scenarios, drivers, drive, train, evaluate, model, fit_drivers),
+    *(report, reproduce, export, verify, watch, bench, doctor),
 ):
     app.command()(verb)
 

@@ -11,6 +11,7 @@ from unjam.cli.options import (
     CavsOption,
     CavTypesOption,
     EpisodesOption,
+    HumansOption,
     JsonOption,
     LengthOption,
     OutOption,
@@ -48,6 +49,7 @@ def drive(
     warmup: WarmupOption = None,
     cav_share: CavShareOption = None,
     cav_types: CavTypesOption = None,
+    humans: HumansOption = None,
     reward: RewardOption = "",
     settings: Annotated[
         list[str] | None, typer.Option("--set", help="Any parameter of the scenario: key=value.")
@@ -70,6 +72,8 @@ def drive(
       unjam drive ring --driver my_driver.py:gentle --json
 
       unjam drive my.sumocfg --cav-share 0.1 --driver pi
+
+      unjam drive ring-jammed -d human -d pi --humans drivers.json
     """
     from unjam.cli.output import aside, console, counting_steps, metrics_table, print_json
     from unjam.experiments.drive import drive as run
@@ -77,7 +81,7 @@ def drive(
     from unjam.scenarios.registry import make_scenario
 
     road = {
-        **road_changes(length, radius, vehicles, cavs, warmup, cav_share, cav_types),
+        **road_changes(length, radius, vehicles, cavs, warmup, cav_share, cav_types, humans),
         **assignments(settings),
     }
     total = make_scenario(scenario, road).horizon * episodes * len(driver)

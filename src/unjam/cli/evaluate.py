@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from unjam.cli.options import DEFAULT_WORKERS, JsonOption, WorkersOption
+from unjam.cli.options import DEFAULT_WORKERS, HumansOption, JsonOption, WorkersOption
 from unjam.errors import InputError
 
 
@@ -15,37 +15,46 @@ def evaluate(
     episodes: Annotated[
         int, typer.Option("--episodes", "-n", min=1, help="Held-out episodes per driver.")
     ] = 20,
+    humans: HumansOption = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder for the results.", show_default="the run's own")
+    ] = None,
     workers: WorkersOption = DEFAULT_WORKERS,
     json: JsonOption = False,
 ) -> None:
     """Judge a trained controller beside every expert and all-human traffic, on fixed held-out seeds.
 
-    The run's evaluation and report are written anew.
+    The run's evaluation and report are written anew; with --out into another folder. Among other people
+    (--humans) it has to be another.
 
     Examples:
 
       unjam evaluate runs/ring-001
 
       unjam evaluate runs/ring-001 --episodes 50 --json
+
+      unjam evaluate runs/ring-001 --humans drivers.json --out runs/among-others
     """
     from unjam.cli.output import aside, console, counting_steps, metrics_table, print_json
     from unjam.drivers.registry import DRIVERS
     from unjam.experiments.folder import read_config
-    from unjam.experiments.judge import comparison, judge
+    from unjam.experiments.judge import among, comparison, judge
     from unjam.experiments.train import TrainResult, gain_of
     from unjam.reports.html import write_report
     from unjam.reports.statistics import summarise
     from unjam.reports.story import signed
     from unjam.traffic.workers import Workers
 
-    config = read_config(run)
+    if humans is not None and out is None:
+        raise InputError("humans: it is not allowed without --out: the run keeps its own evaluation")
+    config = among(read_config(run), humans)
     if not (run / "controller.unjam").is_file():
         raise InputError(f"run: {str(run)!r} has no controller yet; go on with: unjam train --resume {run}")
     total = len(comparison(config, run, list(DRIVERS))) * episodes * config.make_scenario().horizon
     with counting_steps("evaluating", total) as steps, Workers(workers) as pool:
-        found = judge(run, config, pool, list(DRIVERS), episodes, steps)
-    result = TrainResult(run, found.rows, gain_of(config, found.rows))
-    write_report([run], result.report)
+        found = judge(run, config, pool, list(DRIVERS), episodes, steps, out)
+    result = TrainResult(out or run, found.rows, gain_of(config, found.rows))
+    write_report([result.folder], result.report)
     if json:
         gain = asdict(result.gain) if result.gain else None
         drivers = [

@@ -43,6 +43,10 @@ CavTypesOption = Annotated[
     str | None,
     typer.Option("--cav-types", help="Vehicle types that are CAVs, on your own network: car,truck."),
 ]
+HumansOption = Annotated[
+    Path | None,
+    typer.Option("--humans", help="Calibrated drivers, of `unjam fit-drivers`: the people on the road."),
+]
 WarmupOption = Annotated[
     int | None, typer.Option("--warmup", help="All-human simulation steps before the CAVs take over.")
 ]
@@ -58,6 +62,7 @@ def road_changes(
     warmup: int | None,
     cav_share: float | None,
     cav_types: str | None,
+    humans: Path | None = None,
 ) -> dict[str, Any]:
     """Return the changes to a scenario that the road options ask for."""
     asked = {
@@ -68,6 +73,7 @@ def road_changes(
         "warmup": warmup,
         "cav_share": cav_share,
         "cav_types": cav_types.split(",") if cav_types else None,
+        "population": str(humans.absolute()) if humans else None,
     }
     return {name: value for name, value in asked.items() if value is not None}
 

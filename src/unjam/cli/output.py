@@ -95,6 +95,34 @@ def counting_steps(label: str, total: int) -> Iterator[Steps]:
         yield steps
 
 
+class Counted:
+    """Progress of things that are counted: a bar on a terminal, plain lines now and then elsewhere."""
+
+    def __init__(self, label: str) -> None:
+        """Prepare to count what is called `label`."""
+        self._label = label
+        self._bar = bar() if aside.is_terminal else None
+        self._last_line = time.monotonic()
+
+    def __enter__(self) -> "Counted":
+        if self._bar is not None:
+            self._bar.start()
+            self._task = self._bar.add_task(self._label, total=None)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._bar is not None:
+            self._bar.stop()
+
+    def __call__(self, done: int, of: int) -> None:
+        """Note how many are done, and of how many."""
+        if self._bar is not None:
+            self._bar.update(self._task, completed=done, total=of)
+        elif time.monotonic() - self._last_line > LINE_SECONDS:
+            self._last_line = time.monotonic()
+            aside.print(f"{self._label}: {done:,} of {of:,}")
+
+
 def bar() -> Progress:
     """Return a progress bar on standard error, gone when it is done."""
     return Progress(

@@ -12,6 +12,7 @@ from unjam.cli.options import (
     CavShareOption,
     CavsOption,
     CavTypesOption,
+    HumansOption,
     JsonOption,
     LengthOption,
     OutOption,
@@ -55,6 +56,7 @@ def train(
     warmup: WarmupOption = None,
     cav_share: CavShareOption = None,
     cav_types: CavTypesOption = None,
+    humans: HumansOption = None,
     workers: WorkersOption = DEFAULT_WORKERS,
     out: OutOption = None,
     resume: Annotated[
@@ -77,6 +79,8 @@ def train(
 
       unjam train ring --expert runs/ring-001        (a trained controller as the expert)
 
+      unjam train ring --humans drivers.json --set virtual.base=population
+
       unjam train --resume runs/ring-001 --steps 2000000
     """
     from unjam.experiments.config import load_config
@@ -87,7 +91,9 @@ def train(
     changes |= {"reward": reward} if reward else {}
     changes |= {
         f"road.{key}": value
-        for key, value in road_changes(length, radius, vehicles, cavs, warmup, cav_share, cav_types).items()
+        for key, value in road_changes(
+            length, radius, vehicles, cavs, warmup, cav_share, cav_types, humans
+        ).items()
     }
     changes |= {"workers": workers}
     for key, value in assignments(settings).items():

@@ -9,6 +9,7 @@ from unjam.cli.options import (
     CavShareOption,
     CavsOption,
     CavTypesOption,
+    HumansOption,
     JsonOption,
     LengthOption,
     RadiusOption,
@@ -38,6 +39,7 @@ def watch(
     warmup: WarmupOption = None,
     cav_share: CavShareOption = None,
     cav_types: CavTypesOption = None,
+    humans: HumansOption = None,
     settings: Annotated[
         list[str] | None, typer.Option("--set", help="Any parameter of the scenario: key=value.")
     ] = None,
@@ -65,7 +67,7 @@ def watch(
     road = make_scenario(
         scenario,
         {
-            **road_changes(length, radius, vehicles, cavs, warmup, cav_share, cav_types),
+            **road_changes(length, radius, vehicles, cavs, warmup, cav_share, cav_types, humans),
             **assignments(settings),
         },
     )

@@ -1,6 +1,7 @@
 """The final judgement of a run: its controller beside its expert and others, on held-out seeds."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from unjam.controller import make_driver
@@ -13,6 +14,13 @@ from unjam.traffic.workers import Workers
 
 TRAINED = "trained"
 """label of the trained controller in tables and pictures"""
+
+
+def among(config: RunConfig, humans: Path | None) -> RunConfig:
+    """Return a run's configuration with other people on its road: those of a population's file, if any."""
+    if humans is None:
+        return config
+    return replace(config, road={**config.road, "population": str(humans.absolute())})
 
 
 def comparison(config: RunConfig, folder: Path, baselines: Sequence[str]) -> dict[str, Driver]:
@@ -36,10 +44,12 @@ def judge(
     baselines: Sequence[str] | None = None,
     episodes: int | None = None,
     progress: Callable[[tuple[str, int], int], None] | None = None,
+    out: Path | None = None,
 ) -> Evaluation:
     """Evaluate a run's controller beside others on the same held-out seeds, and save it all in its folder.
 
-    `baselines` and `episodes` are the configuration's where they are not given.
+    `baselines` and `episodes` are the configuration's where they are not given; with `out` that is the folder
+    where it is saved.
     """
     scenario = config.make_scenario()
     drivers = comparison(config, folder, config.evaluation.baselines if baselines is None else baselines)
@@ -52,6 +62,6 @@ def judge(
         "expert": describe(config.make_expert()) if config.expert != "none" else "none",
         "manifest": manifest(),
     }
-    save_evaluation(folder, found, about)
+    save_evaluation(out or folder, found, about)
     raise_failure([row for rows in found.rows.values() for row in rows])
     return found

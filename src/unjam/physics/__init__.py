@@ -3,16 +3,19 @@
 from unjam.physics.idm import (
     PAPER_IDM,
     IDMParameters,
+    IDMRows,
     desired_gap,
     equilibrium_gap,
     equilibrium_speed,
     idm_acceleration,
+    parameter_rows,
 )
 from unjam.physics.kinematics import gap_on_loop, next_position, next_speed
 
 __all__ = [
     "PAPER_IDM",
     "IDMParameters",
+    "IDMRows",
     "desired_gap",
     "equilibrium_gap",
     "equilibrium_speed",
@@ -20,4 +23,5 @@ __all__ = [
     "idm_acceleration",
     "next_position",
     "next_speed",
+    "parameter_rows",
 ]

@@ -55,6 +55,13 @@ def at_least(array: Array, floor: Array) -> Array:
     return array.clip(floor, None)
 
 
+def square_root(array: Array) -> Array:
+    """Return the square root of each entry."""
+    if type(array) is float:
+        return math.sqrt(array)
+    return array**0.5 if not isinstance(array, (np.ndarray, np.generic)) else np.sqrt(array)
+
+
 def as_column(array: Array) -> Array:
     """Return `array` of shape (n,) as (n, 1); a float as a tuple of one."""
     return (array,) if type(array) is float else array[..., None]

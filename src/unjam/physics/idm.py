@@ -1,11 +1,15 @@
 """The Intelligent Driver Model (Treiber, Hennecke, Helbing 2000): how people follow the car ahead."""
 
+from collections.abc import Sequence
+from dataclasses import fields
 from math import sqrt
+from typing import NamedTuple
 
+import numpy as np
 from pydantic.dataclasses import dataclass
 
 from unjam.parameters import STRICT, Positive
-from unjam.physics.arrays import Array, at_least
+from unjam.physics.arrays import Array, at_least, square_root
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -26,30 +30,48 @@ class IDMParameters:
     """s0 [m], bumper to bumper at standstill"""
 
 
+class IDMRows(NamedTuple):
+    """The parameters of many drivers at once: as `IDMParameters`, arrays that broadcast with the states."""
+
+    desired_speed: Array
+    time_headway: Array
+    max_acceleration: Array
+    comfortable_deceleration: Array
+    exponent: Array
+    minimum_gap: Array
+
+
 PAPER_IDM = IDMParameters()
+
+PARAMETER_NAMES = tuple(field.name for field in fields(IDMParameters))
 
 HALVINGS = 60
 """of the interval in which the equilibrium speed lies: to the last bit"""
 
 
-def desired_gap(speed: Array, approach_rate: Array, parameters: IDMParameters = PAPER_IDM) -> Array:
+def parameter_rows(drivers: Sequence[IDMParameters]) -> IDMRows:
+    """Return the parameters of `drivers` as arrays of shape (drivers,)."""
+    return IDMRows(**{name: np.array([getattr(one, name) for one in drivers]) for name in PARAMETER_NAMES})
+
+
+def desired_gap(speed: Array, approach_rate: Array, parameters: IDMParameters | IDMRows = PAPER_IDM) -> Array:
     """Return the gap s* that a driver wants at this speed and approach rate (Eq. 6).
 
     Args:
         speed: own speed [m/s], any shape.
         approach_rate: own speed minus the leader's [m/s], same shape.
-        parameters: of the driver.
+        parameters: of the driver, or of the driver of each row.
 
     Returns:
         Desired bumper-to-bumper gap [m], same shape.
     """
     p = parameters
-    braking = 2.0 * sqrt(p.max_acceleration * p.comfortable_deceleration)
+    braking = 2.0 * square_root(p.max_acceleration * p.comfortable_deceleration)
     return p.minimum_gap + at_least(speed * p.time_headway + speed * approach_rate / braking, 0.0)
 
 
 def idm_acceleration(
-    speed: Array, leader_speed: Array, gap: Array, parameters: IDMParameters = PAPER_IDM
+    speed: Array, leader_speed: Array, gap: Array, parameters: IDMParameters | IDMRows = PAPER_IDM
 ) -> Array:
     """Return the acceleration of a driver behind a leader (Eq. 5).
 
@@ -57,7 +79,7 @@ def idm_acceleration(
         speed: own speed [m/s], any shape.
         leader_speed: speed of the vehicle ahead [m/s], same shape.
         gap: bumper-to-bumper distance [m], same shape; positive (the model divides by it).
-        parameters: of the driver.
+        parameters: of the driver, or of the driver of each row.
 
     Returns:
         Acceleration [m/s2], same shape; unbounded below as the gap closes.

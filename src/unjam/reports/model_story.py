@@ -14,10 +14,17 @@ NUMBERS = {
     "reward": ("reward", ""),
 }
 """what is predicted: its words and its unit"""
-BASES = {"idm": "IDM alone", "acc": "ACC alone", "ovm": "OVM alone", "none": "nothing changes"}
+BASES = {
+    "idm": "IDM alone",
+    "population": "typical driver alone",
+    "acc": "ACC alone",
+    "ovm": "OVM alone",
+    "none": "nothing changes",
+}
 """what the base alone is called"""
 _BASES_IN_WORDS = {
     "idm": "physics, with a follower that drives as the IDM",
+    "population": "physics, with a follower that drives as the typical one of a calibrated population",
     "acc": "physics, with a follower that drives as adaptive cruise control",
     "ovm": "physics, with a follower that drives as the optimal velocity model",
     "none": "nothing known but that nothing changes",

@@ -6,7 +6,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from unjam.scenarios.scenario import Scenario, cav_type, human_type
+from unjam.physics.idm import IDMParameters
+from unjam.scenarios.scenario import Scenario, cav_type, human_type_of, human_types
 
 
 class Edge(NamedTuple):
@@ -53,13 +54,17 @@ def words_of_range(whole: tuple[int, int]) -> str:
 
 
 def loop_traffic(
-    scenario: Scenario, edges: Sequence[Edge], ids: Sequence[str], positions: NDArray[np.float64]
+    scenario: Scenario,
+    edges: Sequence[Edge],
+    ids: Sequence[str],
+    positions: NDArray[np.float64],
+    people: dict[str, IDMParameters],
 ) -> str:
     """Return the XML of types, routes and vehicles that stand at `positions` along a closed road."""
     seconds = scenario.simulation_step * (scenario.warmup + scenario.horizon * scenario.steps_per_decision)
     length = sum(edge.length for edge in edges)
-    laps = int(seconds * scenario.humans.desired_speed / length) + 2
-    lines = ["<routes>", human_type(scenario), cav_type(scenario)]
+    laps = int(seconds * scenario.top_speed / length) + 2
+    lines = ["<routes>", *human_types(scenario, people), cav_type(scenario)]
     for first, edge in enumerate(edges):
         names = " ".join(other.name for other in [*edges[first:], *edges[:first]])
         lines.append(f'<route id="from_{edge.name}" edges="{names}" repeat="{laps}"/>')
@@ -67,7 +72,7 @@ def loop_traffic(
         edge = max((edge for edge in edges if edge.start <= position), key=lambda edge: edge.start)
         place = min(float(position) - edge.start, edge.length)
         lines.append(
-            f'<vehicle id="{name}" type="human" route="from_{edge.name}" depart="0" departSpeed="0" '
-            f'departLane="0" departPos="{place!r}"/>'
+            f'<vehicle id="{name}" {human_type_of(name, scenario, people)} route="from_{edge.name}" '
+            f'depart="0" departSpeed="0" departLane="0" departPos="{place!r}"/>'
         )
     return "\n".join([*lines, "</routes>"])

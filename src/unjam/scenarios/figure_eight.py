@@ -83,14 +83,15 @@ class FigureEight(Scenario):
         spacing = (_edge_length(radius) - self.free_ahead) / self.vehicles
         positions = _on_edges(np.arange(self.vehicles, dtype=np.float64) * spacing, edges)
         bottom, top, _, right, left, _ = edges
+        people = self.draw_people(ids, generator)
         return ClosedRoad(
             network=PlainNetwork(
                 _nodes(radius),
-                _edges(radius, self.humans.desired_speed),
+                _edges(radius, self.top_speed),
                 ("--no-turnarounds", "true"),
                 _CONNECTIONS,
             ),
-            traffic=loop_traffic(self, edges, ids, positions),
+            traffic=loop_traffic(self, edges, ids, positions, people),
             vehicle_ids=ids,
             cav_ids=cavs_among(ids),
             start_positions=positions,
@@ -99,6 +100,7 @@ class FigureEight(Scenario):
             limit_speed=self.limit(radius),
             outline=_outline(radius, edges),
             drawn={"radius": float(radius)},
+            people=people,
         )
 
     def limit(self, radius: int) -> float:

@@ -14,7 +14,7 @@ from unjam.physics.arrays import at_least
 from unjam.physics.idm import IDMParameters, idm_acceleration
 from unjam.physics.kinematics import next_position, next_speed
 from unjam.scenarios.road import MergingRoad, Origin, PlainNetwork
-from unjam.scenarios.scenario import VEHICLE_LENGTH, People, Scenario, cav_type, human_type
+from unjam.scenarios.scenario import VEHICLE_LENGTH, People, Scenario, cav_type, human_types
 
 INFLOW_EDGE, BEFORE, AFTER, RAMP = 100.0, 500.0, 100.0, 100.0
 """lengths of the edges on which vehicles enter, of the highway before and after the ramp, of the ramp [m]"""
@@ -119,14 +119,16 @@ class Merge(Scenario):
             '<route id="from_inflow_ramp" edges="inflow_ramp ramp after"/>',
         ]
         vehicles = [vehicle for _, vehicle in entering]
-        traffic = ["<routes>", human_type(self), cav_type(self), *routes, *vehicles, "</routes>"]
+        people = self.draw_people(tuple(origins), generator)
+        traffic = ["<routes>", *human_types(self, people), cav_type(self), *routes, *vehicles, "</routes>"]
         return MergingRoad(
-            network=PlainNetwork(_NODES, _edges(self.humans.desired_speed), ("--no-turnarounds", "true")),
+            network=PlainNetwork(_NODES, _edges(self.top_speed), ("--no-turnarounds", "true")),
             traffic="\n".join(traffic),
             limit_speed=self.limit(),
             origins=origins,
             cav_ids=frozenset(name for name in origins if name.startswith("cav")),
             junctions=JUNCTION_WAYS,
+            people=people,
         )
 
     def _times(self, flow: float) -> list[float]:

@@ -63,6 +63,11 @@ class OwnNetwork(Scenario):
                 raise ValueError(f"cav_share: no vehicle is a car; its types are {known}; name cav_types")
         if self.people != "native":
             raise ValueError("people: 'commanded' is not allowed on your own network; allowed: 'native'")
+        if self.population:
+            raise ValueError(
+                f"population: {self.population!r} is not allowed on your own network: people drive as its "
+                "vehicle types say"
+            )
         return self
 
     def draw(self, generator: np.random.Generator) -> OwnRoad:

@@ -8,6 +8,7 @@ from unjam.parameters import build
 from unjam.scenarios.figure_eight import FigureEight
 from unjam.scenarios.merge import Merge
 from unjam.scenarios.own_network import OwnNetwork, own_network
+from unjam.scenarios.population import read_population
 from unjam.scenarios.ring import Ring
 from unjam.scenarios.scenario import Scenario
 
@@ -43,7 +44,16 @@ def make_scenario(name: str, changes: dict[str, Any] | None = None) -> Scenario:
     scenario = SCENARIOS[name]
     if not changes:
         return scenario
+    if changes.get("population"):
+        changes = {**_of_population(str(changes["population"])), **changes}
     return build(type(scenario), {**asdict(scenario), **changes}, f"scenario {name}")
+
+
+def _of_population(file: str) -> dict[str, Any]:
+    """Return what else changes with a population: who is typical, and who computes how people drive."""
+    population = read_population(file)
+    commanded = {"people": "commanded"} if population.residual else {}
+    return {"humans": asdict(population.typical), **commanded}
 
 
 def scenario_recipe(scenario: Scenario) -> dict[str, Any]:

@@ -58,13 +58,14 @@ class Ring(Scenario):
         length = float(generator.integers(self.length[0], self.length[1], endpoint=True))
         ids = vehicle_names(self.vehicles, self.cavs)
         positions = np.arange(self.vehicles, dtype=np.float64) * (length / self.vehicles)
+        people = self.draw_people(ids, generator)
         return ClosedRoad(
             network=PlainNetwork(
                 _nodes(length),
-                _edges(length, self.humans.desired_speed),
+                _edges(length, self.top_speed),
                 ("--no-internal-links", "true", "--no-turnarounds", "true"),
             ),
-            traffic=loop_traffic(self, _loop(length), ids, positions),
+            traffic=loop_traffic(self, _loop(length), ids, positions, people),
             vehicle_ids=ids,
             cav_ids=cavs_among(ids),
             start_positions=positions,
@@ -73,6 +74,7 @@ class Ring(Scenario):
             limit_speed=equilibrium_speed(length / self.vehicles - VEHICLE_LENGTH, self.humans),
             outline=_outline(length),
             drawn={"length": length},
+            people=people,
         )
 
     @property

@@ -7,6 +7,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from unjam.physics.idm import IDMParameters
+
 
 @dataclass(frozen=True)
 class PlainNetwork:
@@ -42,6 +44,8 @@ class Road:
     """speed that the traffic cannot exceed in the long run [m/s]: the scenario's own limit; NaN: unknown"""
     drawn: dict[str, float] = field(default_factory=dict)
     """what the episode's seed has drawn, by name"""
+    people: dict[str, IDMParameters] = field(default_factory=dict)
+    """how each vehicle's human driver drives, by vehicle; empty: all as the scenario says"""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,5 +1,6 @@
 """What a scenario is: where the vehicles drive, how an episode starts and when it ends."""
 
+from collections.abc import Sequence
 from dataclasses import field
 from typing import Annotated, Any, ClassVar, Literal
 from xml.sax.saxutils import quoteattr
@@ -10,6 +11,7 @@ from pydantic.dataclasses import dataclass
 
 from unjam.parameters import STRICT, Count, CountOrNone, NotNegative, Positive
 from unjam.physics.idm import IDMParameters
+from unjam.scenarios.population import Population, read_population
 from unjam.scenarios.road import Road
 
 VEHICLE_LENGTH = 5.0
@@ -68,6 +70,9 @@ class Scenario:
     exactly; `flow` bound by the human IDM"""
     humans: IDMParameters = field(default_factory=IDMParameters)
     """how people drive"""
+    population: str = ""
+    """file of calibrated drivers, of `unjam fit-drivers`, each of whom drives in its own way; empty: all
+    drive as `humans` says"""
     people: People = "native"
     """who computes how people drive: `native` SUMO's own IDM; `commanded` the same IDM as a speed command in
     every step, as in Flow"""
@@ -94,8 +99,26 @@ class Scenario:
         return self.noise * scale
 
     @property
+    def calibrated(self) -> Population | None:
+        """The people of `population`."""
+        return read_population(self.population) if self.population else None
+
+    @property
+    def top_speed(self) -> float:
+        """What the road allows: as fast as the fastest driver wants to be [m/s]."""
+        population = self.calibrated
+        return population.fastest if population else self.humans.desired_speed
+
+    def draw_people(self, names: Sequence[str], generator: np.random.Generator) -> dict[str, IDMParameters]:
+        """Return who drives which vehicle; nobody where all drive as `humans` says."""
+        population = self.calibrated
+        return dict(zip(names, population.draw(len(names), generator), strict=True)) if population else {}
+
+    @property
     def people_in_words(self) -> str:
         """How people drive."""
+        if self.population:
+            return f"{len(read_population(self.population).drivers)} calibrated drivers of {self.population}"
         return f"IDM with acceleration noise of std {self.noise_per_step:.3f} m/s2 a step"
 
     def draw(self, generator: np.random.Generator) -> Road:
@@ -151,16 +174,30 @@ def type_xml(attributes: dict[str, Any]) -> str:
     return f"<vType {pairs}/>"
 
 
-def human_type(scenario: Scenario) -> str:
-    """Return the XML of the human drivers: SUMO's own IDM with the scenario's parameters.
+def human_types(scenario: Scenario, people: dict[str, IDMParameters]) -> list[str]:
+    """Return the XML of the human drivers: SUMO's own IDM with the scenario's parameters, or each its own.
 
     Under commanded people lies Flow's layer: quick, and with no gap of its own.
     """
-    return vehicle_type("human", scenario, **_human_layer(scenario))
+    own = people if scenario.people == "native" else {}
+    return [
+        vehicle_type("human", scenario, **_human_layer(scenario, scenario.humans)),
+        *(vehicle_type(f"of_{name}", scenario, **_human_layer(scenario, one)) for name, one in own.items()),
+    ]
 
 
-def _human_layer(scenario: Scenario) -> dict[str, Any]:
-    humans = scenario.humans
+def human_type_of(name: str, scenario: Scenario, people: dict[str, IDMParameters]) -> str:
+    """Return which of `human_types` a vehicle has, as attributes of its XML.
+
+    SUMO would not let a driver who keeps a large distance begin closer than that.
+    """
+    own = name in people and scenario.people == "native"
+    checks = ' insertionChecks="none"' if own else ""
+    return f'type="{f"of_{name}" if own else "human"}"{checks}'
+
+
+def _human_layer(scenario: Scenario, humans: IDMParameters) -> dict[str, Any]:
+    population = scenario.calibrated
     layer = {
         "carFollowModel": "IDM",
         "accel": humans.max_acceleration,
@@ -172,6 +209,8 @@ def _human_layer(scenario: Scenario) -> dict[str, Any]:
     }
     if scenario.people == "commanded":
         layer |= {"accel": 2.6, "decel": 4.5, "tau": 1.0, "minGap": scenario.people_gap}
+        if population:  # the layer may not hold back who keeps less than a second
+            layer |= {"tau": min(1.0, population.quickest), "maxSpeed": population.fastest}
     return layer
 
 
@@ -182,11 +221,11 @@ def cav_type(scenario: Scenario) -> str:
     touches.
     """
     if scenario.actuation == "flow":
-        layer = _human_layer(scenario)
+        layer = _human_layer(scenario, scenario.humans)
         smallest = max(layer["minGap"], SMALLEST_CAV_GAP)
         return vehicle_type("cav", scenario, color=CAV_COLOUR, **{**layer, "minGap": smallest})
     layer = obedient_layer(scenario.simulation_step)
-    return vehicle_type("cav", scenario, **layer, maxSpeed=scenario.humans.desired_speed)
+    return vehicle_type("cav", scenario, **layer, maxSpeed=scenario.top_speed)
 
 
 def obedient_layer(simulation_step: float) -> dict[str, Any]:

@@ -19,7 +19,7 @@ from unjam.physics.kinematics import next_position, next_speed
 from unjam.scenarios.road import ClosedRoad
 from unjam.scenarios.scenario import Scenario
 from unjam.traffic.neighbours import loop_neighbours, loop_state
-from unjam.traffic.people import wanted_speeds
+from unjam.traffic.people import drivers_of, wanted_speeds
 from unjam.traffic.places import places_along
 from unjam.traffic.simulation import Simulation
 from unjam.traffic.traffic import Scene, Stay, Traffic, TrafficLog
@@ -54,6 +54,7 @@ class ClosedTraffic(Traffic[ClosedRoad]):
         self._cavs = cavs
         self._near = loop_neighbours(cavs[0] if self.single else np.array(cavs), len(road.vehicle_ids))
         self._commanded = scenario.people == "commanded"
+        self._drivers = drivers_of(scenario, road, road.vehicle_ids)
         needed = [range(len(road.vehicle_ids))] if self._commanded else self._near
         self._near_positions: dict[int, float] = {
             int(place): float(road.start_positions[place])
@@ -183,7 +184,9 @@ class ClosedTraffic(Traffic[ClosedRoad]):
         noise = [0.0] * len(self._speeds)
         if self.scenario.noise > 0:
             noise = self._next_noise()
-        wanted = wanted_speeds(self.scenario, self.road, people, self._speeds, self._near_positions, noise)
+        wanted = wanted_speeds(
+            self.scenario, self.road, self._drivers, people, self._speeds, self._near_positions, noise
+        )
         self._simulation.command_speeds(self._human_ids, wanted)
 
     def exploration_noise(self) -> Iterator[Array]:

@@ -8,13 +8,13 @@ import numpy as np
 from unjam.drivers.idm import SMALLEST_GAP
 from unjam.drivers.local_state import LocalState
 from unjam.errors import EpisodeError
-from unjam.physics.idm import idm_acceleration
+from unjam.physics.idm import idm_acceleration, parameter_rows
 from unjam.physics.kinematics import next_speed
 from unjam.scenarios.road import MergingRoad
 from unjam.scenarios.scenario import Scenario
 from unjam.traffic.network_files import network_file, network_lines
 from unjam.traffic.open import OpenTraffic
-from unjam.traffic.people import LEAVE_TO_SUMO
+from unjam.traffic.people import LEAVE_TO_SUMO, as_calibrated, drivers_of
 from unjam.traffic.simulation import Simulation
 from unjam.traffic.streams import Streams
 from unjam.traffic.traffic import Floats, TrafficLog
@@ -66,7 +66,10 @@ class MergingTraffic(OpenTraffic[MergingRoad]):
         gaps = streams.gaps(leaders).clip(SMALLEST_GAP, None)
         speeds = streams.speeds
         ahead = np.where(leaders < 0, speeds, speeds[leaders])
-        acceleration = idm_acceleration(speeds, ahead, gaps, scenario.humans)
+        drivers = drivers_of(scenario, self.road, streams.names)
+        humans = parameter_rows(drivers) if self.road.people else scenario.humans
+        acceleration = idm_acceleration(speeds, ahead, gaps, humans)
+        acceleration = as_calibrated(scenario.calibrated, acceleration, speeds, ahead, gaps)
         if scenario.noise > 0:
             noise = self._noise_generator.standard_normal(len(speeds))
             acceleration = acceleration + scenario.noise_per_step * noise

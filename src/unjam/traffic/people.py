@@ -1,22 +1,45 @@
-"""How commanded people drive: the paper's IDM with noise, as a speed for each step, as Flow does it."""
+"""How commanded people drive: IDM with noise, as a speed for each step, as Flow does it."""
 
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
+
 from unjam.drivers.idm import SMALLEST_GAP
-from unjam.physics.arrays import at_least
-from unjam.physics.idm import idm_acceleration
+from unjam.physics.arrays import Array, at_least, clip, stack_columns
+from unjam.physics.idm import IDMParameters, idm_acceleration
 from unjam.physics.kinematics import gap_on_loop
-from unjam.scenarios.road import ClosedRoad
+from unjam.scenarios.population import Population
+from unjam.scenarios.road import ClosedRoad, Road
 from unjam.scenarios.scenario import VEHICLE_LENGTH, Scenario
 
 LEAVE_TO_SUMO = -1.0
 """the commanded speed that stands for none"""
 
 
+def drivers_of(scenario: Scenario, road: Road, names: Sequence[str]) -> list[IDMParameters]:
+    """Return how the human driver of each vehicle drives."""
+    return [road.people.get(name, scenario.humans) for name in names]
+
+
+def as_calibrated(
+    population: Population | None, acceleration: Array, speed: Array, leader_speed: Array, gap: Array
+) -> Array:
+    """Return IDM accelerations with what a population adds to them: its residual and its limits [m/s2].
+
+    Shapes: all arrays (n,). Without a population the accelerations are as they were.
+    """
+    if population is None:
+        return acceleration
+    if population.residual is not None:
+        acceleration = acceleration + population.residual(stack_columns((speed, leader_speed - speed, gap)))
+    return clip(acceleration, *population.limits)
+
+
 def wanted_speeds(
     scenario: Scenario,
     road: ClosedRoad,
+    drivers: Sequence[IDMParameters],
     people: Sequence[int],
     speeds: Sequence[float],
     positions: Any,
@@ -25,24 +48,32 @@ def wanted_speeds(
     """Return the speeds that people want after the next step [m/s]; on a crossing SUMO drives them.
 
     Args:
-        scenario: whose IDM they drive by.
+        scenario: whose people they are.
         road: on which they drive, closed and with one lane.
+        drivers: how each drives, by place.
         people: their places in road order.
         speeds: of all vehicles [m/s], by place.
         positions: of all front bumpers along the road, not wrapped [m], by place.
         noise: by how much noise changes each speed [m/s], by place.
     """
-    step, loop, humans, count = scenario.simulation_step, road.loop_length, scenario.humans, len(speeds)
-    wanted = []
-    for place in people:
+    step, loop, count = scenario.simulation_step, road.loop_length, len(speeds)
+    population = scenario.calibrated
+    wanted: list[float] = [LEAVE_TO_SUMO] * len(people)
+    seen: list[tuple[int, float, float, float]] = []
+    accelerations: list[float] = []
+    for index, place in enumerate(people):
         position = positions[place]
         on_road = position % loop
         if any(start <= on_road < end for start, end in road.crossings):
-            wanted.append(LEAVE_TO_SUMO)
             continue
         ahead = place + 1 if place + 1 < count else 0
-        gap = gap_on_loop(position, positions[ahead], loop, VEHICLE_LENGTH)
+        gap = at_least(gap_on_loop(position, positions[ahead], loop, VEHICLE_LENGTH), SMALLEST_GAP)
         speed = speeds[place]
-        acceleration = idm_acceleration(speed, speeds[ahead], at_least(gap, SMALLEST_GAP), humans)
-        wanted.append(at_least(speed + acceleration * step + noise[place], 0.0))
+        accelerations.append(idm_acceleration(speed, speeds[ahead], gap, drivers[place]))
+        seen.append((index, speed, speeds[ahead], gap))
+    if population is not None and seen:
+        _, *columns = (np.array(column, np.float64) for column in zip(*seen, strict=True))
+        accelerations = as_calibrated(population, np.array(accelerations), *columns).tolist()
+    for (index, speed, *_), acceleration in zip(seen, accelerations, strict=True):
+        wanted[index] = at_least(speed + acceleration * step + noise[people[index]], 0.0)
     return wanted

@@ -1,26 +1,43 @@
 """What is known before anything is learned: physics, how people follow, and what a reward is made of."""
 
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from math import nan
 
 from unjam.drivers.acc import ACC
-from unjam.drivers.driver import Driver
-from unjam.drivers.idm import IDM
+from unjam.drivers.driver import Driver, Memory
+from unjam.drivers.idm import IDM, SMALLEST_GAP
 from unjam.drivers.local_state import LARGEST_GAP, LocalState
 from unjam.drivers.ovm import OVM
-from unjam.physics.arrays import Array, as_column, namespace, stack_columns
+from unjam.physics.arrays import Array, as_column, at_least, namespace, stack_columns
+from unjam.physics.idm import idm_acceleration
 from unjam.physics.kinematics import next_position, next_speed
 from unjam.scenarios.scenario import Scenario
+from unjam.traffic.people import as_calibrated
 from unjam.traffic.reward import Outcome, Reward, time_headway
 
 BASES: dict[str, Callable[[Scenario], Driver] | None] = {
     "idm": lambda scenario: IDM(**asdict(scenario.humans)),
+    "population": lambda scenario: TypicalPerson(scenario),
     "acc": lambda scenario: ACC(set_speed=scenario.humans.desired_speed),
     "ovm": lambda scenario: OVM(largest_speed=scenario.humans.desired_speed),
     "none": None,
 }
 """Who is taken to drive behind the CAV, a driver without memory; None: nothing is known."""
+
+
+@dataclass(frozen=True)
+class TypicalPerson(Driver):
+    """The typical driver of a road's calibrated population, with its residual; without one, its IDM alone."""
+
+    scenario: Scenario
+
+    def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
+        """Return how such a driver accelerates; nothing is remembered."""
+        gap = at_least(state.leader_gap, SMALLEST_GAP)
+        seen = (state.speed, state.leader_speed, gap)
+        acceleration = idm_acceleration(*seen, self.scenario.humans)
+        return as_calibrated(self.scenario.calibrated, acceleration, *seen), memory
 
 
 def largest_gap(state: LocalState) -> Array:

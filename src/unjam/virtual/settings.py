@@ -7,7 +7,7 @@ from pydantic.dataclasses import dataclass
 
 from unjam.parameters import STRICT, Count, CountOrNone, NotNegative, Positive
 
-BaseName = Literal["idm", "acc", "ovm", "none"]
+BaseName = Literal["idm", "population", "acc", "ovm", "none"]
 ErrorName = Literal["unexplained", "total_variation", "released"]
 
 
@@ -16,7 +16,8 @@ class VirtualSettings:
     """The virtual environment: its model, how it is fitted, and the length of its rollouts."""
 
     base: BaseName = "idm"
-    """what is known before learning: how the follower drives; `none`: nothing, all is learned"""
+    """what is known before learning: how the follower drives; `population`: as the typical driver of the
+    road's calibrated population, residual included; `none`: nothing, all is learned"""
     members: Count = 5
     """networks in the ensemble"""
     hidden: Annotated[tuple[Count, ...], Field(min_length=1)] = (64, 64)

@@ -105,7 +105,7 @@ class VirtualWorld:
         wanted_speeds, wanted_gaps = numbers[: len(SPEEDS)], numbers[GAP_ROWS]
         crashed = (wanted_gaps <= 0.0).any(0)
         largest = largest_gap(state)
-        speeds = wanted_speeds.clip(0.0, scenario.humans.desired_speed)
+        speeds = wanted_speeds.clip(0.0, scenario.top_speed)
         gaps = wanted_gaps.clip(0.0).minimum(largest)
         left_of_reward = left[-1].clip(self._lowest, self._highest)
         nobody = gaps >= largest

@@ -1,0 +1,192 @@
+"""Tables of how people drive, from files under results/figure-6/ and results/field/."""
+
+import json
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from tables import RESULTS
+
+from unjam.reports.statistics import estimate
+
+NETWORKS = {"knowledge": "IDM + residual", "vanilla": "network alone", "nearest row": "nearest row"}
+MODELS = {
+    "paper's IDM": "paper's IDM",
+    "paper's IDM, clipped": "the same, clipped",
+    "IDM, every moment": "IDM, calibrated on all moments alike",
+    "IDM": "IDM, calibrated on all trajectories alike",
+    "IDM, headway kept": "the same, part of the first headway kept",
+    "vanilla": "network alone",
+    "knowledge, paper's IDM": "paper's IDM + residual",
+    "knowledge, paper's IDM clipped": "paper's IDM, clipped + residual",
+    "knowledge, IDM": "calibrated IDM + residual",
+    "IDM + multi-step": "calibrated IDM + multi-step residual",
+    "IDM, headway kept + multi-step": "part of the first headway kept + multi-step residual",
+    "IDM, own headway": "calibrated IDM, each driver's own headway",
+    "IDM, all own": "IDM, all parameters each driver's own",
+}
+
+
+def rows_of(name: str) -> pd.DataFrame:
+    """Return the rows of a results file."""
+    return pd.DataFrame(json.loads((RESULTS / name).read_text())["rows"])
+
+
+def figure_6(**chosen: Any) -> pd.DataFrame:
+    """Return the rows of the study of Fig. 6 with these values, by size, network, repeat."""
+    rows = rows_of("figure-6/figure-6.json")
+    for name, value in chosen.items():
+        rows = rows[rows[name] == value]
+    return rows.sort_values(["size", "network", "repeat"])
+
+
+def errors(driver: str, longer: bool = False, name: str = "error_of_driver") -> pd.DataFrame:
+    """Return the mean error and its standard deviation over the repeats, by size and network."""
+    rows = figure_6(driver=driver, split="trajectories", longer=longer)
+    table = []
+    for size, found in rows[rows["network"] != "nearest row"].groupby("size"):
+        cells: dict[str, Any] = {"share of the data": f"{100 * size:g} %"}
+        for network, here in found.groupby("network"):
+            cells[NETWORKS[str(network)]] = f"{here[name].mean():.4f} ± {here[name].std(ddof=0):.4f}"
+        table.append({**cells, "repeats": int(found["repeat"].nunique())})
+    return pd.DataFrame(table)
+
+
+def leaks() -> pd.DataFrame:
+    """Return the error on the test rows by split: what rows that training has seen hide."""
+    rows = figure_6(driver="other", longer=False)
+    rows = rows[rows["size"].isin([0.01, 0.1, 1.0])]
+    words = {"trajectories": "by trajectory", "rows": "row by row", "released": "as the released code"}
+    table = []
+    for (size, network), found in rows.groupby(["size", "network"]):
+        cells: dict[str, Any] = {"share of the data": f"{100 * size:g} %", "": NETWORKS[str(network)]}
+        for split, heading in words.items():
+            here = found[found["split"] == split]["error"]
+            cells[heading] = f"{here.mean():.4f}" if len(here) else "–"
+        table.append(cells)
+    return pd.DataFrame([row for row in table if row["row by row"] != "–"])
+
+
+def field(data: str, test: str, models: Sequence[str] = tuple(MODELS)) -> pd.DataFrame:
+    """Return errors on a test set: of a single seed with its interval, of several their mean and range."""
+    rows = rows_of("field/field.json")
+    rows = rows[(rows["data"] == data) & (rows["test"] == test)]
+    table = []
+    for model in models:
+        found = rows[rows["model"] == model]
+        if found.empty:
+            continue
+        table.append(
+            {
+                "": MODELS[model],
+                "gap, driving on [m]": _cell(found, "gap"),
+                "speed, driving on [m/s]": f"{found['speed'].mean():.2f}",
+                "collided": f"{100 * found['collided'].mean():.0f} %",
+                "one step [m/s²]": f"{found['one_step'].mean():.3f}",
+            }
+        )
+    return pd.DataFrame(table)
+
+
+def _cell(found: pd.DataFrame, name: str) -> str:
+    values = found[name]
+    low, high = np.array(found[f"{name}_interval"].tolist()).mean(0)
+    seeds = f"; seeds {values.min():.2f} to {values.max():.2f}" if len(found) > 1 else ""
+    return f"{values.mean():.2f} [{low:.2f}, {high:.2f}]{seeds}"
+
+
+def gap_error(model: str, data: str = "ngsim", test: str = "test") -> float:
+    """Return the error of the gap, mean over seeds [m]."""
+    rows = rows_of("field/field.json")
+    chosen = (rows["data"] == data) & (rows["test"] == test) & (rows["model"] == model)
+    return float(rows[chosen]["gap"].mean())
+
+
+def ring() -> pd.DataFrame:
+    """Return what happens on the ring, by who the people are and who drives the CAV."""
+    table = []
+    for (people, driver), found in rows_of("field/ring.json").groupby(["people", "driver"], sort=False):
+        table.append(
+            {
+                "people": people,
+                "CAV": {"human": "none", "pi": "PI", "trained": "PI + residual"}[str(driver)],
+                "mean speed, steady [m/s]": _mean(found["mean_speed_steady"], 2),
+                "speed std across vehicles, steady [m/s]": _mean(found["speed_std_fleet_steady"], 2),
+                "wave speed [m/s]": _mean(found["wave_speed"], 1),
+                "collisions": int(found["collisions"].sum()),
+            }
+        )
+    return pd.DataFrame(table)
+
+
+def _mean(values: pd.Series, digits: int) -> str:
+    found = estimate([float("nan") if value is None else float(value) for value in values])
+    if found.count == 0:
+        return "no wave"
+    interval = f" [{found.low:.{digits}f}, {found.high:.{digits}f}]" if found.count > 1 else ""
+    return f"{found.mean:.{digits}f}{interval}"
+
+
+def claims() -> pd.DataFrame:
+    """Return what the paper says of the knowledge network, and what was measured."""
+    rows = figure_6(driver="other", split="trajectories", longer=False)
+    return pd.DataFrame(
+        [
+            {"the paper": words, "here": verdict, "number": number}
+            for words, verdict, number in (
+                _loss(rows),
+                _sizes(rows, "lower error at every size of the data", "mean"),
+                _sizes(rows, "smaller spread at every size", "std"),
+                _one_step(),
+                _driving_on(),
+            )
+        ]
+    )
+
+
+def _loss(rows: pd.DataFrame) -> tuple[str, str, str]:
+    whole = rows[(rows["size"] == 1.0) & (rows["network"] != "nearest row")]
+    reached = {}
+    for network, found in whole.groupby("network"):
+        limit = 1.05 * float(found["noise"].iloc[0]) ** 2
+        curves = [np.array(curve) for curve in found["training_loss"]]
+        passes = [
+            int(np.argmax(curve <= limit)) + 1 if (curve <= limit).any() else len(curve) for curve in curves
+        ]
+        reached[str(network)] = float(np.mean(passes))
+    held = reached["knowledge"] < reached["vanilla"]
+    with_idm, without = (f"{reached[name]:.0f}" for name in ("knowledge", "vanilla"))
+    number = f"passes to a loss 5 % above the noise: {with_idm} with IDM, {without} without"
+    return "faster convergence", "held" if held else "not held", number
+
+
+def _sizes(rows: pd.DataFrame, words: str, how: str) -> tuple[str, str, str]:
+    found = rows[rows["network"] != "nearest row"].groupby(["size", "network"])["error_of_driver"].agg(how)
+    table = found.unstack()
+    better = table["knowledge"] < table["vanilla"]
+    names = [f"{100 * size:g} %" for size in table.index]
+    held = [name for name, one in zip(names, better, strict=True) if one]
+    verdict = (
+        "held" if better.all() else "not held" if not better.any() else f"held at {', '.join(held)} alone"
+    )
+    number = "; ".join(
+        f"{name}: {row['knowledge']:.3f} and {row['vanilla']:.3f}"
+        for name, (_, row) in zip(names, table.iterrows(), strict=True)
+    )
+    return words, verdict, f"with and without IDM [m/s²]: {number}"
+
+
+def _one_step() -> tuple[str, str, str]:
+    rows = rows_of("field/field.json")
+    rows = rows[(rows["data"] == "ngsim") & (rows["test"] == "others")]
+    means = rows.groupby("model")["one_step"].mean()
+    knowledge, alone = means["knowledge, paper's IDM clipped"], means["vanilla"]
+    number = f"one step, NGSIM, 218 drivers: {knowledge:.3f} m/s² with IDM, {alone:.3f} without"
+    return "it captures what real drivers do", "held" if knowledge < alone else "not held", number
+
+
+def _driving_on() -> tuple[str, str, str]:
+    idm, knowledge = (gap_error(model, test="others") for model in ("IDM", "knowledge, IDM"))
+    number = f"error of the gap, driving on: {knowledge:.2f} m with the residual, {idm:.2f} m without"
+    return "the residual improves on IDM", "held" if knowledge < idm else "not held", number

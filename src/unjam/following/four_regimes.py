@@ -1,0 +1,144 @@
+"""A made-up set of car following in four regimes: acceleration, deceleration, cruising, emergency braking.
+
+The paper trains and judges its knowledge network (Fig. 6) on such a set of 262,630 rows, after Mo, Shi and Di
+(2021), and leaves most of its making open. Here every choice is a parameter, and all that is drawn comes from
+one seed.
+"""
+
+from dataclasses import field
+
+import numpy as np
+from pydantic import model_validator
+from pydantic.dataclasses import dataclass
+
+from unjam.following.pairs import Floats, Pair
+from unjam.parameters import STRICT, Count, CountOrNone, NotNegative, Positive
+from unjam.physics.arrays import at_least
+from unjam.physics.idm import IDMParameters, desired_gap, idm_acceleration
+from unjam.physics.kinematics import next_position, next_speed
+
+REGIMES = ("acceleration", "deceleration", "cruising", "emergency braking")
+
+TREIBER_IDM = IDMParameters(
+    desired_speed=33.3, time_headway=1.6, max_acceleration=0.73, comfortable_deceleration=1.67
+)
+"""the drivers of Treiber, Hennecke and Helbing (2000)"""
+
+SMALLEST_GAP = 0.1
+"""what the driver is told at least [m]: noise may not drive it into its leader and out at the other side"""
+
+Range = tuple[float, float]
+
+
+@dataclass(frozen=True, config=STRICT)
+class FourRegimes:
+    """How the set is made; the defaults are ours where the paper is silent."""
+
+    rows: Count = 262_630
+    """moments with an acceleration, of all regimes together, as many of each as is possible (the paper: the
+    total)"""
+    seconds: Positive = 30.0
+    """length of a trajectory; the last of the set is cut where the rows are full"""
+    step: Positive = 0.1
+    """time between two moments [s]"""
+    driver: IDMParameters = field(default_factory=lambda: TREIBER_IDM)
+    """who follows: the truth, which the knowledge network's own IDM need not share"""
+    noise: NotNegative = 0.2
+    """standard deviation of the Gaussian noise on each acceleration [m/s2]; it moves the follower too"""
+    speed: Range = (5.0, 25.0)
+    """of the follower at the start, uniform [m/s] (the paper: `varied`)"""
+    leader_faster: Range = (0.0, 8.0)
+    """acceleration: by how much the leader is faster, uniform [m/s]"""
+    leader_slower: Range = (0.0, 8.0)
+    """deceleration: by how much the leader is slower at the start, uniform [m/s]"""
+    cruising_difference: Range = (-0.5, 0.5)
+    """cruising: leader's speed minus the follower's at the start, uniform [m/s]"""
+    emergency_slower: Range = (4.0, 15.0)
+    """emergency braking: by how much the leader is slower at the start, uniform [m/s]"""
+    acceleration: Range = (0.1, 0.5)
+    """acceleration: of the follower at the start, as a share of what an empty road would give, uniform"""
+    deceleration: Range = (-2.0, 0.0)
+    """deceleration: of the follower at the start, uniform [m/s2] (the paper)"""
+    emergency: float = -2.0
+    """emergency braking: of the follower at the start [m/s2] (the paper)"""
+    seed: CountOrNone = 0
+
+    @model_validator(mode="after")
+    def _possible(self) -> "FourRegimes":
+        if self.speed[1] >= self.driver.desired_speed:
+            raise ValueError(
+                f"speed: {self.speed[1]} m/s is not allowed at the start; allowed: below the driver's "
+                f"desired speed, {self.driver.desired_speed} m/s"
+            )
+        return self
+
+
+def four_regimes(settings: FourRegimes) -> list[Pair]:
+    """Return the trajectories, the regimes in turn; `kind` names the regime.
+
+    The leader keeps its speed. Each trajectory starts with the gap at which the driver's own model gives the
+    acceleration that belongs to the regime. They have `settings.rows` accelerations together.
+    """
+    generator = np.random.default_rng(settings.seed)
+    length = max(1, round(settings.seconds / settings.step))
+    count = -(-settings.rows // length)
+    regime = np.arange(count) % len(REGIMES)
+    speed, leader_speed, gap = _starts(regime, settings, generator)
+    noise = generator.normal(0.0, settings.noise, (length, count))
+    speeds, gaps = np.empty((length + 1, count)), np.empty((length + 1, count))
+    speeds[0], gaps[0] = speed, gap
+    for moment in range(length):
+        seen = at_least(gap, SMALLEST_GAP)
+        acceleration = idm_acceleration(speed, leader_speed, seen, settings.driver) + noise[moment]
+        speed = next_speed(speed, acceleration, settings.step)
+        gap = next_position(gap, leader_speed - speed, settings.step)
+        speeds[moment + 1], gaps[moment + 1] = speed, gap
+    pairs = []
+    for number in range(count):
+        kept = min(length, settings.rows - number * length) + 1
+        pairs.append(
+            Pair(
+                name=f"{number}",
+                driver=f"{number}",
+                step=settings.step,
+                speed=speeds[:kept, number].copy(),
+                leader_speed=np.full(kept, leader_speed[number]),
+                gap=gaps[:kept, number].copy(),
+                kind=REGIMES[regime[number]],
+            )
+        )
+    return pairs
+
+
+def _starts(
+    regime: np.ndarray, settings: FourRegimes, generator: np.random.Generator
+) -> tuple[Floats, Floats, Floats]:
+    """Return speed, leader's speed and gap at the start of each trajectory."""
+
+    def uniform(within: Range) -> Floats:
+        return generator.uniform(*within, size=len(regime))
+
+    p = settings.driver
+    speed = uniform(settings.speed)
+    free = p.max_acceleration * (1.0 - (speed / p.desired_speed) ** p.exponent)
+    leader_speed = np.choose(
+        regime,
+        [
+            speed + uniform(settings.leader_faster),
+            speed - uniform(settings.leader_slower),
+            speed + uniform(settings.cruising_difference),
+            speed - uniform(settings.emergency_slower),
+        ],
+    ).clip(0.0, None)
+    wanted = np.choose(
+        regime,
+        [
+            uniform(settings.acceleration) * free,
+            uniform(settings.deceleration),
+            np.zeros(len(regime)),
+            np.full(len(regime), settings.emergency),
+        ],
+    )
+    # Eq. 5 solved for the gap.
+    interaction = (free - wanted) / p.max_acceleration
+    return speed, leader_speed, desired_gap(speed, speed - leader_speed, p) / np.sqrt(interaction)

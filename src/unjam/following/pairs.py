@@ -1,0 +1,180 @@
+"""What is known of how people drive: one follower behind one leader, moment by moment."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from unjam.errors import wrong
+from unjam.physics.kinematics import next_position
+
+Floats = NDArray[np.float64]
+
+SPLITS = ("train", "validation", "test")
+
+
+@dataclass(frozen=True, eq=False)
+class Pair:
+    """How one driver followed one leader; T evenly spaced moments."""
+
+    name: str
+    """of this trajectory, unlike that of any other"""
+    driver: str
+    """who followed; several trajectories may be of one driver"""
+    step: float
+    """time between two moments [s]"""
+    speed: Floats = field(repr=False)
+    """of the follower [m/s], shape (T,)"""
+    leader_speed: Floats = field(repr=False)
+    """[m/s], shape (T,)"""
+    gap: Floats = field(repr=False)
+    """from the follower's front bumper to the leader's rear bumper [m], shape (T,)"""
+    kind: str = ""
+    """of driver, where the data say it: `human`, `ACC`"""
+    split: str = ""
+    """to which part of a published split it belongs, where there is one"""
+
+    @property
+    def seconds(self) -> float:
+        """How long it lasts [s]."""
+        return (len(self.speed) - 1) * self.step
+
+    @cached_property
+    def acceleration(self) -> Floats:
+        """Between each moment and the next, as an Euler step has it [m/s2], shape (T - 1,)."""
+        return np.diff(self.speed) / self.step
+
+    @cached_property
+    def leader_path(self) -> Floats:
+        """Where the leader's rear bumper is, from where the follower's front began [m], shape (T,).
+
+        The follower's way by Euler steps, plus the gap: so a follower that drives as this one did keeps
+        exactly the recorded gap, whatever errors there are in the leader's speed.
+        """
+        way = next_position(np.zeros(len(self.speed)), np.r_[0.0, np.cumsum(self.speed[1:])], self.step)
+        return self.gap + way
+
+    def part(self, first: int, last: int, name: str = "") -> "Pair":
+        """Return the moments from `first` on and before `last` as a trajectory of its own."""
+        cut = slice(first, last)
+        values = (self.speed[cut], self.leader_speed[cut], self.gap[cut])
+        return Pair(name or self.name, self.driver, self.step, *values, self.kind, self.split)
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """Single moments, without what came before; n rows."""
+
+    speed: Floats
+    leader_speed: Floats
+    gap: Floats
+    acceleration: Floats
+    """until the next moment [m/s2]"""
+
+    def __len__(self) -> int:
+        return len(self.speed)
+
+    def some(self, chosen: NDArray[np.int64]) -> "Rows":
+        """Return the chosen rows."""
+        return Rows(*(values[chosen] for values in vars(self).values()))
+
+
+def rows_of(pairs: Sequence[Pair]) -> Rows:
+    """Return all moments of `pairs` but the last of each, one after the other."""
+    return Rows(
+        np.concatenate([pair.speed[:-1] for pair in pairs]),
+        np.concatenate([pair.leader_speed[:-1] for pair in pairs]),
+        np.concatenate([pair.gap[:-1] for pair in pairs]),
+        np.concatenate([pair.acceleration for pair in pairs]),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Stretches:
+    """Trajectories side by side, of up to T moments; the first index is time. n stretches."""
+
+    speed: Floats = field(repr=False)
+    """[m/s], shape (T, n); past the end of a stretch its last value"""
+    leader_speed: Floats = field(repr=False)
+    gap: Floats = field(repr=False)
+    leader_path: Floats = field(repr=False)
+    """of `Pair`"""
+    present: NDArray[np.bool_] = field(repr=False)
+    """whether the stretch lasts that long, shape (T, n)"""
+    step: float
+    """[s]"""
+    owner: NDArray[np.int64] = field(repr=False)
+    """which pair each stretch is of, shape (n,)"""
+
+    def some(self, chosen: NDArray[np.int64]) -> "Stretches":
+        """Return the chosen stretches, as long as the longest of them."""
+        long = int(self.present[:, chosen].sum(0).max())
+        return Stretches(
+            self.speed[:long, chosen],
+            self.leader_speed[:long, chosen],
+            self.gap[:long, chosen],
+            self.leader_path[:long, chosen],
+            self.present[:long, chosen],
+            self.step,
+            self.owner[chosen],
+        )
+
+
+def stretches_of(pairs: Sequence[Pair], seconds: float | None = None) -> Stretches:
+    """Return `pairs` side by side, cut into stretches of `seconds`, the last of each as long as it is.
+
+    None: each pair whole. What is left at an end and shorter than two moments is not there.
+
+    Raises:
+        InputError: the pairs have different time steps.
+    """
+    steps = {pair.step for pair in pairs}
+    if len(steps) != 1:
+        raise wrong("time step", sorted(steps), "one and the same in all trajectories [s]")
+    (step,) = steps
+    parts: list[Pair] = []
+    owner: list[int] = []
+    for number, pair in enumerate(pairs):
+        length = len(pair.speed) if seconds is None else round(seconds / step) + 1
+        for first in range(0, len(pair.speed) - 1, max(1, length - 1)):
+            parts.append(pair.part(first, first + length))
+            owner.append(number)
+    longest = max(len(part.speed) for part in parts)
+
+    def side_by_side(name: str) -> Floats:
+        columns = [getattr(part, name) for part in parts]
+        return np.stack([np.pad(column, (0, longest - len(column)), mode="edge") for column in columns], 1)
+
+    lengths = np.array([len(part.speed) for part in parts])
+    return Stretches(
+        side_by_side("speed"),
+        side_by_side("leader_speed"),
+        side_by_side("gap"),
+        side_by_side("leader_path"),
+        np.arange(longest)[:, None] < lengths,
+        step,
+        np.array(owner),
+    )
+
+
+def split_by_trajectory(pairs: Sequence[Pair], shares: Sequence[float], seed: int) -> list[Pair]:
+    """Return `pairs` with `split` set to train, validation or test; all pairs of a driver go together.
+
+    Args:
+        pairs: any number.
+        shares: of training, validation and test, of the number of drivers; they add up to one.
+        seed: who goes where.
+    """
+    drivers = sorted({pair.driver for pair in pairs})
+    order = np.random.default_rng(seed).permutation(len(drivers))
+    borders = np.round(np.cumsum(shares) * len(drivers)).astype(int)
+    places = np.searchsorted(borders, np.argsort(order), side="right").clip(max=len(SPLITS) - 1)
+    split = {driver: SPLITS[place] for driver, place in zip(drivers, places, strict=True)}
+    return [replace(pair, split=split[pair.driver]) for pair in pairs]
+
+
+def of_split(pairs: Sequence[Pair], *names: str) -> list[Pair]:
+    """Return the pairs of these parts of the split."""
+    return [pair for pair in pairs if pair.split in names]

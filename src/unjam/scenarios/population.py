@@ -1,0 +1,173 @@
+"""A population of drivers, as `unjam fit-drivers` calibrates it: who the people on a road may be.
+
+A population is `NAME.json`, where it has a residual network with `NAME.safetensors` beside it. Nothing in it
+is ever executed.
+"""
+
+import hashlib
+import json
+from dataclasses import asdict, dataclass, field
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from safetensors import SafetensorError
+from safetensors.numpy import load, save
+
+from unjam import __version__
+from unjam.drivers.network import Network, network_arrays, network_from_arrays
+from unjam.errors import InputError
+from unjam.files import to_json, write_whole
+from unjam.parameters import build
+from unjam.physics.idm import PARAMETER_NAMES, IDMParameters
+
+FORMAT = 1
+RESIDUAL_INPUTS = 3
+"""own speed [m/s], the leader's minus own [m/s], gap [m]"""
+LARGEST = 64 * 2**20
+"""bytes of a file"""
+WRITTEN = ("format", "unjam", "typical", "spread", "limits", "drivers", "residual")
+"""keys of the file; others are `about`"""
+
+
+@dataclass(frozen=True, eq=False)
+class Population:
+    """Drivers as they were calibrated, one set of parameters each."""
+
+    typical: IDMParameters
+    """the one IDM that suits all of them best together"""
+    drivers: tuple[IDMParameters, ...] = field(repr=False)
+    limits: tuple[float, float]
+    """within which their acceleration was kept [m/s2]"""
+    residual: Network | None = None
+    """what all of them do beside their IDM: a network of RESIDUAL_INPUTS that answers [m/s2]"""
+    details: tuple[dict[str, Any], ...] = field(default=(), repr=False)
+    """of each driver, whatever else is known"""
+    about: dict[str, Any] = field(default_factory=dict, repr=False)
+    """where it comes from"""
+
+    @property
+    def fastest(self) -> float:
+        """The largest desired speed [m/s]."""
+        return max(one.desired_speed for one in (self.typical, *self.drivers))
+
+    @property
+    def quickest(self) -> float:
+        """The smallest time headway [s]."""
+        return min(one.time_headway for one in (self.typical, *self.drivers))
+
+    def draw(self, count: int, generator: np.random.Generator) -> list[IDMParameters]:
+        """Return `count` drivers, drawn with replacement; each keeps its own parameters together."""
+        return [self.drivers[index] for index in generator.integers(len(self.drivers), size=count)]
+
+    def spread(self) -> dict[str, dict[str, float]]:
+        """Return mean, standard deviation and quartiles of each parameter."""
+        found = {}
+        for name in PARAMETER_NAMES:
+            values = np.array([getattr(one, name) for one in self.drivers])
+            low, median, high = np.quantile(values, [0.25, 0.5, 0.75])
+            found[name] = {
+                "mean": float(values.mean()),
+                "std": float(values.std()),
+                "quartiles": [float(low), float(median), float(high)],
+            }
+        return found
+
+
+def write_population(path: Path, population: Population) -> None:
+    """Write a population to `path`, its residual beside it."""
+    residual = None
+    if population.residual is not None:
+        weights = save(network_arrays(population.residual))
+        beside = path.with_suffix(".safetensors")
+        residual = {
+            "file": beside.name,
+            "sha256": hashlib.sha256(weights).hexdigest(),
+            "authority": population.residual.authority,
+        }
+        write_whole(beside, weights)
+    details = population.details or ({},) * len(population.drivers)
+    drivers = [{**detail, **asdict(one)} for detail, one in zip(details, population.drivers, strict=True)]
+    content = {
+        "format": FORMAT,
+        "unjam": __version__,
+        "typical": asdict(population.typical),
+        "spread": population.spread(),
+        "limits": list(population.limits),
+        "residual": residual,
+        **population.about,
+        "drivers": drivers,
+    }
+    write_whole(path, to_json(content, indent=1))
+
+
+def read_population(path: Path | str) -> Population:
+    """Return the population of a file.
+
+    Raises:
+        InputError: there is none, or it is damaged, or not a population.
+    """
+    path = Path(path)
+    try:
+        stamp = path.stat()
+    except OSError:
+        raise InputError(f"population: {str(path)!r} does not exist") from None
+    return _read(path, stamp.st_mtime_ns, stamp.st_size)
+
+
+@lru_cache(maxsize=8)
+def _read(path: Path, changed: int, size: int) -> Population:
+    """Read a file once, as long as it stays as it is: every episode asks for it."""
+    if size > LARGEST:
+        raise InputError(f"population {path.name}: {size} bytes are not allowed; allowed: <= {LARGEST}")
+    try:
+        content = json.loads(path.read_bytes())
+        if content["format"] != FORMAT:
+            raise InputError(f"population {path.name}: format {content['format']!r} is unknown")
+        drivers = tuple(
+            build(
+                IDMParameters, {name: one[name] for name in PARAMETER_NAMES}, f"population.drivers.{number}"
+            )
+            for number, one in enumerate(content["drivers"])
+        )
+        if not drivers:
+            raise InputError(f"population {path.name}: it has no drivers")
+        low, high = (float(limit) for limit in content["limits"])
+        return Population(
+            typical=build(IDMParameters, content["typical"], "population.typical"),
+            drivers=drivers,
+            limits=(low, high),
+            residual=_residual(path, content["residual"]),
+            details=tuple(
+                {key: value for key, value in one.items() if key not in PARAMETER_NAMES}
+                for one in content["drivers"]
+            ),
+            about={key: value for key, value in content.items() if key not in WRITTEN},
+        )
+    except (
+        OSError,
+        ValueError,
+        KeyError,
+        TypeError,
+        AttributeError,
+        RecursionError,
+        SafetensorError,
+    ) as error:
+        words = f"no {error}" if isinstance(error, KeyError) else " ".join(str(error).split())
+        raise InputError(f"population {path.name}: not a population: {words}") from None
+
+
+def _residual(path: Path, named: dict[str, Any] | None) -> Network | None:
+    if named is None:
+        return None
+    beside = path.parent / Path(str(named["file"])).name  # never a file of another folder
+    if beside.stat().st_size > LARGEST:
+        raise InputError(f"population {path.name}: its residual is too large")
+    weights = beside.read_bytes()
+    if hashlib.sha256(weights).hexdigest() != named["sha256"]:
+        raise InputError(f"population {path.name}: damaged: {beside.name} does not have the hash it names")
+    network = network_from_arrays(load(weights), float(named["authority"]), 0.0)
+    if network.inputs != RESIDUAL_INPUTS:
+        raise InputError(f"population {path.name}: {network.inputs} inputs are not allowed; allowed: 3")
+    return network

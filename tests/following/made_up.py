@@ -1,0 +1,40 @@
+"""Drivers that are made up: what tests calibrate on."""
+
+import numpy as np
+
+from unjam.following.open_loop import Follow, drive_behind, idm_follow
+from unjam.following.pairs import Pair
+from unjam.physics.idm import IDMParameters, equilibrium_gap
+
+STEP = 0.1
+
+
+def follower(
+    driver: Follow,
+    name: str = "0",
+    seconds: float = 40.0,
+    speed: float = 8.0,
+    gap: float = 14.0,
+    seed: int = 0,
+    split: str = "",
+) -> Pair:
+    """How `driver` follows a leader whose speed goes up and down."""
+    times = np.arange(round(seconds / STEP) + 1) * STEP
+    phase = np.random.default_rng(seed).uniform(0, 6)
+    leader_speed = 8.0 + 3.0 * np.sin(0.25 * times + phase) + np.sin(0.9 * times)
+    leader_path = gap + np.r_[0.0, np.cumsum(leader_speed[1:]) * STEP]
+    leader = (leader_speed[:, None], leader_path[:, None])
+    driven = list(drive_behind(driver, (np.array([speed]), np.array([gap])), leader, STEP))
+    speeds, gaps = (
+        np.concatenate([[first], *rows])
+        for first, rows in zip((speed, gap), zip(*driven, strict=True), strict=True)
+    )
+    return Pair(name, name, STEP, speeds, leader_speed, gaps, "human", split)
+
+
+def idm_driver(
+    parameters: IDMParameters, name: str = "0", seed: int = 0, seconds: float = 40.0, split: str = ""
+) -> Pair:
+    """How an IDM follows, from its own equilibrium gap on."""
+    gap = equilibrium_gap(8.0, parameters)
+    return follower(idm_follow(parameters), name, seconds, 8.0, gap, seed, split)

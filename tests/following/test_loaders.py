@@ -1,0 +1,182 @@
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from unjam.errors import InputError
+from unjam.following.loaders import FOOT, Reading, read_pairs
+
+SHORT = Reading(shortest=1.0)
+SPEED, LEADER, GAP = 10.0, 12.0, 20.0
+MOMENTS = 30
+
+
+def table(path: Path, **changes: object) -> Path:
+    """A plain table of two pairs, the second of which begins later."""
+    parts = []
+    for pair, begin in (("one", 0.0), ("two", 100.0)):
+        times = begin + 0.1 * np.arange(MOMENTS)
+        gap = GAP + (LEADER - SPEED) * 0.1 * np.arange(MOMENTS)
+        parts.append(
+            pd.DataFrame({"pair": pair, "time": times, "speed": SPEED, "leader_speed": LEADER, "gap": gap})
+        )
+    frame = pd.concat(parts, ignore_index=True).assign(**changes)
+    frame.to_parquet(path) if path.suffix == ".parquet" else frame.to_csv(path, index=False)
+    return path
+
+
+def ngsim(path: Path, feet: float = FOOT, **changes: object) -> Path:
+    """Two vehicles, the second behind the first, in the public format: feet and milliseconds."""
+    rows = []
+    for vehicle, preceding, front, speed in ((7, 0, 100.0, LEADER), (8, 7, 100.0 - GAP - 5.0, SPEED)):
+        for moment in range(MOMENTS):
+            rows.append(
+                {
+                    "Vehicle_ID": vehicle,
+                    "Frame_ID": moment,
+                    "Global_Time": 1118846980200 + 100 * moment,
+                    "Local_Y": (front + speed * 0.1 * moment) / feet,
+                    "v_Length": 5.0 / feet,
+                    "v_Vel": speed / feet,
+                    "Lane_ID": 2,
+                    "Preceding": preceding,
+                    "Location": "i-80",
+                }
+            )
+    pd.DataFrame(rows).assign(**changes).to_csv(path, index=False)
+    return path
+
+
+def reconstructed(path: Path, header: bool) -> Path:
+    """The same in metres, as the reconstructed files have it."""
+    rows = []
+    for vehicle, leader, front, speed in ((7, 0, 100.0, LEADER), (8, 7, 100.0 - GAP - 5.0, SPEED)):
+        for frame in range(MOMENTS):
+            rows.append([vehicle, frame, 2, front + speed * 0.1 * frame, speed, 0.0, 5.0, 2, 0, leader])
+    names = ["Vehicle_ID", "Frame_ID", "Lane_ID", "LocalY", "Mean_Speed", "Mean_Accel", "Vehicle_length"]
+    names += ["Vehicle_Class_ID", "Follower_ID", "Leader_ID"]
+    pd.DataFrame(rows, columns=names).to_csv(path, index=False, header=header)
+    return path
+
+
+def openacc(path: Path) -> Path:
+    """A platoon of three, whose third driver is a machine."""
+    times = 0.1 * np.arange(MOMENTS)
+    gap = GAP + (LEADER - SPEED) * times
+    frame = pd.DataFrame({"Time": times, "Speed1": LEADER, "Speed2": SPEED, "Speed3": SPEED})
+    frame = frame.assign(IVS1=gap, IVS2=15.0, Driver1="Human", Driver2="Human", Driver3="ACC")
+    above = 'Date,04/07/2019\nVehicle_order,"Audi(A8), Tesla(Model3), BMW(X5)"\n\n'
+    path.write_text(above + frame.to_csv(index=False))
+    return path
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".parquet"])
+def test_a_plain_table(tmp_path: Path, suffix: str) -> None:
+    found = read_pairs(table(tmp_path / f"t{suffix}", kind="human", driver="me"), reading=SHORT)
+    assert [pair.name for pair in found.pairs] == ["one", "two"]
+    pair = found.pairs[0]
+    assert (pair.step, pair.kind, pair.driver) == (0.1, "human", "me")
+    assert (pair.speed[0], pair.leader_speed[0], pair.gap[0]) == (SPEED, LEADER, GAP)
+    assert found.words() == ["2 trajectories with 60 of 60 rows"]
+
+
+@pytest.mark.parametrize(
+    "make", [ngsim, lambda path: reconstructed(path, True), lambda path: reconstructed(path, False), openacc]
+)
+def test_public_formats_say_the_same_in_si_units(tmp_path: Path, make) -> None:
+    pair = read_pairs(make(tmp_path / "data.csv"), reading=SHORT).pairs[0]
+    assert len(pair.speed) == MOMENTS
+    assert pair.step == 0.1
+    np.testing.assert_allclose(pair.speed, SPEED)
+    np.testing.assert_allclose(pair.leader_speed, LEADER)
+    np.testing.assert_allclose(pair.gap, GAP + (LEADER - SPEED) * 0.1 * np.arange(MOMENTS), atol=1e-6)
+
+
+def test_who_has_nobody_ahead_is_counted(tmp_path: Path) -> None:
+    found = read_pairs(ngsim(tmp_path / "data.csv"), reading=SHORT)
+    assert found.words() == [
+        "1 trajectories with 30 of 60 rows",
+        "left out: 30 rows: nobody ahead, or not recorded",
+    ]
+
+
+def test_metres_are_not_taken_for_feet(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"median length of its vehicles would be 1\.5 m"):
+        read_pairs(ngsim(tmp_path / "data.csv", feet=1.0), reading=SHORT)
+
+
+def test_openacc_names_its_drivers(tmp_path: Path) -> None:
+    found = read_pairs(openacc(tmp_path / "platoon.csv"), reading=SHORT)
+    assert [(pair.driver, pair.kind) for pair in found.pairs] == [
+        ("Tesla(Model3)", "Human"),
+        ("BMW(X5)", "ACC"),
+    ]
+
+
+def spoilt(path: Path, row: int, column: str, value: object) -> Path:
+    frame = pd.read_csv(table(path)).astype({column: object})
+    frame.loc[row, column] = value
+    frame.to_csv(path, index=False)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("column", "value", "words"),
+    [
+        ("gap", "near", r"line 7: gap: nan is not allowed; allowed: 0 to 1000"),
+        ("speed", -3, r"line 7: speed: -3 is not allowed; allowed: 0 to 70"),
+        ("leader_speed", 300, r"line 7: leader_speed: 300 is not allowed"),
+        ("time", 0.3, r"line 7: time: 0.3 is there twice in its pair"),
+    ],
+)
+def test_a_bad_row_is_refused_by_its_line(tmp_path: Path, column: str, value: object, words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        read_pairs(spoilt(tmp_path / "t.csv", 5, column, value), reading=SHORT)
+
+
+def test_a_bad_row_may_be_cut_out_and_is_told(tmp_path: Path) -> None:
+    path = spoilt(tmp_path / "t.csv", 12, "gap", "")
+    found = read_pairs(path, reading=Reading(cut_bad=True, shortest=1.0))
+    assert [len(pair.speed) for pair in found.pairs] == [12, 17, 30]
+    assert len({pair.name for pair in found.pairs}) == 3
+    assert [(row.line, row.why) for row in found.bad] == [(14, "gap: nan is not allowed; allowed: 0 to 1000")]
+    assert "cut out: line 14: gap: nan is not allowed; allowed: 0 to 1000" in found.words()
+
+
+def test_short_trajectories_are_counted(tmp_path: Path) -> None:
+    path = table(tmp_path / "t.csv")
+    frame = pd.read_csv(path)
+    frame.drop(index=[40]).to_csv(path, index=False)
+    found = read_pairs(path, reading=Reading(shortest=1.5))
+    assert [len(pair.speed) for pair in found.pairs] == [30, 19]
+    assert found.left_out == {"trajectories shorter than 1.5 s": 10}
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda path: path / "none.csv", "does not exist"),
+        (lambda path: table(path / "t.csv").rename(path / "t.parquet"), "cannot be read"),
+        (lambda path: openacc(path / "t.csv"), "no column 'pair'; it has: Time"),
+    ],
+)
+def test_what_cannot_be_read(tmp_path: Path, make, words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        read_pairs(make(tmp_path), "table", SHORT)
+
+
+def test_a_table_without_anything_long_enough(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no trajectory lasts 20 s"):
+        read_pairs(table(tmp_path / "t.csv"))
+
+
+def test_columns_may_name_the_driver(tmp_path: Path) -> None:
+    path = table(tmp_path / "t.csv", period=400, follower=5)
+    pairs = read_pairs(path, reading=Reading(shortest=1.0, driver=("period", "follower"))).pairs
+    assert {pair.driver for pair in pairs} == {"400-5"}
+
+
+def test_an_unknown_format(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="format: 'highd' is not allowed"):
+        read_pairs(table(tmp_path / "t.csv"), "highd")

@@ -1,0 +1,110 @@
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from unjam.drivers.network import Network
+from unjam.errors import InputError
+from unjam.physics.idm import PAPER_IDM, IDMParameters
+from unjam.scenarios.population import Population, read_population, write_population
+from unjam.scenarios.registry import make_scenario, scenario_from_recipe, scenario_recipe
+
+DRIVERS = (
+    IDMParameters(time_headway=0.8, desired_speed=35.0),
+    IDMParameters(time_headway=1.6, minimum_gap=4.0),
+)
+NETWORK = Network(((np.ones((3, 2)), np.zeros(2)), (np.full((2, 1), 0.01), np.zeros(1))), 0.5)
+
+
+def written(folder: Path, residual: Network | None = None) -> Path:
+    path = folder / "drivers.json"
+    details = ({"name": "a"}, {"name": "b"})
+    about = {"data": ["x.csv"]}
+    write_population(path, Population(PAPER_IDM, DRIVERS, (-4.0, 2.0), residual, details, about))
+    return path
+
+
+@pytest.mark.parametrize("residual", [None, NETWORK])
+def test_what_is_written_is_read_again(tmp_path: Path, residual: Network | None) -> None:
+    found = read_population(written(tmp_path, residual))
+    assert (found.typical, found.drivers, found.limits) == (PAPER_IDM, DRIVERS, (-4.0, 2.0))
+    assert [detail["name"] for detail in found.details] == ["a", "b"]
+    assert found.about == {"data": ["x.csv"]}
+    assert (found.fastest, found.quickest) == (35.0, 0.8)
+    seen = np.array([[5.0, 1.0, 9.0]])
+    assert (found.residual is None) == (residual is None)
+    if found.residual is not None:
+        np.testing.assert_allclose(found.residual(seen), NETWORK(seen))
+
+
+def test_a_file_that_changes_is_read_anew(tmp_path: Path) -> None:
+    path = written(tmp_path)
+    assert len(read_population(path).drivers) == 2
+    write_population(path, Population(PAPER_IDM, DRIVERS[:1], (-4.0, 2.0)))
+    assert len(read_population(path).drivers) == 1
+
+
+def damaged(path: Path, **changes: object) -> Path:
+    path.write_text(json.dumps({**json.loads(path.read_text()), **changes}))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"format": 7}, "format 7 is unknown"),
+        ({"drivers": []}, "no drivers"),
+        ({"drivers": [{"time_headway": 1.0}]}, "no 'desired_speed'"),
+        ({"typical": {"time_headway": -1.0}}, r"population.typical.time_headway: -1.0 is not allowed"),
+        ({"limits": [1.0]}, "not a population"),
+        ({"residual": {"file": "../drivers.json", "sha256": "0", "authority": 1.0}}, "hash it names"),
+        ({"residual": {"file": "gone.safetensors", "sha256": "0", "authority": 1.0}}, "not a population"),
+    ],
+)
+def test_a_damaged_file_is_refused_in_one_line(tmp_path: Path, changes: dict, words: str) -> None:
+    with pytest.raises(InputError, match=words) as error:
+        read_population(damaged(written(tmp_path, NETWORK), **changes))
+    assert "\n" not in str(error.value)
+
+
+def test_damaged_weights_are_refused(tmp_path: Path) -> None:
+    path = written(tmp_path, NETWORK)
+    beside = path.with_suffix(".safetensors")
+    content = bytearray(beside.read_bytes())
+    content[-1] ^= 1
+    beside.write_bytes(content)
+    with pytest.raises(InputError, match="damaged"):
+        read_population(path)
+
+
+def test_what_is_no_population(tmp_path: Path) -> None:
+    (tmp_path / "x.json").write_text("[1, 2")
+    with pytest.raises(InputError, match="not a population"):
+        read_population(tmp_path / "x.json")
+    with pytest.raises(InputError, match="does not exist"):
+        read_population(tmp_path / "y.json")
+
+
+@pytest.mark.parametrize("name", ["ring", "figure-eight", "merge"])
+def test_a_road_draws_its_people_from_it(tmp_path: Path, name: str) -> None:
+    scenario = make_scenario(name, {"population": str(written(tmp_path))})
+    assert scenario_from_recipe(scenario_recipe(scenario)) == scenario
+    assert scenario.humans == PAPER_IDM
+    assert scenario.top_speed == 35.0
+    roads = [scenario.draw(np.random.default_rng(seed)) for seed in (0, 0, 1)]
+    assert set(roads[0].people.values()) == set(DRIVERS)
+    assert roads[0].people == roads[1].people != roads[2].people
+    own_types = roads[0].traffic.count('<vType id="of_')
+    assert own_types == (22 if name == "ring" else 0)
+
+
+def test_without_a_population_roads_are_as_they_were() -> None:
+    road = make_scenario("ring").draw(np.random.default_rng(0))
+    assert road.people == {}
+    assert "insertionChecks" not in road.traffic
+
+
+def test_a_residual_is_commanded(tmp_path: Path) -> None:
+    assert make_scenario("ring", {"population": str(written(tmp_path, NETWORK))}).people == "commanded"
+    assert make_scenario("ring", {"population": str(written(tmp_path))}).people == "native"
