@@ -21,6 +21,7 @@ ALLOWED = {
     "controller": {"drivers"},
     "following": {"physics", "drivers", "scenarios"},
     "reports": {"physics", "drivers", "scenarios", "traffic"},
+    "virtual": {"following"},
     "experiments": {"controller", "following", "reports"},
     "cli": {"controller", "reports"},
     "environments": {"controller", "physics", "drivers", "scenarios", "traffic", "reports"},

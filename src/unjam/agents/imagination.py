@@ -1,6 +1,7 @@
 """What Algorithm 1 does between actual episodes: fit the virtual environment, and imagine in it."""
 
 from collections.abc import Sequence
+from dataclasses import asdict, replace
 from math import ceil
 from typing import Any
 
@@ -14,11 +15,13 @@ from unjam.drivers.driver import Driver
 from unjam.drivers.network import Network
 from unjam.drivers.residual import ResidualDriver
 from unjam.errors import MissingPartError
+from unjam.physics.idm import IDMParameters
 from unjam.scenarios.scenario import Scenario
 from unjam.traffic.record import Episode
 from unjam.virtual.data import ActualData, pack_data, unpack_data
 from unjam.virtual.fitting import fit
 from unjam.virtual.model import EnvironmentModel, torch_generator
+from unjam.virtual.people import calibrated_people
 from unjam.virtual.rollout import Rollouts, begin, imagine, return_bound, rollout_length
 from unjam.virtual.settings import VirtualSettings
 from unjam.virtual.world import VirtualWorld
@@ -54,7 +57,8 @@ class Imagination:
         """virtual decisions of all iterations so far"""
         self.facts: dict[str, Any] = {}
         """what there is to say of the virtual environment in this iteration"""
-        self._scenario = scenario
+        self.scenario = scenario
+        """the road as far as it is known: with calibrated people where the settings ask for them"""
         self._reward = reward
         self._expert = expert
         self._policy = policy
@@ -63,15 +67,17 @@ class Imagination:
     def learn(self, episodes: Sequence[Episode], iteration: int) -> None:
         """Add actual episodes to D_a, fit the model to it, and find the rollout length of Eq. 15."""
         first = self.data.episodes
-        self.data.add(episodes, self._scenario)
+        self.data.add(episodes, self.scenario)
         self._newest = [n for n, kept in enumerate(self.data.recordings) if kept.episode >= first]
         self._actual = sum(len(self.data.recordings[place].reward) for place in self._newest)
         settings = self.settings
+        if settings.calibrate and first == 0:
+            self._know(calibrated_people(self.data.recordings, self.scenario))
         found = fit(
             self.model,
             self.data.transitions(settings.holdout),
             settings,
-            self._scenario,
+            self.scenario,
             self._reward,
             (self._run_seed, iteration, FIT),
         )
@@ -103,7 +109,7 @@ class Imagination:
         looks = looks[generator.integers(len(looks), size=count)]
         device = self.settings.device
         world = VirtualWorld(
-            self.model, self._scenario, self._reward, torch_generator(seeds[1], device), self.settings.noise
+            self.model, self.scenario, self._reward, torch_generator(seeds[1], device), self.settings.noise
         )
         starts = begin(self.data, looks, self._expert, device)
         rollouts = imagine(driver, world, starts, driven, torch_generator(seeds[2], device))
@@ -127,24 +133,28 @@ class Imagination:
 
     def decision_discount(self, gamma: float) -> float:
         """Return the discount from decision to decision; `gamma` is that from look to look."""
-        return gamma ** (1 / self._policy.decisions_held(self._scenario.decision_step))
+        return gamma ** (1 / self._policy.decisions_held(self.scenario.decision_step))
 
     def state(self) -> tuple[dict[str, Any], dict[str, torch.Tensor]]:
         """Return all that a run must keep of it to go on, as JSON and tensors."""
         facts, arrays = pack_data(self.data)
         tensors = {f"{DATA}{name}": torch.from_numpy(np.array(array)) for name, array in arrays.items()}
         tensors |= {name: tensor.cpu() for name, tensor in self.model.state_dict().items()}
-        return {"steps": self.steps, "data": facts}, tensors
+        return {"steps": self.steps, "data": facts, "people": asdict(self.scenario.humans)}, tensors
 
     def restore(self, facts: dict[str, Any], tensors: dict[str, torch.Tensor]) -> None:
         """Go on from what `state` returned."""
         arrays = {name.removeprefix(DATA): t.numpy() for name, t in tensors.items() if name.startswith(DATA)}
         self.data = unpack_data(facts["data"], arrays)
         self.steps = facts["steps"]
+        self._know(IDMParameters(**facts["people"]))
         self.model.load_state_dict({n: t for n, t in tensors.items() if not n.startswith(DATA)})
 
+    def _know(self, people: IDMParameters) -> None:
+        self.scenario = replace(self.scenario, humans=people)
+
     def _driver(self, network: Network) -> ResidualDriver:
-        scenario, policy = self._scenario, self._policy
+        scenario, policy = self.scenario, self._policy
         hold = policy.decisions_held(scenario.decision_step)
         return ResidualDriver(self._expert, network, scenario.action_limit, policy.observe, hold)
 

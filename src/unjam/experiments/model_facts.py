@@ -85,12 +85,12 @@ def measure_model(folder: Path, config: RunConfig) -> dict[str, Any]:
         )
     torch.set_num_threads(1)  # for small networks more are slower
     state, tensors = checkpoint
-    scenario = config.make_scenario()
     settings = replace(config.virtual, device="cpu")
     imagination = Imagination(
-        settings, scenario, config.reward, config.make_expert(), config.policy, config.seed
+        settings, config.make_scenario(), config.reward, config.make_expert(), config.policy, config.seed
     )
     restore_imagination(imagination, state, tensors)
+    scenario = imagination.scenario
     data, model = imagination.data, imagination.model
     generator = np.random.default_rng(config.seed)
     newest = read_progress(folder)[-1]

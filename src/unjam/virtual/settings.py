@@ -18,6 +18,9 @@ class VirtualSettings:
     base: BaseName = "idm"
     """what is known before learning: how the follower drives; `population`: as the typical driver of the
     road's calibrated population, residual included; `none`: nothing, all is learned"""
+    calibrate: bool = False
+    """whether the base takes IDM parameters that are calibrated, in the first iteration, on those who drove
+    behind the CAVs; otherwise it knows those of the road"""
     members: Count = 5
     """networks in the ensemble"""
     hidden: Annotated[tuple[Count, ...], Field(min_length=1)] = (64, 64)

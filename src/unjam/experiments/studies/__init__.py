@@ -2,15 +2,24 @@
 
 from unjam.experiments.studies.comparison import FIGURE_9, TABLE_1, TABLE_2
 from unjam.experiments.studies.figure_5 import FIGURE_5
+from unjam.experiments.studies.figure_6 import run as run_figure_6
 from unjam.experiments.studies.figure_8 import FIGURE_8
 from unjam.experiments.studies.figure_10 import FIGURE_10
 from unjam.experiments.studies.study import Study
 from unjam.experiments.studies.theory import THEORY
 
+FIGURE_6 = Study(
+    "networks that learn how people drive, with knowledge and without",
+    lambda seeds: [],
+    lambda pool, seeds, folder: run_figure_6(folder),
+    minutes=25.0,
+)
+
 STUDIES: dict[str, Study] = {
     "table-1": TABLE_1,
     "figure-5": FIGURE_5,
     "table-2": TABLE_2,
+    "figure-6": FIGURE_6,
     "figure-8": FIGURE_8,
     "figure-9": FIGURE_9,
     "figure-10": FIGURE_10,

@@ -1,0 +1,57 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from unjam.drivers import LocalState, PISaturation
+from unjam.physics.idm import IDMParameters
+from unjam.scenarios import Ring
+from unjam.traffic.episode import run_episode
+from unjam.virtual.data import ActualData, Recording
+from unjam.virtual.people import calibrated_people, people_behind
+
+OTHERS = IDMParameters(time_headway=1.6, max_acceleration=0.7)
+RING = Ring(length=(300, 320), vehicles=20, horizon=900, noise=0.0, humans=OTHERS)
+
+
+@pytest.fixture(scope="module")
+def data() -> ActualData:
+    kept = ActualData(10_000)
+    kept.add([run_episode(RING, PISaturation(), (seed,)) for seed in range(2)], RING)
+    return kept
+
+
+def test_finds_how_people_on_the_road_drive(data: ActualData) -> None:
+    believed = replace(RING, humans=IDMParameters())
+    found = calibrated_people(data.recordings, believed)
+    assert found.time_headway == pytest.approx(OTHERS.time_headway, abs=0.1)
+    assert found.max_acceleration == pytest.approx(OTHERS.max_acceleration, rel=0.2)
+    assert (found.desired_speed, found.minimum_gap) == (30.0, 2.0)
+
+
+def test_a_drive_is_that_of_the_vehicle_behind(data: ActualData) -> None:
+    pairs = people_behind(data.recordings, RING)
+    assert len(pairs) == 2
+    states = data.recordings[0].states
+    np.testing.assert_array_equal(pairs[0].leader_speed, states.speed[: len(pairs[0].speed)])
+    np.testing.assert_array_equal(pairs[0].gap, states.follower_gap[: len(pairs[0].speed)])
+
+
+def test_another_vehicle_behind_is_another_drive(data: ActualData) -> None:
+    recording = data.recordings[0]
+    gap = np.array(recording.states.follower_gap, np.float64)
+    gap[400:] += 30.0
+    pairs = people_behind([changed(recording, gap)], RING)
+    assert [len(pair.speed) for pair in pairs] == [400, 501]
+
+
+def test_where_nobody_drove_behind_people_stay_as_they_are_known(data: ActualData) -> None:
+    recording = data.recordings[0]
+    alone = changed(recording, np.array(recording.states.loop_length, np.float64))
+    assert people_behind([alone], RING) == []
+    assert calibrated_people([alone], RING) == RING.humans
+
+
+def changed(recording: Recording, follower_gap: np.ndarray) -> Recording:
+    states = LocalState(*recording.states)._replace(follower_gap=follower_gap)
+    return replace(recording, states=states)
