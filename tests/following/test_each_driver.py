@@ -1,3 +1,5 @@
+from typing import Literal
+
 import pytest
 
 from tests.following.made_up import idm_driver
@@ -17,7 +19,7 @@ def groups() -> list[list[Pair]]:
 
 
 @pytest.mark.parametrize("every", ["trajectory", "moment"])
-def test_each_driver_gets_its_own_headway_and_what_is_typical(every: str) -> None:
+def test_each_driver_gets_its_own_headway_and_what_is_typical(every: Literal["trajectory", "moment"]) -> None:
     told: list[int] = []
     settings = CalibrationSettings(every=every)
     found = calibrate_each(groups(), PAPER_IDM, ("time_headway",), settings, told.append)

@@ -70,7 +70,8 @@ def _one_parameter(
         (squares,) = gap_squares(stretches, personal_idm(rows, 0.0, settings.limits))
         return _by_group(squares, stretches, group, settings.every)
 
-    grid = np.linspace(*getattr(settings, name), GRID)
+    low, high = getattr(settings, name)
+    grid = np.linspace(low, high, GRID)
     tried = np.stack([errors(np.full(len(groups), value)) for value in grid])
     place = tried.argmin(0)
     values = grid[place]
