@@ -125,7 +125,8 @@ def _mean(values: pd.Series, digits: int) -> str:
     if found.count == 0:
         return "no wave"
     interval = f" [{found.low:.{digits}f}, {found.high:.{digits}f}]" if found.count > 1 else ""
-    return f"{found.mean:.{digits}f}{interval}"
+    share = f" in {found.count} of {len(values)}" if found.count < len(values) else ""
+    return f"{found.mean:.{digits}f}{interval}{share}"
 
 
 def claims() -> pd.DataFrame:

@@ -23,6 +23,12 @@ def test_a_file_becomes_a_population(data: Path) -> None:
     assert found.facts()["drivers"] == 3
 
 
+def test_a_population_names_no_folder_of_the_machine(data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sys.argv", ["unjam", "fit-drivers", str(data)])
+    command = fit_from_files([data], QUICK).population.about["manifest"]["command"]
+    assert command == ["unjam", "fit-drivers", "data.parquet"]
+
+
 def test_trajectories_can_be_chosen(data: Path) -> None:
     assert len(fit_from_files([data], QUICK, only={"kind": "human"}).population.drivers) == 2
 

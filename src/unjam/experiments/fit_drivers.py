@@ -93,7 +93,11 @@ def fit_from_files(
     pairs = _chosen(pairs, only or {})
     population = fit_drivers(pairs, settings, told)
     about = {**population.about, "data": [file.name for file in files], "only": only or {}}
-    return FittedDrivers(replace(population, about={**about, "manifest": manifest()}), words)
+    made = manifest()
+    made["command"] = [
+        Path(word).name if "/" in word else word for word in made["command"]
+    ]  # it is given away
+    return FittedDrivers(replace(population, about={**about, "manifest": made}), words)
 
 
 def _chosen(pairs: list[Pair], only: dict[str, str]) -> list[Pair]:

@@ -88,10 +88,9 @@ def trajectories_of(
         if (len(rows) - 1) * step < shortest or len(rows) < 2:
             short += len(rows)
             continue
-        first = rows.iloc[0]
-        pair = str(first["pair"])
+        pair = str(rows["pair"].iloc[0])
         speed, leader_speed, gap = (rows[name].to_numpy(np.float64) for name in COLUMNS[2:])
-        driver, kind, split = (str(first[name]) if name in rows else "" for name in OPTIONAL)
+        driver, kind, split = (str(rows[name].iloc[0]) if name in rows else "" for name in OPTIONAL)
         parts[pair] = parts.get(pair, 0) + 1
         name = pair if parts[pair] == 1 else f"{pair}/{parts[pair]}"
         pairs.append(Pair(name, driver or pair, step, speed, leader_speed, gap, kind, split))
