@@ -1,3 +1,4 @@
+import json
 from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any, cast
@@ -15,6 +16,7 @@ from unjam.agents.state import learner_state, restore_learner
 from unjam.drivers import PISaturation
 from unjam.drivers.network import Network
 from unjam.drivers.residual import ResidualDriver, observation_size
+from unjam.physics.idm import IDMParameters
 from unjam.scenarios import Ring
 from unjam.traffic.episode import run_episode
 from unjam.traffic.record import Episode
