@@ -228,11 +228,11 @@ def test_what_is_told_of_the_virtual_environment_is_whole(shared: Simulation) ->
     assert told.virtual["bound"] > abs(told.virtual["return_virtual"] - told.virtual["return_actual"])
 
 
-def test_what_is_known_of_people_survives_a_stop() -> None:
+def test_what_is_known_of_people_survives_a_stop(shared: Simulation) -> None:
     one, other = (Imagination(VIRTUAL, RING, "", PISaturation(), POLICY, 0) for _ in range(2))
     people = IDMParameters(time_headway=1.3, max_acceleration=0.8)
     one.scenario = replace(RING, humans=people)
-    one.data.add([run_episode(RING, PISaturation(), (0,))], RING)
+    one.data.add([run_episode(RING, PISaturation(), (0,), simulation=shared)], RING)
     facts, tensors = one.state()
     other.restore(json.loads(json.dumps(facts)), tensors)
     assert other.scenario == one.scenario
