@@ -222,7 +222,7 @@ def test_the_first_format_can_be_read(tmp_path: Path) -> None:
     np.testing.assert_array_equal(actions(load_controller(written(tmp_path, content))), actions(driver))
 
 
-@settings(max_examples=300)
+@settings(max_examples=60)
 @given(place=st.floats(0, 1, exclude_max=True), bits=st.integers(1, 255))
 def test_a_changed_byte_is_refused_or_changes_nothing(place: float, bits: int) -> None:
     driver = residual(PISaturation())

@@ -133,7 +133,7 @@ def mutated(content: bytes, kind: str, place: float, other: bytes) -> bytes:
     }[kind]
 
 
-@settings(max_examples=150)
+@settings(max_examples=60)
 @given(
     kind=st.sampled_from(["change", "cut", "insert", "double", "swap"]),
     place=st.floats(0, 1, exclude_max=True),
@@ -167,7 +167,7 @@ def places(value: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
     ]
 
 
-@settings(max_examples=100)
+@settings(max_examples=60)
 @given(number=st.integers(0), value=JSON)
 def test_whatever_a_manifest_says_it_is_refused_in_one_line_or_drives(number: int, value: Any) -> None:
     """A manifest with one thing replaced, by a forger who also made the hashes fit."""

@@ -132,7 +132,7 @@ def test_where_all_are_damaged_it_says_so(tmp_path: Path, name: str) -> None:
     assert "\n" not in str(caught.value)
 
 
-@settings(max_examples=300)
+@settings(max_examples=60)
 @given(
     part=st.sampled_from([STATE, TENSORS]), place=st.floats(0, 1, exclude_max=True), bits=st.integers(1, 255)
 )
@@ -153,7 +153,7 @@ def test_a_changed_byte_anywhere_never_changes_what_is_loaded(part: str, place: 
     assert harmless or is_content(found, 1)
 
 
-@settings(max_examples=100)
+@settings(max_examples=60)
 @given(part=st.sampled_from([STATE, TENSORS]), share=st.floats(0, 1, exclude_max=True))
 def test_a_file_cut_anywhere_is_noticed(part: str, share: float) -> None:
     with tempfile.TemporaryDirectory() as name:

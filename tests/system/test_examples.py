@@ -28,7 +28,7 @@ EXAMPLES = Path(__file__).parents[2] / "examples"
 @pytest.mark.parametrize(
     ("name", "argument", "words"),
     [
-        ("train_ppo.py", 100, "over 3 episodes"),
+        pytest.param("train_ppo.py", 100, "over 3 episodes", marks=pytest.mark.slow),
         ("plain_loop.py", 2, "episode 1: return"),
     ],
 )

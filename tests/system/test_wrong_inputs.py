@@ -191,6 +191,7 @@ def test_cache_that_cannot_be_written_is_code_74(unjam: Run, tmp_path: Path) -> 
     assert one_line(ran.stderr)
 
 
+@pytest.mark.slow
 def test_disk_that_fills_up_in_training_leaves_a_whole_checkpoint(unjam: Run, tmp_path: Path) -> None:
     def little_space() -> None:
         resource.setrlimit(resource.RLIMIT_FSIZE, (90_000, 90_000))

@@ -15,7 +15,10 @@ def test_every_base_can_be_chosen() -> None:
 @pytest.mark.parametrize(
     ("values", "words"),
     [
-        ({"base": "krauss"}, "virtual.base: 'krauss' is not allowed; allowed: 'idm', 'acc', 'ovm' or 'none'"),
+        (
+            {"base": "krauss"},
+            "virtual.base: 'krauss' is not allowed; allowed: 'idm', 'population', 'acc', 'ovm' or 'none'",
+        ),
         ({"error": "loss"}, "virtual.error: 'loss' is not allowed; allowed: 'unexplained'"),
         ({"members": 0}, "virtual.members: 0 is not allowed"),
         ({"holdout": 1.0}, "virtual.holdout: 1.0 is not allowed"),
