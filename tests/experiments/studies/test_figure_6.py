@@ -7,9 +7,20 @@ import numpy as np
 import pytest
 
 from unjam.experiments.studies import figure_6
-from unjam.experiments.studies.figure_6 import NEAREST, SIZES, Task, measure, parted, tasks
+from unjam.experiments.studies.figure_6 import (
+    NEAREST,
+    SIZES,
+    Task,
+    average_acceleration,
+    measure,
+    parted,
+    tasks,
+)
 from unjam.following.four_regimes import FourRegimes
 from unjam.following.network import NetworkSettings
+from unjam.following.pairs import Rows
+from unjam.physics.idm import idm_acceleration
+from unjam.physics.kinematics import next_speed
 
 
 @pytest.fixture
@@ -47,6 +58,16 @@ def test_a_fit_is_judged_with_and_without_noise(small: None, network: str) -> No
     assert row["noise"] == pytest.approx(0.2, abs=0.02)
     assert row["rows"] == round(0.1 * 4200)
     assert row["error_of_driver"] < row["error"] or network == "vanilla"
+
+
+@pytest.mark.parametrize("speed", [0.0, 0.01, 10.0])
+def test_who_stands_can_only_start(speed: float) -> None:
+    count, settings = 200_000, FourRegimes()
+    rows = Rows(*(np.full(count, value) for value in (speed, 0.0, 2.0 + speed * 5, 0.0)))
+    noise = np.random.default_rng(0).normal(0.0, settings.noise, count)
+    wanted = idm_acceleration(rows.speed, rows.leader_speed, rows.gap, settings.driver) + noise
+    drawn = (next_speed(rows.speed, wanted, settings.step) - rows.speed) / settings.step
+    assert average_acceleration(rows, settings)[0] == pytest.approx(drawn.mean(), abs=2e-3)
 
 
 def test_knowledge_of_the_truth_leaves_noise_alone(small: None) -> None:

@@ -27,6 +27,7 @@ def picture(rows: Sequence[dict[str, Any]]) -> Figure:
         _errors(right, [*longer, *(row for row in main if row["size"] == 0.3)])
         right.set_title("at 1 % as many gradient steps as at 30 %", loc="left", fontsize=9, color=INK)
         right.sharey(middle)
+        middle.set_ylabel("error of the acceleration, noise aside [m/s²]")
         middle.legend()
         return figure
 
@@ -38,7 +39,7 @@ def _losses(axes: Axes, rows: Sequence[dict[str, Any]]) -> None:
             axes.plot(np.arange(1, len(curve) + 1), curve, color=colour, lw=1.0, alpha=0.7)
     noise = next(row["noise"] for row in rows)
     axes.axhline(noise**2, color=INK, lw=0.9, ls=":")
-    axes.annotate("noise", (1.2, noise**2), va="top", fontsize=8, color=INK)
+    axes.annotate("noise", (1.2, noise**2), va="bottom", fontsize=8, color=INK)
     axes.set_xscale("log")
     axes.set_yscale("log")
     axes.set_xlabel("passes over all training rows")
@@ -58,6 +59,6 @@ def _errors(axes: Axes, rows: Sequence[dict[str, Any]]) -> None:
     axes.set_xscale("log")
     axes.set_yscale("log")
     axes.set_xlabel("share of the training rows [%]")
-    axes.set_xticks([1, 10, 30, 50, 100], ["1", "10", "30", "50", "100"])
+    ticks = [100 * size for size in sorted({row["size"] for row in rows})]
+    axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
     axes.minorticks_off()
-    axes.set_ylabel("error of the acceleration,\nnoise aside [m/s²]")
