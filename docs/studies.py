@@ -38,17 +38,22 @@ def honest(study: str, road: str) -> pd.DataFrame:
             {
                 "": f"{row['name']}{' (best expert)' if row.get('best_expert') else ''}",
                 "trainings": row["trainings"] or "",
-                "return": f"{row['return']['mean']:.0f}",
-                "mean speed [m/s]": f"{row['mean_speed']['mean']:.2f}",
-                "of the limit, steady": f"{row['speed_limit_ratio_steady']['mean']:.3f}",
-                "std across vehicles [m/s]": f"{row['speed_std_fleet']['mean']:.2f}",
-                "smallest headway [s]": f"{row['min_headway']['mean']:.2f}",
-                "collisions": f"{row['collisions']['mean']:.2f}",
+                "return": number(row["return"]["mean"], 0),
+                "mean speed [m/s]": number(row["mean_speed"]["mean"], 2),
+                "of the limit, steady": number(row["speed_limit_ratio_steady"]["mean"], 3),
+                "std across vehicles [m/s]": number(row["speed_std_fleet"]["mean"], 2),
+                "smallest headway [s]": number(row["min_headway"]["mean"], 2),
+                "collisions": number(row["collisions"]["mean"], 2),
                 "beyond": "" if beyond is None else interval(beyond, 0, "+"),
                 "better": "" if better is None else f"{100 * better['mean']:.0f} %",
             }
         )
     return pd.DataFrame(table)
+
+
+def number(value: float | None, digits: int) -> str:
+    """Return a number as tables show it; a dash where there is none."""
+    return "–" if value is None else f"{value:.{digits}f}"
 
 
 def interval(entries: dict[str, Any], digits: int, sign: str = "") -> str:
