@@ -24,12 +24,15 @@ LITTLE_RING: dict[str, Any] = {
 QUICK: dict[str, dict[str, Any]] = {
     "trpo": {"trpo.batch_steps": 3000, "steps": 48_000},
     "ppo": {"ppo.batch_steps": 3000, "ppo.epochs": 40, "steps": 36_000},
-    "sac": {"sac.batch_steps": 3000, "sac.start_steps": 3000, "sac.updates_per_step": 0.1, "steps": 24_000},
+    "sac": {
+        **{"sac.batch_steps": 3000, "sac.start_steps": 3000, "sac.updates_per_step": 0.3},
+        **{"sac.temperature": 0.2, "steps": 24_000},
+    },
 }
-STANDING = 0.0
-"""return of the network that has learned nothing: it never starts, and nobody passes it"""
-TARGETS = {"trpo": 100.0, "ppo": 100.0, "sac": 35.0}
-"""measured with other seeds: 166, 195, 50; sac, which learns from fewer steps, is the slowest to leave"""
+STANDING = 60.0
+"""more than the return of a network that has learned nothing: it never starts, and those ahead stop behind it"""
+TARGET = 100.0
+"""measured with other seeds: 166 (trpo), 195 (ppo), 173 (sac)"""
 
 
 @pytest.mark.slow
@@ -39,6 +42,6 @@ def test_a_network_alone_learns_to_drive_on_a_little_ring(agent: str, tmp_path: 
     rows: list[dict[str, Any]] = []
     with Workers(1) as workers:
         learn_with(workers, tmp_path / "run", config, rows.append)
-    assert rows[0]["return_expert"] == pytest.approx(STANDING, abs=25.0)
-    assert max(row["return_validation"] or 0.0 for row in rows) > TARGETS[agent]
+    assert rows[0]["return_expert"] < STANDING
+    assert max(row["return_validation"] or 0.0 for row in rows) > TARGET
     assert sum(row["virtual_steps"] for row in rows) > 0

@@ -66,8 +66,9 @@ class MergingTraffic(OpenTraffic[MergingRoad]):
         gaps = streams.gaps(leaders).clip(SMALLEST_GAP, None)
         speeds = streams.speeds
         ahead = np.where(leaders < 0, speeds, speeds[leaders])
-        drivers = drivers_of(scenario, self.road, streams.names)
-        humans = parameter_rows(drivers) if self.road.people else scenario.humans
+        humans = scenario.humans
+        if self.road.people:
+            humans = parameter_rows(drivers_of(scenario, self.road, streams.names))
         acceleration = idm_acceleration(speeds, ahead, gaps, humans)
         acceleration = as_calibrated(scenario.calibrated, acceleration, speeds, ahead, gaps)
         if scenario.noise > 0:
