@@ -30,7 +30,7 @@ QUICK: dict[str, dict[str, Any]] = {
     },
 }
 STANDING = 60.0
-"""more than the return of a network that has learned nothing: it never starts, and those ahead stop behind it"""
+"""more than what a network that has learned nothing earns: it never starts, and stops those ahead"""
 TARGET = 100.0
 """measured with other seeds: 166 (trpo), 195 (ppo), 173 (sac)"""
 
