@@ -31,7 +31,7 @@ class NetworkSettings:
     epochs: Count = 200
     """most passes over the rows"""
     patience: Count = 200
-    """passes without progress on the validation rows after which learning ends; as many as there are: never"""
+    """passes without progress on the validation rows after which learning ends; as many as `epochs`: never"""
     authority: Positive = 8.0
     """largest acceleration that it may answer [m/s2]: no network answers what no car can do"""
 
