@@ -163,6 +163,8 @@ def _loss(rows: pd.DataFrame) -> tuple[str, str, str]:
 
 
 def _sizes(rows: pd.DataFrame, words: str, how: str) -> tuple[str, str, str]:
+    if how == "std" and rows["repeat"].nunique() < 2:
+        return words, "not measured", "one repeat tells no spread"
     found = rows[rows["network"] != "nearest row"].groupby(["size", "network"])["error_of_driver"].agg(how)
     table = found.unstack()
     better = table["knowledge"] < table["vanilla"]

@@ -30,8 +30,8 @@ class NetworkSettings:
     """rows in a gradient step"""
     epochs: Count = 200
     """most passes over the rows"""
-    patience: Count = 30
-    """passes without progress on the validation rows after which learning ends (the paper names none)"""
+    patience: Count = 200
+    """passes without progress on the validation rows after which learning ends; as many as `epochs`: never"""
     authority: Positive = 8.0
     """largest acceleration that it may answer [m/s2]: no network answers what no car can do"""
 

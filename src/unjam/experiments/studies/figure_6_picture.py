@@ -7,6 +7,7 @@ import numpy as np
 from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
 from unjam.reports.figures import INK, LINES, STYLE
 
@@ -41,7 +42,7 @@ def _losses(axes: Axes, rows: Sequence[dict[str, Any]]) -> None:
     axes.axhline(noise**2, color=INK, lw=0.9, ls=":")
     axes.annotate("noise", (1.2, noise**2), va="bottom", fontsize=8, color=INK)
     axes.set_xscale("log")
-    axes.set_yscale("log")
+    _few_ticks(axes)
     axes.set_xlabel("passes over all training rows")
     axes.set_title("training loss [(m/s²)²]", loc="left", fontsize=9, color=INK)
 
@@ -57,8 +58,16 @@ def _errors(axes: Axes, rows: Sequence[dict[str, Any]]) -> None:
             percent, means, spreads, color=colour, lw=1.5, marker="o", ms=4, capsize=3, label=LABELS[network]
         )
     axes.set_xscale("log")
-    axes.set_yscale("log")
     axes.set_xlabel("share of the training rows [%]")
     ticks = [100 * size for size in sorted({row["size"] for row in rows})]
     axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
     axes.minorticks_off()
+    _few_ticks(axes)
+
+
+def _few_ticks(axes: Axes) -> None:
+    """Make the vertical axis logarithmic, with numbers that can be read within a decade."""
+    axes.set_yscale("log")
+    axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 4.0, 6.0)))
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axes.yaxis.set_minor_locator(NullLocator())
