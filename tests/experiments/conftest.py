@@ -56,8 +56,9 @@ def reproduced(
     little.setattr(reproduction, "run_all", run_here)
     little.setattr("unjam.experiments.train.write_report", lambda folders, path: path.touch())
     folder, told = tmp_path_factory.mktemp("pool"), []
-    assert len(make_plan(["little"], 2, pool.Pool(folder)).runs) == 4
-    reproduce(["little"], folder, 2, 2, told=told.append)
+    to_do = make_plan(["little"], 2, pool.Pool(folder))
+    assert len(to_do.runs) == 4
+    reproduce(to_do, 2, told=told.append)
     return folder, told
 
 

@@ -13,6 +13,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from unjam.errors import DiskError, InputError
+from unjam.experiments import checkpoint
 from unjam.experiments.checkpoint import STATE, TENSORS, load_checkpoint, save_checkpoint
 
 Content = tuple[dict[str, Any], dict[str, torch.Tensor]]
@@ -75,6 +76,16 @@ def test_what_else_lies_in_the_folder_is_left_alone(tmp_path: Path) -> None:
     assert (tmp_path / "notes.txt").read_text() == "mine"
     assert (tmp_path / "old").is_dir()
     assert is_content(load_checkpoint(tmp_path), 3)
+
+
+def test_what_another_version_made_is_refused_in_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(checkpoint, "FORMAT", 1)
+    save_all(tmp_path, 1)
+    monkeypatch.undo()
+    with pytest.raises(InputError, match=r"000001 has format 1, of another version of unjam; allowed: \d+$"):
+        load_checkpoint(tmp_path)
 
 
 def swap(one: Path, other: Path) -> None:

@@ -73,7 +73,7 @@ def test_what_is_there_is_not_trained_again(reproduced: Made) -> None:
     plan_now = make_plan(["little"], 2, Pool(folder))
     assert (plan_now.runs, plan_now.finished, plan_now.roads) == ([], 4, [])
     told: list[str] = []
-    reproduce(["little"], folder, 2, 2, told=told.append)
+    reproduce(plan_now, 2, told=told.append)
     assert {path: path.stat().st_mtime_ns for path in before} == before
     assert len(told) == 1
 
@@ -121,8 +121,9 @@ def test_a_stopped_training_goes_on(reproduced: Made, monkeypatch: pytest.Monkey
     run = PlannedRun("little", "plain", 1)
     monkeypatch.setitem(plan.VARIANTS, "plain", replace(plan.VARIANTS["plain"], steps=480))
     (folder / "runs" / run.name / "evaluation.json").unlink()
-    assert run in make_plan(["little"], 2, Pool(folder)).runs
-    reproduce(["little"], folder, 2, 2)
+    to_do = make_plan(["little"], 2, Pool(folder))
+    assert run in to_do.runs
+    reproduce(to_do, 2)
     assert read_config(folder / "runs" / run.name).steps == 480
     rows = (folder / "runs" / run.name / "progress.jsonl").read_text().splitlines()
     assert [json.loads(row)["actual_steps"] for row in rows] == [160, 320, 480]

@@ -4,9 +4,10 @@ import torch
 
 from tests.following.made_up import idm_driver
 from unjam.following.network import FollowingNetwork, NetworkSettings, fit_one_step, on_rows
-from unjam.following.open_loop import idm_follow, inputs_of
+from unjam.following.open_loop import idm_follow
 from unjam.following.pairs import Rows, rows_of
 from unjam.physics.idm import PAPER_IDM, IDMParameters
+from unjam.scenarios.population import residual_inputs
 
 SETTINGS = NetworkSettings(hidden=(16, 16), rate=1e-2, epochs=40, batch=128)
 
@@ -24,7 +25,7 @@ def test_the_papers_network_has_two_layers_of_128() -> None:
 
 def test_its_numpy_twin_answers_the_same(rows: Rows) -> None:
     network = FollowingNetwork(SETTINGS, rows, seed=1)
-    seen = inputs_of(rows.speed, rows.leader_speed, rows.gap)
+    seen = residual_inputs(rows.speed, rows.leader_speed, rows.gap)
     with torch.no_grad():
         wanted = network(torch.as_tensor(seen, dtype=torch.float32)).numpy()
     np.testing.assert_allclose(on_rows(network.as_driver())(seen), wanted, atol=1e-4)
@@ -41,7 +42,7 @@ def test_a_new_residual_may_be_zero(rows: Rows) -> None:
 def test_it_learns(rows: Rows, base: None) -> None:
     network, losses = fit_one_step(rows, rows, base, SETTINGS, seed=0)
     assert min(losses.validation) < 0.2 * losses.validation[0]
-    seen = inputs_of(rows.speed, rows.leader_speed, rows.gap)
+    seen = residual_inputs(rows.speed, rows.leader_speed, rows.gap)
     known = base(rows.speed, rows.leader_speed, rows.gap) if base else 0.0
     error = np.square(on_rows(network.as_driver())(seen) + known - rows.acceleration).mean()
     assert error == pytest.approx(min(losses.validation), rel=1e-2)

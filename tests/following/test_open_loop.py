@@ -9,7 +9,6 @@ from unjam.following.open_loop import (
     always,
     drive_behind,
     idm_follow,
-    inputs_of,
     one_step_error,
     open_loop,
     personal_idm,
@@ -17,6 +16,7 @@ from unjam.following.open_loop import (
 )
 from unjam.following.pairs import stretches_of
 from unjam.physics.idm import PAPER_IDM, IDMParameters
+from unjam.scenarios.population import residual_inputs
 
 QUICK = IDMParameters(time_headway=0.8, max_acceleration=1.5)
 
@@ -78,5 +78,5 @@ def test_tensors_drive_as_arrays_do() -> None:
 
 
 def test_a_network_sees_speed_relative_speed_and_gap() -> None:
-    seen = inputs_of(np.array([5.0]), np.array([7.0]), np.array([9.0]))
+    seen = residual_inputs(np.array([5.0]), np.array([7.0]), np.array([9.0]))
     np.testing.assert_array_equal(seen, [[5.0, 2.0, 9.0]])

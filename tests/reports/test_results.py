@@ -11,7 +11,7 @@ from unjam.drivers import Human, PISaturation
 from unjam.errors import InputError
 from unjam.experiments.drive import DriveResult
 from unjam.reports.metrics import METRICS
-from unjam.reports.results import Results, command_to_repeat, read_progress, read_results, steps_of
+from unjam.reports.results import Results, command_to_repeat, read_progress, read_results
 from unjam.scenarios import Ring
 from unjam.traffic.episode import run_episode
 
@@ -145,7 +145,3 @@ def test_plain_words_of_the_command_are_left_as_they_are() -> None:
     command = ["unjam", "train", "ring", "--out", "runs/ring-001", "--set", "trpo.gamma=0.99"]
     assert command_to_repeat(results_made_by(*command)) == " ".join(command)
     assert command_to_repeat(results_made_by()) == ""
-
-
-def test_the_budget_is_read_from_a_configuration() -> None:
-    assert steps_of('scenario = "ring"\nsteps = 960000\n') == 960_000

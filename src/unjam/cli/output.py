@@ -2,12 +2,12 @@
 
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
 from unjam.files import to_json
@@ -55,52 +55,13 @@ def metrics_table(rows_by_driver: dict[str, list[dict[str, Any]]]) -> Table:
     return table
 
 
-class Steps:
-    """Progress of many episodes at once, counted in steps."""
-
-    def __init__(self, label: str, total: int) -> None:
-        """Prepare to count to `total`."""
-        self._label = label
-        self._total = total
-        self._done: dict[Any, int] = {}
-        self._bar: Progress | None = None
-        self._task: TaskID | None = None
-        self._last_line = time.monotonic()
-
-    def __call__(self, key: Any, steps: int) -> None:
-        """Note that the episode `key` has come to `steps`."""
-        self._done[key] = steps
-        done = sum(self._done.values())
-        if self._bar is not None and self._task is not None:
-            self._bar.update(self._task, completed=done)
-        elif time.monotonic() - self._last_line > LINE_SECONDS:
-            self._last_line = time.monotonic()
-            aside.print(f"{self._label}: {done:,} of {self._total:,} steps")
-
-    def attach(self, bar: Progress) -> None:
-        """Show it as a bar."""
-        self._bar = bar
-        self._task = bar.add_task(self._label, total=self._total)
-
-
-@contextmanager
-def counting_steps(label: str, total: int) -> Iterator[Steps]:
-    """Show the progress of episodes: a bar on a terminal, plain lines now and then elsewhere."""
-    steps = Steps(label, total)
-    if not aside.is_terminal:
-        yield steps
-        return
-    with bar() as shown:
-        steps.attach(shown)
-        yield steps
-
-
 class Counted:
     """Progress of things that are counted: a bar on a terminal, plain lines now and then elsewhere."""
 
-    def __init__(self, label: str) -> None:
-        """Prepare to count what is called `label`."""
+    def __init__(self, label: str, unit: str = "") -> None:
+        """Prepare to count what is called `label`, in `unit`."""
         self._label = label
+        self._unit = f" {unit}" if unit else ""
         self._bar = bar() if aside.is_terminal else None
         self._last_line = time.monotonic()
 
@@ -120,7 +81,20 @@ class Counted:
             self._bar.update(self._task, completed=done, total=of)
         elif time.monotonic() - self._last_line > LINE_SECONDS:
             self._last_line = time.monotonic()
-            aside.print(f"{self._label}: {done:,} of {of:,}")
+            aside.print(f"{self._label}: {done:,} of {of:,}{self._unit}")
+
+
+@contextmanager
+def counting_steps(label: str, total: int) -> Iterator[Callable[[Any, int], None]]:
+    """Show the progress of many episodes at once: call it with an episode and the steps it has come to."""
+    done: dict[Any, int] = {}
+    with Counted(label, "steps") as counted:
+
+        def note(episode: Any, steps: int) -> None:
+            done[episode] = steps
+            counted(sum(done.values()), total)
+
+        yield note
 
 
 def bar() -> Progress:

@@ -37,12 +37,12 @@ def reproduce(
       unjam reproduce table-1 --executor ray --workers 64 --out /shared/unjam
     """
     from unjam.cli.output import aside, console, print_json
-    from unjam.experiments.studies.pool import Pool
 
     if executor not in ("local", "ray"):
         raise wrong("executor", executor, "local, ray")
     from unjam.experiments.reproduce import make_plan
     from unjam.experiments.reproduce import reproduce as run
+    from unjam.experiments.studies.pool import Pool
 
     plan = make_plan(studies, seeds, Pool(out))
     minutes = plan.seconds(workers) / 60.0
@@ -60,7 +60,7 @@ def reproduce(
     )
     if dry_run:
         return
-    folders = run(studies, out, seeds, workers, executor, aside.print)
+    folders = run(plan, workers, executor, aside.print)
     if json:
         print_json({"folders": [str(folder) for folder in folders]})
         return

@@ -81,6 +81,11 @@ OBSERVED: dict[str, tuple[Observed, ...]] = {
 """what each part of an observation holds, in order; what an expert remembers is its own to say"""
 
 
+def lap_angle(state: LocalState) -> Array:
+    """Return the place on a closed road as an angle, 0 to 2 pi from its start, shape (n,)."""
+    return 2.0 * pi * state.route_position / state.loop_length
+
+
 def lap_place(state: LocalState) -> Array:
     """Return cosine and sine of the place on a closed road, 0 to 2 pi from its start.
 
@@ -88,7 +93,7 @@ def lap_place(state: LocalState) -> Array:
         Shape (n, 2), no unit; a tuple of two for plain numbers.
     """
     xp = namespace(state.speed)
-    angle = 2.0 * pi * state.route_position / state.loop_length
+    angle = lap_angle(state)
     return stack_columns((xp.cos(angle), xp.sin(angle)))
 
 

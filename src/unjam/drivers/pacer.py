@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 from functools import cached_property
-from math import pi
 from typing import Annotated, Any, ClassVar
 
 import numpy as np
@@ -10,7 +9,7 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from unjam.drivers.driver import Driver, Memory
-from unjam.drivers.local_state import LocalState, Observed
+from unjam.drivers.local_state import LocalState, Observed, lap_angle
 from unjam.parameters import STRICT, NotNegative, Positive
 from unjam.physics.arrays import Array, as_column, at_least, namespace
 
@@ -94,7 +93,7 @@ class Pacer(Driver):
             return state.loop_length / self.lap_time
         xp = namespace(state.speed)
         mean, *rest = self.harmonics
-        place = 2.0 * pi * state.route_position / state.loop_length
+        place = lap_angle(state)
         pace = place * 0.0 + mean
         for number, (cosine, sine) in enumerate(zip(rest[::2], rest[1::2], strict=True), start=1):
             pace = pace + cosine * xp.cos(number * place) + sine * xp.sin(number * place)

@@ -13,6 +13,8 @@ from unjam.agents.state import Tensors
 from unjam.errors import InputError
 from unjam.files import make_folder, write_whole
 
+FORMAT = 2
+"""of what a checkpoint holds; one of another unjam is refused"""
 GENERATIONS = 2
 STATE, TENSORS = "state.json", "tensors.safetensors"
 
@@ -25,7 +27,7 @@ def save_checkpoint(folder: Path, state: dict[str, Any], tensors: Tensors) -> No
     """
     place = folder / f"{state['iteration']:06d}"
     make_folder(place)
-    data = save(tensors)
+    state, data = {**state, "format": FORMAT}, save(tensors)
     write_whole(place / TENSORS, data)
     write_whole(place / STATE, json.dumps({**state, "sha256": _hash(state, data)}, indent=1))
     for old in _places(folder)[:-GENERATIONS]:
@@ -36,17 +38,23 @@ def load_checkpoint(folder: Path) -> tuple[dict[str, Any], Tensors] | None:
     """Return the newest checkpoint that is whole; None where there was never any.
 
     Raises:
-        InputError: there are some, and all of them are damaged.
+        InputError: there are some, and all of them are damaged, or another unjam made them.
     """
     places = _places(folder)
     for place in reversed(places):
         try:
             state = json.loads((place / STATE).read_text())
             data = (place / TENSORS).read_bytes()
-            if state.pop("sha256") == _hash(state, data):
-                return state, load(data)
+            if state.pop("sha256") != _hash(state, data):
+                continue
+            found, known = state.pop("format", 1), load(data)
         except (OSError, ValueError, KeyError, TypeError, AttributeError, SafetensorError):
             continue
+        if found != FORMAT:
+            raise InputError(
+                f"checkpoint: {place} has format {found!r}, of another version of unjam; allowed: {FORMAT}"
+            )
+        return state, known
     if places:
         raise InputError(f"checkpoint: all {len(places)} under {folder} are damaged")
     return None

@@ -108,12 +108,7 @@ def load_config(
     Raises:
         InputError: an unknown key or preset, a value out of range, an unreadable file.
     """
-    given: dict[str, Any] = read_toml(file) if file is not None else {}
-    for key, value in (changes or {}).items():
-        nested: Any = value
-        for part in reversed(key.split(".")):
-            nested = {part: nested}
-        given = merge(given, nested)
+    given = merge(read_toml(file) if file is not None else {}, nested(changes or {}))
     values: dict[str, Any] = {}
     if preset:
         started = preset_values(preset, str(given.get("scenario", RunConfig.scenario)))
@@ -138,6 +133,17 @@ def merge(values: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
         both = isinstance(value, dict) and isinstance(merged.get(key), dict)
         merged[key] = merge(merged[key], value) if both else value
     return merged
+
+
+def nested(changes: dict[str, Any]) -> dict[str, Any]:
+    """Return changes whose keys may have dots as tables: `trpo.gamma` becomes `gamma` of the table `trpo`."""
+    tables: dict[str, Any] = {}
+    for key, value in changes.items():
+        inner: Any = value
+        for part in reversed(key.split(".")):
+            inner = {part: inner}
+        tables = merge(tables, inner)
+    return tables
 
 
 def to_toml(config: RunConfig) -> str:

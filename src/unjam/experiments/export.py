@@ -21,6 +21,7 @@ from unjam.experiments.judge import TRAINED
 from unjam.experiments.manifest import origin
 from unjam.files import check_folder, write_whole
 from unjam.reports.metrics import measure
+from unjam.reports.results import EVALUATION_FILE, rows_by_driver
 from unjam.reports.statistics import summarise
 from unjam.scenarios.registry import make_scenario
 from unjam.scenarios.scenario import Scenario
@@ -106,18 +107,14 @@ def _of_driver(text: str, scenario: str) -> tuple[Scenario, Driver, dict[str, An
 
 def _held_out(folder: Path) -> dict[str, Any] | None:
     """Return what the run's evaluation measured of the controller and of its expert; None before its end."""
-    path = folder / "evaluation.json"
+    path = folder / EVALUATION_FILE
     if not path.is_file():
         return None
     found = json.loads(path.read_text())
+    rows_of = rows_by_driver(found["rows"])
     measured: dict[str, Any] = {"reward": found["reward"]}
     for label in (TRAINED, found["expert"]):
-        rows = [
-            {name: float("nan") if value is None else value for name, value in row.items()}
-            for row in found["rows"]
-            if row["driver"] == label
-        ]
-        if rows:
+        if rows := rows_of.get(label):
             estimates = {name: each.__dict__ for name, each in summarise(rows).items() if each.count}
             measured[label] = {"episodes": len(rows), **estimates}
     return measured

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from unjam.errors import InputError, wrong
+from unjam.experiments.config import nested
 from unjam.experiments.manifest import manifest
 from unjam.files import check_folder
 from unjam.following.fit_drivers import FitDriversSettings, fit_drivers
@@ -82,7 +83,7 @@ def fit_from_files(
         if out.suffix != ".json":
             raise wrong("out", str(out), "a .json file")
         check_folder(out)
-    settings = build(FitDriversSettings, _nested(changes), "")
+    settings = build(FitDriversSettings, nested(changes), "")
     pairs: list[Pair] = []
     words = []
     for file in files:
@@ -109,14 +110,3 @@ def _chosen(pairs: list[Pair], only: dict[str, str]) -> list[Pair]:
         if not pairs:
             raise InputError(f"only: no trajectory has {name} {value!r}; there are: {', '.join(there)}")
     return pairs
-
-
-def _nested(changes: dict[str, Any]) -> dict[str, Any]:
-    values: dict[str, Any] = {}
-    for key, value in changes.items():
-        *tables, name = key.split(".")
-        inner = values
-        for table in tables:
-            inner = inner.setdefault(table, {})
-        inner[name] = value
-    return values

@@ -10,6 +10,7 @@ from unjam.drivers.registry import describe, free_label
 from unjam.experiments.config import RunConfig
 from unjam.experiments.evaluate import Evaluation, evaluate, held_out_seeds, raise_failure, save_evaluation
 from unjam.experiments.manifest import manifest
+from unjam.traffic.episode import can_drive
 from unjam.traffic.workers import Workers
 
 TRAINED = "trained"
@@ -31,7 +32,7 @@ def comparison(config: RunConfig, folder: Path, baselines: Sequence[str]) -> dic
     drivers: dict[str, Driver] = {}
     for name in baselines:
         driver = make_driver(name, time_step)
-        if driver.needs_loop and not scenario.closed:
+        if not can_drive(driver, scenario):
             continue
         drivers[free_label(driver, {**expert, **drivers})] = driver
     return {**drivers, **expert, TRAINED: make_driver(str(folder), time_step)}

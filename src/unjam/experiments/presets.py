@@ -44,7 +44,7 @@ PRESETS: dict[str, dict[str, Any]] = {
 }
 
 BEST: dict[str, dict[str, Any]] = {
-    "ring": {"steps": 300_000, "evaluation": {"every": 2}},
+    "ring": PRESETS["demo"],
     "figure-eight": {"expert": "pacer:varying=true", "steps": 300_000},
     "merge": {"expert": "bcm", "steps": 300_000},
 }

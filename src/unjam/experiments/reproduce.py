@@ -19,6 +19,7 @@ from unjam.experiments.studies.plan import ROADS, PlannedRun
 from unjam.experiments.studies.pool import REFERENCES, Pool
 from unjam.experiments.studies.study import Study
 from unjam.files import make_folder, to_json, write_whole
+from unjam.traffic.episode import can_drive
 from unjam.traffic.workers import Workers
 
 SECONDS: dict[str, dict[str, float]] = {
@@ -38,6 +39,9 @@ class Plan:
     """What is still to do for some studies."""
 
     names: tuple[str, ...]
+    seeds: int
+    """of each training"""
+    pool: Pool
     runs: list[PlannedRun]
     """trainings, those that are finished left out"""
     finished: int
@@ -65,7 +69,7 @@ def make_plan(names: Sequence[str], seeds: int, pool: Pool) -> Plan:
     missing = [run for run in wanted if not pool.has(run)]
     roads = dict.fromkeys(road for study in chosen.values() for road in study.roads)
     undriven = [road for road in roads if not pool.has_drives(road)]
-    return Plan(tuple(chosen), missing, len(wanted) - len(missing), undriven)
+    return Plan(tuple(chosen), seeds, pool, missing, len(wanted) - len(missing), undriven)
 
 
 def studies_of(names: Sequence[str]) -> dict[str, Study]:
@@ -99,9 +103,7 @@ def _check_settings(run: PlannedRun, pool: Pool) -> None:
 
 
 def reproduce(
-    names: Sequence[str],
-    folder: Path,
-    seeds: int,
+    plan: Plan,
     workers: int,
     executor: Executor = "local",
     told: Told = lambda line: None,
@@ -111,33 +113,30 @@ def reproduce(
     A study that was stopped goes on where it was: trainings from their last checkpoint.
 
     Args:
-        names: of the studies; `all` for all of them.
-        folder: where everything is written, or was.
-        seeds: of each training.
+        plan: of `make_plan`.
         workers: trainings at once.
         executor: `ray`: on a Ray cluster whose machines share the folder.
         told: told a line when something is done.
 
     Raises:
-        InputError: an unknown study, or the folder holds a training with other settings.
         UnjamError: a training failed; the others are there.
     """
-    pool = Pool(folder)
-    plan = make_plan(names, seeds, pool)
-    make_folder(folder)
+    pool = plan.pool
+    make_folder(pool.folder)
     for road in plan.roads:
         told(f"drivers that do not learn: {road}")
         drive_references(road, pool, workers)
     commands = {run.name: training_command(run, pool) for run in plan.runs}
     run_all(commands, workers, executor, told)
     written = []
-    for name, study in studies_of(names).items():
+    for name in plan.names:
+        study = STUDIES[name]
         told(f"writing {name}: {study.title}")
-        target = folder / name
+        target = pool.folder / name
         make_folder(target)
-        study.write(pool, seeds, target)
-        about = {"study": name, "title": study.title, "seeds": seeds, **manifest()}
-        about["trainings"] = [_trained_by(run, pool) for run in study.runs(seeds)]
+        study.write(pool, plan.seeds, target, workers)
+        about = {"study": name, "title": study.title, "seeds": plan.seeds, **manifest()}
+        about["trainings"] = [_trained_by(run, pool) for run in study.runs(plan.seeds)]
         write_whole(target / "manifest.json", to_json(about, indent=1))
         written.append(target)
     return written
@@ -154,7 +153,7 @@ def drive_references(road: str, pool: Pool, workers: int) -> None:
     config = load_config(changes=ROADS[road])
     scenario = config.make_scenario()
     made = {label: make_driver(name, scenario.decision_step) for label, name in REFERENCES.items()}
-    drivers = {label: driver for label, driver in made.items() if scenario.closed or not driver.needs_loop}
+    drivers = {label: driver for label, driver in made.items() if can_drive(driver, scenario)}
     with Workers(workers) as processes:
         found = evaluate(scenario, drivers, held_out_seeds(config.evaluation.episodes), processes)
     save_evaluation(pool.drives_of(road), found, {"scenario": config.scenario, "manifest": manifest()})

@@ -13,9 +13,10 @@ from torch import Tensor, nn
 
 from unjam.drivers.network import Network
 from unjam.errors import UnjamError
-from unjam.following.open_loop import INPUTS, Follow, Residual, inputs_of
+from unjam.following.open_loop import Follow, Residual
 from unjam.following.pairs import Floats, Rows
 from unjam.parameters import STRICT, Count, Positive
+from unjam.scenarios.population import RESIDUAL_INPUTS, residual_inputs
 
 
 @checked_dataclass(frozen=True, config=STRICT)
@@ -47,7 +48,7 @@ class FollowingNetwork(nn.Module):
         super().__init__()
         with torch.random.fork_rng():
             torch.manual_seed(seed)
-            sizes = [len(INPUTS), *settings.hidden, 1]
+            sizes = [len(RESIDUAL_INPUTS), *settings.hidden, 1]
             self.layers = nn.ModuleList(nn.Linear(*pair) for pair in itertools.pairwise(sizes))
         if zero:
             last = self.layers[-1]
@@ -55,12 +56,12 @@ class FollowingNetwork(nn.Module):
             nn.init.zeros_(last.weight)
             nn.init.zeros_(last.bias)
         self.authority = settings.authority
-        seen = inputs_of(rows.speed, rows.leader_speed, rows.gap)
+        seen = residual_inputs(rows.speed, rows.leader_speed, rows.gap)
         self.register_buffer("mean", torch.as_tensor(seen.mean(0), dtype=torch.float32))
         self.register_buffer("scale", torch.as_tensor(seen.std(0).clip(1e-3), dtype=torch.float32))
 
     def forward(self, inputs: Tensor) -> Tensor:
-        """Return the acceleration [m/s2], shape (n,), for what `inputs_of` answers."""
+        """Return the acceleration [m/s2], shape (n,), for what `residual_inputs` answers."""
         hidden = (inputs - self.mean) / self.scale
         *first, last = self.layers
         for layer in first:
@@ -85,7 +86,7 @@ def on_rows(network: Network) -> Residual:
     """Return a network that drives as one that takes inputs of any shape (..., 3)."""
 
     def answer(inputs: Floats) -> Floats:
-        return network(inputs.reshape(-1, len(INPUTS))).reshape(inputs.shape[:-1])
+        return network(inputs.reshape(-1, len(RESIDUAL_INPUTS))).reshape(inputs.shape[:-1])
 
     return answer
 
@@ -155,6 +156,6 @@ def fit_one_step(
 def _tensors(rows: Rows, base: Follow | None) -> tuple[Tensor, Tensor]:
     """Return what the network sees of rows, and what it is to answer."""
     known = 0.0 if base is None else base(rows.speed, rows.leader_speed, rows.gap)
-    inputs = inputs_of(rows.speed, rows.leader_speed, rows.gap)
+    inputs = residual_inputs(rows.speed, rows.leader_speed, rows.gap)
     wanted = torch.as_tensor(rows.acceleration - known, dtype=torch.float32)
     return torch.as_tensor(np.ascontiguousarray(inputs), dtype=torch.float32), wanted

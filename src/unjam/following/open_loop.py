@@ -16,6 +16,7 @@ from unjam.following.pairs import Floats, Stretches
 from unjam.physics.arrays import Array, at_least, clip, namespace
 from unjam.physics.idm import IDMParameters, IDMRows, idm_acceleration
 from unjam.physics.kinematics import next_position, next_speed
+from unjam.scenarios.population import residual_inputs
 
 Follow = Callable[[Array, Array, Array], Array]
 """a model of a driver: (own speed, leader's speed, gap) -> acceleration; [m/s], [m] and [m/s2]"""
@@ -27,8 +28,6 @@ Residual = Callable[[Array], Array]
 """a network: what it sees, shape (..., 3) -> acceleration"""
 Limits = tuple[float, float]
 
-INPUTS = ("speed", "leader's speed minus own", "gap")
-"""what a network sees"""
 SLOWEST = 2.0
 """speed below which a time headway is not to be told from the gap [m/s]: it counts as this"""
 HEADWAYS = (0.2, 6.0)
@@ -79,7 +78,7 @@ def with_residual(base: Model | None, network: Residual, limits: Limits | None =
         known = base(speed, gap) if base is not None else None
 
         def follow(speed: Array, leader_speed: Array, gap: Array) -> Array:
-            found = network(inputs_of(speed, leader_speed, gap))
+            found = network(residual_inputs(speed, leader_speed, gap))
             if known is not None:
                 found = found + known(speed, leader_speed, gap)
             return found if limits is None else clip(found, *limits)
@@ -87,11 +86,6 @@ def with_residual(base: Model | None, network: Residual, limits: Limits | None =
         return follow
 
     return begin
-
-
-def inputs_of(speed: Array, leader_speed: Array, gap: Array) -> Array:
-    """Return what a network sees, shape (..., 3), SI units: INPUTS."""
-    return namespace(gap).stack([speed, leader_speed - speed, gap], -1)
 
 
 def drive_behind(follow: Follow, start: tuple[Array, Array], leader: Any, step: float) -> Iterator[Any]:

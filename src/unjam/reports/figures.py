@@ -52,17 +52,22 @@ def data_uri(figure: Figure, kind: Literal["png", "svg"]) -> str:
     if kind == "svg":
         with rc_context({"svg.hashsalt": "unjam"}):  # the same figure gets the same bytes
             figure.savefig(content, format="svg", metadata={"Date": None})
-        return _data_uri("image/svg+xml", content)
-    figure.savefig(content, format="png", dpi=130)
-    small = io.BytesIO()
+        return _data_uri("image/svg+xml", content.getvalue())
+    return _data_uri("image/png", png_bytes(figure))
+
+
+def png_bytes(figure: Figure, dpi: int = 130) -> bytes:
+    """Return a figure as a small PNG of 256 colours."""
+    content, small = io.BytesIO(), io.BytesIO()
+    figure.savefig(content, format="png", dpi=dpi)
     # A sixth of the size. Maximum coverage keeps colours that are rare: the CAV's, and the fastest.
     quantized = Image.open(content).convert("RGB").quantize(256, Image.Quantize.MAXCOVERAGE)
     quantized.save(small, "PNG", optimize=True)
-    return _data_uri("image/png", small)
+    return small.getvalue()
 
 
-def _data_uri(mime: str, content: io.BytesIO) -> str:
-    return f"data:{mime};base64,{base64.b64encode(content.getvalue()).decode()}"
+def _data_uri(mime: str, content: bytes) -> str:
+    return f"data:{mime};base64,{base64.b64encode(content).decode()}"
 
 
 def speed_scale(shown: Sequence[Shown]) -> Normalize:

@@ -267,8 +267,3 @@ def measure(episode: Episode) -> dict[str, Any]:
     for name, metric in METRICS.items():
         row[name] = metric.function(episode) if episode.ok else float("nan")
     return row
-
-
-def measure_all(episodes: Sequence[Episode]) -> list[dict[str, Any]]:
-    """Return the rows of several episodes."""
-    return [measure(episode) for episode in episodes]

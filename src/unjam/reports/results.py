@@ -2,7 +2,6 @@
 
 import json
 import shlex
-import tomllib
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -17,6 +16,8 @@ from unjam.errors import InputError
 Floats = NDArray[np.float32]
 
 
+EVALUATION_FILE = "evaluation.json"
+"""what was measured of each driver"""
 MODEL_FILE = "model.json"
 """what there is to see of a run's virtual environment"""
 PICTURED = ("speeds", "positions", "gaps", "outline", "waiting", "lines", "places")
@@ -101,10 +102,10 @@ def read_results(folder: Path) -> Results:
     Raises:
         InputError: it is not such a folder, or not finished.
     """
-    path = folder / "evaluation.json"
+    path = folder / EVALUATION_FILE
     if not path.is_file():
         hint = "; go on with: unjam train --resume" if (folder / "config.toml").exists() else ""
-        raise InputError(f"report: {str(folder)!r} has no evaluation.json{hint}")
+        raise InputError(f"report: {str(folder)!r} has no {EVALUATION_FILE}{hint}")
     try:
         return _results(folder, json.loads(path.read_text()), load_file(folder / "shown.safetensors"))
     except (OSError, ValueError, LookupError, TypeError, AttributeError, SafetensorError) as error:
@@ -112,9 +113,7 @@ def read_results(folder: Path) -> Results:
 
 
 def _results(folder: Path, about: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> Results:
-    rows: dict[str, list[dict[str, Any]]] = {}
-    for row in about.pop("rows"):
-        rows.setdefault(row["driver"], []).append({key: _nan(value) for key, value in row.items()})
+    rows = rows_by_driver(about.pop("rows"))
     shown = {}
     for number, entry in enumerate(about.pop("shown")):
         values: dict[str, Any] = {key: _nan(value) for key, value in entry.items() if key != "seed"}
@@ -122,6 +121,19 @@ def _results(folder: Path, about: dict[str, Any], arrays: dict[str, NDArray[Any]
         shown[entry["driver"]] = Shown(**values)
     config = _text(folder / "config.toml")
     return Results(folder, about, rows, shown, read_progress(folder), config, read_model(folder))
+
+
+def rows_by_driver(rows: list[dict[str, Any]]) -> dict[str, list[dict[str, Any]]]:
+    """Return the rows of an `evaluation.json` by driver, NaN where it has null."""
+    found: dict[str, list[dict[str, Any]]] = {}
+    for row in rows:
+        found.setdefault(row["driver"], []).append({key: _nan(value) for key, value in row.items()})
+    return found
+
+
+def read_rows(folder: Path) -> dict[str, list[dict[str, Any]]]:
+    """Return the rows of metrics of a folder of results, by driver."""
+    return rows_by_driver(json.loads((folder / EVALUATION_FILE).read_text())["rows"])
 
 
 def read_progress(folder: Path) -> list[dict[str, Any]]:
@@ -157,8 +169,3 @@ def command_to_repeat(results: Results) -> str:
     """Return the command line that made a folder."""
     command = results.about.get("manifest", {}).get("command", [])
     return shlex.join(str(word) for word in command)
-
-
-def steps_of(config: str) -> int:
-    """Return the budget of actual steps in a configuration."""
-    return int(tomllib.loads(config)["steps"])

@@ -20,11 +20,12 @@ from unjam.drivers.network import Network, network_arrays, network_from_arrays
 from unjam.errors import InputError
 from unjam.files import to_json, write_whole
 from unjam.parameters import build
+from unjam.physics.arrays import Array, namespace
 from unjam.physics.idm import PARAMETER_NAMES, IDMParameters
 
 FORMAT = 1
-RESIDUAL_INPUTS = 3
-"""own speed [m/s], the leader's minus own [m/s], gap [m]"""
+RESIDUAL_INPUTS = ("speed", "leader's speed minus own", "gap")
+"""what the residual sees [m/s, m/s, m]"""
 LARGEST = 64 * 2**20
 """bytes of a file"""
 WRITTEN = ("format", "unjam", "typical", "spread", "limits", "drivers", "residual")
@@ -73,6 +74,11 @@ class Population:
                 "quartiles": [float(low), float(median), float(high)],
             }
         return found
+
+
+def residual_inputs(speed: Array, leader_speed: Array, gap: Array) -> Array:
+    """Return what a residual sees, shape (..., 3), SI units: RESIDUAL_INPUTS."""
+    return namespace(gap).stack([speed, leader_speed - speed, gap], -1)
 
 
 def write_population(path: Path, population: Population) -> None:
@@ -168,6 +174,6 @@ def _residual(path: Path, named: dict[str, Any] | None) -> Network | None:
     if hashlib.sha256(weights).hexdigest() != named["sha256"]:
         raise InputError(f"population {path.name}: damaged: {beside.name} does not have the hash it names")
     network = network_from_arrays(load(weights), float(named["authority"]), 0.0)
-    if network.inputs != RESIDUAL_INPUTS:
+    if network.inputs != len(RESIDUAL_INPUTS):
         raise InputError(f"population {path.name}: {network.inputs} inputs are not allowed; allowed: 3")
     return network

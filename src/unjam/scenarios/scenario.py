@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import field
+from functools import cached_property
 from typing import Annotated, Any, ClassVar, Literal
 from xml.sax.saxutils import quoteattr
 
@@ -98,9 +99,9 @@ class Scenario:
         scale = self.simulation_step**0.5 if self.noise_scaling == "sqrt-step" else 1.0
         return self.noise * scale
 
-    @property
+    @cached_property
     def calibrated(self) -> Population | None:
-        """The people of `population`."""
+        """The people of `population`, read once."""
         return read_population(self.population) if self.population else None
 
     @property
@@ -117,8 +118,8 @@ class Scenario:
     @property
     def people_in_words(self) -> str:
         """How people drive."""
-        if self.population:
-            return f"{len(read_population(self.population).drivers)} calibrated drivers of {self.population}"
+        if self.calibrated:
+            return f"{len(self.calibrated.drivers)} calibrated drivers of {self.population}"
         return f"IDM with acceleration noise of std {self.noise_per_step:.3f} m/s2 a step"
 
     def draw(self, generator: np.random.Generator) -> Road:

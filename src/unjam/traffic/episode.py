@@ -55,7 +55,7 @@ def run_episode(
         InputError: driver or reward answer something that is not finite, or of a wrong shape.
         EpisodeError: SUMO cannot run the scenario.
     """
-    if driver.needs_loop and not scenario.closed:
+    if not can_drive(driver, scenario):
         raise InputError(f"driver: it is not allowed on {scenario.title}: it needs a closed road")
     earned = make_reward(reward or scenario.reward)
     if simulation is None:
@@ -68,6 +68,11 @@ def run_episode(
             f"no CAV was on the road in {traffic.decisions} decisions: let more vehicles be CAVs"
         )
     return _episode(traffic, seed, earned, log)
+
+
+def can_drive(driver: Driver, scenario: Scenario) -> bool:
+    """Return whether a driver can drive a scenario: some need a loop."""
+    return scenario.closed or not driver.needs_loop
 
 
 @dataclass(frozen=True)

@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 
 from unjam.drivers.idm import SMALLEST_GAP
-from unjam.physics.arrays import Array, at_least, clip, stack_columns
+from unjam.physics.arrays import Array, at_least, clip
 from unjam.physics.idm import IDMParameters, idm_acceleration
 from unjam.physics.kinematics import gap_on_loop
-from unjam.scenarios.population import Population
+from unjam.scenarios.population import Population, residual_inputs
 from unjam.scenarios.road import ClosedRoad, Road
 from unjam.scenarios.scenario import VEHICLE_LENGTH, Scenario
 
@@ -32,7 +32,7 @@ def as_calibrated(
     if population is None:
         return acceleration
     if population.residual is not None:
-        acceleration = acceleration + population.residual(stack_columns((speed, leader_speed - speed, gap)))
+        acceleration = acceleration + population.residual(residual_inputs(speed, leader_speed, gap))
     return clip(acceleration, *population.limits)
 
 

@@ -11,7 +11,7 @@ from unjam.experiments.studies.theory import THEORY
 FIGURE_6 = Study(
     "networks that learn how people drive, with knowledge and without",
     lambda seeds: [],
-    lambda pool, seeds, folder: run_figure_6(folder),
+    lambda pool, seeds, folder, workers: run_figure_6(folder, workers),
     minutes=25.0,
 )
 

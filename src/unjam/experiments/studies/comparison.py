@@ -19,7 +19,9 @@ ABLATION = (
 FRAMEWORK = ("ppo", "sac", "proposed-ppo", "proposed-sac", "proposed")
 
 
-def _write(variants: Sequence[str], roads: Sequence[str], pool: Pool, seeds: int, folder: Path) -> None:
+def _write(
+    variants: Sequence[str], roads: Sequence[str], pool: Pool, seeds: int, folder: Path, workers: int
+) -> None:
     """Write table and curves of some variants on some roads."""
     write_table([row for road in roads for row in table_rows(pool, road, variants, seeds)], folder)
     by_road = {road: curves_of(pool, road, variants, seeds) for road in roads}

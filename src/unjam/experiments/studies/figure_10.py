@@ -27,10 +27,10 @@ OTHER_ROADS: dict[str, dict[str, Any]] = {
 EPISODES = 20
 
 
-def carried_over(pool: Pool, seeds: int) -> list[dict[str, Any]]:
+def carried_over(pool: Pool, seeds: int, processes: int = 2) -> list[dict[str, Any]]:
     """Return what controllers that were trained among 22 vehicles do among others, without training."""
     rows = []
-    with Workers(2) as workers:
+    with Workers(processes) as workers:
         for road, changes in OTHER_ROADS.items():
             scenario = load_config(changes=changes).make_scenario()
             drivers = {name: make_driver(name, scenario.decision_step) for name in ("human", "pi")}
@@ -46,9 +46,9 @@ def carried_over(pool: Pool, seeds: int) -> list[dict[str, Any]]:
     return rows
 
 
-def _write(pool: Pool, seeds: int, folder: Path) -> None:
+def _write(pool: Pool, seeds: int, folder: Path, workers: int) -> None:
     write_table([row for road in VOLUMES for row in table_rows(pool, road, LEARNERS, seeds)], folder)
-    write_whole(folder / "carried-over.json", to_json(carried_over(pool, seeds), indent=1))
+    write_whole(folder / "carried-over.json", to_json(carried_over(pool, seeds, workers), indent=1))
 
 
 FIGURE_10 = Study(

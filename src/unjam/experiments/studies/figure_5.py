@@ -13,7 +13,7 @@ from unjam.reports.results import Shown, read_results
 LEARNED = ("proposed", "ours")
 
 
-def _write(pool: Pool, seeds: int, folder: Path) -> None:
+def _write(pool: Pool, seeds: int, folder: Path, workers: int) -> None:
     """Draw a picture per road; all drivers of one meet the same traffic."""
     for road in PAPERS_ROADS:
         space_time(shown_on(pool, road)).savefig(folder / f"{road}.png", dpi=130)

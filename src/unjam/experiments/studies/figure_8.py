@@ -56,7 +56,7 @@ def _per_thousand(folder: Path) -> dict[str, float]:
     return {part: sum(row["seconds"].get(part, 0.0) for row in rows) / thousands for part in parts}
 
 
-def _write(pool: Pool, seeds: int, folder: Path) -> None:
+def _write(pool: Pool, seeds: int, folder: Path, workers: int) -> None:
     found = measured_seconds()
     means = {
         variant: {part: sum(turn.get(part, 0.0) for turn in turns) / len(turns) for part in turns[0]}

@@ -4,19 +4,17 @@ In the experiment of Sugiyama et al. (2008), 22 cars on 230 m, a jam arose by it
 traffic at about 20 km/h, 5.6 m/s; on motorways it is 15 to 20 km/h.
 """
 
-import io
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image
 
 from unjam.controller import make_driver
 from unjam.experiments.evaluate import Evaluation, raise_failure, save_evaluation
 from unjam.experiments.manifest import manifest
 from unjam.experiments.studies.parts import Told
 from unjam.files import make_folder, to_json, write_whole
-from unjam.reports.figures import space_time
+from unjam.reports.figures import png_bytes, space_time
 from unjam.reports.metrics import measure
 from unjam.reports.results import read_results
 from unjam.reports.waves import wave_speed
@@ -75,7 +73,4 @@ def run(
     write_whole(folder / "ring.json", to_json({"manifest": about, "rows": rows}, indent=1))
     save_evaluation(folder / "shown", Evaluation({}, shown), {})
     pictured = list(read_results(folder / "shown").shown.values())
-    content = io.BytesIO()
-    space_time(pictured).savefig(content, dpi=90)
-    # A fifth of the size; maximum coverage keeps colours that are rare.
-    Image.open(content).convert("RGB").quantize(256, Image.Quantize.MAXCOVERAGE).save(folder / "ring.png")
+    write_whole(folder / "ring.png", png_bytes(space_time(pictured), dpi=90))

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import product
 from typing import Any
 
@@ -66,7 +67,7 @@ class PlannedRun:
         """Its place among all trainings of the studies."""
         return f"{self.road}/{self.variant}/{self.seed}"
 
-    @property
+    @cached_property
     def config(self) -> RunConfig:
         """Its configuration: one worker, judged without drivers that all trainings would share."""
         variant = VARIANTS[self.variant]

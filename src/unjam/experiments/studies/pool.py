@@ -1,7 +1,6 @@
 """What studies are made of, once it has been measured: trainings, and drivers that do not learn."""
 
 import hashlib
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import ceil
@@ -13,7 +12,7 @@ import numpy as np
 from unjam.experiments.folder import read_config
 from unjam.experiments.judge import TRAINED
 from unjam.experiments.studies.plan import PlannedRun
-from unjam.reports.results import Results, read_progress, read_results
+from unjam.reports.results import EVALUATION_FILE, Results, read_progress, read_results, read_rows
 
 REFERENCES: dict[str, str] = {
     "human": "human",
@@ -54,10 +53,6 @@ class TrainedRun:
         """Return a number of the training batches, exploration included, in the last tenth of them."""
         return float(np.mean([row[name] for row in self.last]))
 
-    def judged(self, name: str) -> float:
-        """Return the mean of a metric on the held-out seeds."""
-        return float(np.mean([row[name] for row in self.rows]))
-
     @property
     def seconds(self) -> float:
         """Wall time of its iterations."""
@@ -82,27 +77,23 @@ class Pool:
     def has(self, run: PlannedRun) -> bool:
         """Return whether a training is finished, with these settings."""
         folder = self.folder_of(run)
-        return (folder / "evaluation.json").is_file() and read_config(folder) == run.config
+        return (folder / EVALUATION_FILE).is_file() and read_config(folder) == run.config
 
     def has_drives(self, road: str) -> bool:
         """Return whether the drivers that do not learn have driven a road."""
-        return (self.drives_of(road) / "evaluation.json").is_file()
+        return (self.drives_of(road) / EVALUATION_FILE).is_file()
 
     def trained(self, runs: Sequence[PlannedRun]) -> list[TrainedRun]:
         """Return finished trainings."""
         return [
-            TrainedRun(run, read_progress(folder), _rows(folder, TRAINED))
+            TrainedRun(run, read_progress(folder), read_rows(folder)[TRAINED])
             for run in runs
             for folder in (self.folder_of(run),)
         ]
 
     def references(self, road: str) -> dict[str, list[dict[str, Any]]]:
         """Return the rows of the drivers that do not learn, by label, on the seeds that judge."""
-        about = json.loads((self.drives_of(road) / "evaluation.json").read_text())
-        found: dict[str, list[dict[str, Any]]] = {}
-        for row in about["rows"]:
-            found.setdefault(row["driver"], []).append(row)
-        return found
+        return read_rows(self.drives_of(road))
 
     def sha256(self, run: PlannedRun) -> str:
         """Return the hash of a trained controller."""
@@ -111,8 +102,3 @@ class Pool:
     def results(self, run: PlannedRun) -> Results:
         """Return all that the folder of a training says, pictures included."""
         return read_results(self.folder_of(run))
-
-
-def _rows(folder: Path, driver: str) -> list[dict[str, Any]]:
-    rows = json.loads((folder / "evaluation.json").read_text())["rows"]
-    return [row for row in rows if row["driver"] == driver]

@@ -15,8 +15,9 @@ class Study:
     title: str
     runs: Callable[[int], list[PlannedRun]]
     """the trainings for a number of seeds"""
-    write: Callable[[Pool, int, Path], None]
-    """measures what else it needs, and writes numbers and pictures into a folder: (pool, seeds, folder)"""
+    write: Callable[[Pool, int, Path, int], None]
+    """measures what else it needs, and writes numbers and pictures into a folder: (pool, seeds, folder,
+    processes)"""
     roads: tuple[str, ...] = ()
     """where drivers that do not learn are driven beside them"""
     minutes: float = 0.0

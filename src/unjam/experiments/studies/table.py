@@ -106,7 +106,7 @@ def _mean(values: Sequence[float]) -> float:
 
 
 def _finite(rows: Rows, name: str) -> list[float]:
-    return [row[name] for row in rows if row[name] is not None and np.isfinite(row[name])]
+    return [row[name] for row in rows if np.isfinite(row[name])]
 
 
 def write_table(rows: Rows, folder: Path) -> None:

@@ -48,10 +48,12 @@ def random_network(inputs: int, authority: float, seed: int, hidden: int = 64) -
     return Network(tuple(layers), authority)
 
 
-def untrained(roads: Sequence[str] = PAPERS_ROADS, policies: int = RANDOM_POLICIES) -> list[dict[str, Any]]:
+def untrained(
+    roads: Sequence[str] = PAPERS_ROADS, policies: int = RANDOM_POLICIES, processes: int = 2
+) -> list[dict[str, Any]]:
     """A1: return of the expert plus a random residual beside a random network alone, on the same seeds."""
     rows = []
-    with Workers(2) as workers:
+    with Workers(processes) as workers:
         for road in roads:
             config = PlannedRun(road, "proposed", 0).config
             scenario, expert, parts = config.make_scenario(), config.make_expert(), config.policy.observe
@@ -62,13 +64,11 @@ def untrained(roads: Sequence[str] = PAPERS_ROADS, policies: int = RANDOM_POLICI
                     network = random_network(observation_size(parts, base), limit, number)
                     drivers[f"{kind} {number}"] = ResidualDriver(base, network, limit, parts)
             found = evaluate(scenario, drivers, held_out_seeds(4), workers)
-            means = {
-                label: float(np.mean([row["return"] for row in rows])) for label, rows in found.rows.items()
-            }
+            returns = {label: means["return"] for label, means in found.means().items()}
             for kind in ("expert + random", "random"):
-                values = [mean for label, mean in means.items() if label.startswith(f"{kind} ")]
+                values = [mean for label, mean in returns.items() if label.startswith(f"{kind} ")]
                 rows.append({"road": road, "policy": kind, "returns": values, **entries(estimate(values))})
-            rows.append({"road": road, "policy": "expert alone", "mean": means["expert alone"]})
+            rows.append({"road": road, "policy": "expert alone", "mean": returns["expert alone"]})
     return rows
 
 
@@ -136,10 +136,10 @@ def draw(by_variant: dict[str, list[list[dict[str, Any]]]]) -> Figure:
         return figure
 
 
-def _write(pool: Pool, seeds: int, folder: Path) -> None:
+def _write(pool: Pool, seeds: int, folder: Path, workers: int) -> None:
     by_variant = model_over_training(pool, seeds)
     found = {
-        "untrained": untrained(),
+        "untrained": untrained(processes=workers),
         "convergence": convergence(pool, seeds),
         "model": by_variant,
     }
