@@ -17,7 +17,7 @@ demo: $(VENV)/.installed
 	$(BIN)/unjam train ring --preset demo
 
 test: $(VENV)/.installed-dev
-	$(BIN)/python -m pytest -n 2 -m "not slow"
+	$(BIN)/python -m pytest -n 2 --dist loadfile -m "not slow"
 
 test-all: $(VENV)/.installed-dev
 	$(BIN)/python -m pytest -n 2 --hypothesis-profile=thorough

@@ -25,6 +25,12 @@ def simulation() -> Iterator[Simulation]:
 
 
 @pytest.fixture
+def without_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Leave the pictures of reports empty: drawing them takes five seconds, and few tests look at them."""
+    monkeypatch.setattr("unjam.reports.html.data_uri", lambda figure, kind: f"data:image/{kind};base64,")
+
+
+@pytest.fixture
 def my_drivers(tmp_path: Path) -> Path:
     """A user's file with drivers and rewards, good and bad."""
     path = tmp_path / "mine.py"

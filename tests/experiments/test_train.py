@@ -25,6 +25,8 @@ from unjam.traffic.workers import Workers
 
 from .test_run import STEPS, learn_with, outcome, small_config
 
+pytestmark = pytest.mark.usefixtures("without_pictures")  # but for those of the run that all share
+
 CONTENT = {
     "checkpoint",
     "config.toml",

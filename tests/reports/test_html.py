@@ -107,6 +107,13 @@ def page_of(*folders: Path) -> tuple[str, Page]:
     return text, Page(text)
 
 
+@pytest.fixture(autouse=True)
+def pictures(request: pytest.FixtureRequest) -> None:
+    """Draw pictures for those tests alone that are about the page that has them."""
+    if "written" not in request.fixturenames:
+        request.getfixturevalue("without_pictures")
+
+
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return run_in(tmp_path_factory.mktemp("html") / "ring-001")

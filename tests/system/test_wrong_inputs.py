@@ -176,7 +176,7 @@ def test_disk_that_fills_up_is_code_74(unjam: Run, tmp_path: Path) -> None:
     def little_space() -> None:
         resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
 
-    unjam("drive", "ring", "--driver", "pi", *SMALL)  # so that the network is made already
+    unjam("drive", "ring", "--driver", "pi", *SMALL, "--no-report")  # so that the network is made already
     ran = unjam("drive", "ring", "--driver", "pi", *SMALL, "--out", "new", preexec_fn=little_space)
     assert ran.returncode == 74, ran.stderr
     assert one_line(ran.stderr)

@@ -1,7 +1,7 @@
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -76,7 +76,11 @@ def plain_rings(length: int, rings: int = 150) -> tuple[Measured, Measured]:
     )
 
 
-@pytest.fixture(scope="module", params=[230, 260])
+def slowly(length: int) -> Any:
+    return pytest.param(length, marks=pytest.mark.slow)
+
+
+@pytest.fixture(scope="module", params=[230, slowly(260)])
 def human_rings(request: pytest.FixtureRequest, workers: Workers) -> tuple[int, list[Episode]]:
     return request.param, run(workers, ring_warm(request.param), Human(), range(20))
 
@@ -100,7 +104,7 @@ def test_human_rings_agree_with_flow(human_rings: tuple[int, list[Episode]]) -> 
     assert abs(found.std - flow.std) < 0.05 * flow.mean + spread.std / np.sqrt(FLOW_SEEDS)
 
 
-@pytest.mark.parametrize("length", [230, 260])
+@pytest.mark.parametrize("length", [230, slowly(260)])
 def test_rings_with_the_papers_pi_agree_with_flow(length: int, workers: Workers) -> None:
     flow = FLOW_PI[length]
     found, _ = measured(run(workers, ring_warm(length), PISaturation(time_constant=0), range(8)))
@@ -108,7 +112,7 @@ def test_rings_with_the_papers_pi_agree_with_flow(length: int, workers: Workers)
     assert abs(found.std - flow.std) < 0.05 * flow.mean
 
 
-@pytest.mark.parametrize("length", range(220, 271, 10))
+@pytest.mark.parametrize("length", [220, 270, *map(slowly, range(230, 261, 10))])
 def test_pi_holds_a_warm_ring_at_its_limit(length: int, workers: Workers) -> None:
     (episode,) = run(workers, ring_warm(length), PISaturation(), [0])
     row = measure(episode)

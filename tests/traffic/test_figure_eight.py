@@ -119,14 +119,18 @@ def test_on_the_crossing_people_are_left_to_sumo(
             assert inside or speed >= 0.0
 
 
+def slowly(*values: object) -> Any:
+    return pytest.param(*values, marks=pytest.mark.slow)
+
+
 @pytest.mark.parametrize(
     ("driver", "radius", "speed"),
     [
         (Pacer(), 32, 5.8),
-        (Pacer(), 35, 6.2),
-        (Pacer(varying=True), 32, 6.8),
-        (Pacer(varying=True), 33, 6.8),
-        (Pacer(varying=True), 34, 6.9),
+        slowly(Pacer(), 35, 6.2),
+        slowly(Pacer(varying=True), 32, 6.8),
+        slowly(Pacer(varying=True), 33, 6.8),
+        slowly(Pacer(varying=True), 34, 6.9),
         (Pacer(varying=True), 35, 7.2),
     ],
 )
