@@ -152,6 +152,7 @@ class Driver:
             "expert_acceleration": (expert,),
             "expert_memory": getattr(self.memory, "features", ()),
             "loop_length": (s.loop_length / 250.0,),
+            "route_position": (s.route_position / 100.0,),
             "place": (math.cos(lap := 2.0 * math.pi * s.route_position / s.loop_length), math.sin(lap)),
         }
         units = np.array([number for part in self.r["parts"] for number in parts[part]])

@@ -32,7 +32,7 @@ from unjam.errors import InputError
 from ..conftest import random_network
 
 ALL_PARTS: tuple[ObservationPart, ...] = (
-    *("local", "expert_acceleration", "expert_memory", "loop_length", "place"),
+    *("local", "expert_acceleration", "expert_memory", "loop_length", "place", "route_position"),
 )
 ABOUT = {"scenario": "ring", "iteration": 3}
 

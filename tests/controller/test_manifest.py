@@ -57,7 +57,7 @@ def test_what_a_network_sees_is_told_with_its_scale() -> None:
         np.array([scales["gap to the leader"]]),
         speed + scales["follower's speed - own"],
         np.array([scales["gap to the follower"]]),
-        speed,
+        np.array([scales["position along the road"]]),
         loop,
     )
     driver = residual(PISaturation())

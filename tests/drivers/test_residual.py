@@ -10,7 +10,7 @@ from unjam.drivers.residual import observation_size
 
 from ..conftest import random_network
 
-ALL_PARTS = ("local", "expert_acceleration", "expert_memory", "loop_length", "place")
+ALL_PARTS = ("local", "expert_acceleration", "expert_memory", "loop_length", "place", "route_position")
 
 
 def zero_network(inputs: int) -> Network:

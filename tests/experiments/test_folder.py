@@ -4,9 +4,10 @@ from typing import Any
 
 import pytest
 
+from tests.traffic.own_roads import straight
 from unjam.errors import InputError
 from unjam.experiments.config import load_config
-from unjam.experiments.folder import continue_folder, read_config, start_folder
+from unjam.experiments.folder import check_possible, continue_folder, read_config, start_folder
 from unjam.experiments.train import train
 
 from .test_run import STEPS, small_config
@@ -34,6 +35,13 @@ def test_what_cannot_work_is_told_before_anything_is_written(tmp_path: Path, cha
         train(small_config(**changes), tmp_path / "run")
     assert "\n" not in str(caught.value)
     assert not (tmp_path / "run").exists()
+
+
+def test_vehicles_on_a_network_of_ones_own_know_no_position(tmp_path: Path) -> None:
+    file = straight(tmp_path, '<flow id="f" type="car" route="along" begin="0" end="60" period="3"/>')
+    changes = {"scenario": str(file), "road.cav_types": ["car"], "policy.observe": ["route_position"]}
+    with pytest.raises(InputError, match="'route_position' is not allowed on a network of one's own"):
+        check_possible(load_config(changes=changes))
 
 
 @pytest.mark.parametrize("content", [{}, {"notes.txt": "mine"}])

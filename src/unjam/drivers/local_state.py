@@ -38,10 +38,13 @@ RELATIVE_SPEED_SCALE = 5.0
 GAP_SCALE = 20.0
 ACCELERATION_SCALE = 1.0
 LOOP_LENGTH_SCALE = 250.0
+ROUTE_POSITION_SCALE = 100.0
 
-ObservationPart = Literal["local", "expert_acceleration", "expert_memory", "loop_length", "place"]
+ObservationPart = Literal[
+    "local", "expert_acceleration", "expert_memory", "loop_length", "place", "route_position"
+]
 """Parts of an observation: the paper's five numbers; the expert's acceleration; what the expert remembers;
-the length of the closed road; the place on it."""
+the length of the closed road; the place on it; the position along a road with ends."""
 
 STATE_UNITS = {
     "speed": "m/s",
@@ -77,6 +80,7 @@ OBSERVED: dict[str, tuple[Observed, ...]] = {
     "expert_acceleration": (Observed("expert's acceleration", ACCELERATION_SCALE, "m/s2"),),
     "loop_length": (Observed("length of the closed road", LOOP_LENGTH_SCALE, "m"),),
     "place": (Observed("cosine of the place on the lap", 1.0, ""), Observed("sine of the same", 1.0, "")),
+    "route_position": (Observed("position along the road", ROUTE_POSITION_SCALE, "m"),),
 }
 """what each part of an observation holds, in order; what an expert remembers is its own to say"""
 

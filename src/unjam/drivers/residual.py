@@ -11,6 +11,7 @@ from unjam.drivers.local_state import (
     ACCELERATION_SCALE,
     LOOP_LENGTH_SCALE,
     OBSERVED,
+    ROUTE_POSITION_SCALE,
     LocalState,
     ObservationPart,
     Observed,
@@ -55,6 +56,8 @@ def observe(
             blocks.append(as_column(state.loop_length / LOOP_LENGTH_SCALE))
         elif part == "place":
             blocks.append(lap_place(state))
+        elif part == "route_position":
+            blocks.append(as_column(state.route_position / ROUTE_POSITION_SCALE))
         elif part == "expert_acceleration":
             blocks.append(as_column(expert_acceleration / ACCELERATION_SCALE))
         else:

@@ -18,6 +18,8 @@ def check_possible(config: RunConfig) -> None:
     of_a_loop = [part for part in config.policy.observe if part in ("loop_length", "place")]
     if of_a_loop and not scenario.closed:
         raise InputError(f"policy.observe: {of_a_loop[0]!r} is not allowed on a road with ends")
+    if "route_position" in config.policy.observe and not scenario.has_coordinate:
+        raise InputError("policy.observe: 'route_position' is not allowed on a network of one's own")
     observation_size(config.policy.observe, config.make_expert())
     make_reward(config.reward or scenario.reward)
     for name in config.evaluation.baselines:

@@ -36,6 +36,7 @@ class OwnNetwork(Scenario):
     title: ClassVar[str] = "own-network"
     reward: ClassVar[str] = "released"
     closed: ClassVar[bool] = False
+    has_coordinate: ClassVar[bool] = False
 
     file: str = ""
     """the .sumocfg file"""

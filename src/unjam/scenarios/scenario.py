@@ -51,6 +51,8 @@ class Scenario:
     """reward used where none is named"""
     closed: ClassVar[bool] = True
     """whether the road is a loop"""
+    has_coordinate: ClassVar[bool] = True
+    """whether vehicles have a position along the road"""
     people_gap: ClassVar[float] = 0.0
     """gap that SUMO keeps for commanded people [m]"""
 
