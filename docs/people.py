@@ -163,8 +163,6 @@ def _loss(rows: pd.DataFrame) -> tuple[str, str, str]:
 
 
 def _sizes(rows: pd.DataFrame, words: str, how: str) -> tuple[str, str, str]:
-    if how == "std" and rows["repeat"].nunique() < 2:
-        return words, "not measured", "one repeat tells no spread"
     found = rows[rows["network"] != "nearest row"].groupby(["size", "network"])["error_of_driver"].agg(how)
     table = found.unstack()
     better = table["knowledge"] < table["vanilla"]
@@ -174,7 +172,7 @@ def _sizes(rows: pd.DataFrame, words: str, how: str) -> tuple[str, str, str]:
         "held" if better.all() else "not held" if not better.any() else f"held at {', '.join(held)} alone"
     )
     number = "; ".join(
-        f"{name}: {row['knowledge']:.3f} and {row['vanilla']:.3f}"
+        f"{name}: {row['knowledge']:.4f} and {row['vanilla']:.4f}"
         for name, (_, row) in zip(names, table.iterrows(), strict=True)
     )
     return words, verdict, f"with and without IDM [m/s²]: {number}"
