@@ -11,7 +11,7 @@ TORCH_INDEX ?=
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet -c constraints.txt
 
-.PHONY: demo test test-all check bless docs bench soak clean
+.PHONY: demo test test-all coverage check bless docs bench soak clean
 
 demo: $(VENV)/.installed
 	$(BIN)/unjam train ring --preset demo
@@ -21,6 +21,11 @@ test: $(VENV)/.installed-dev
 
 test-all: $(VENV)/.installed-dev
 	$(BIN)/python -m pytest -n 2 --hypothesis-profile=thorough
+
+# Which lines no test runs; with TESTS="" also those of the slow ones
+TESTS ?= -m "not slow"
+coverage: $(VENV)/.installed-dev
+	$(BIN)/python -m pytest -n 2 --dist loadfile $(TESTS) --cov --cov-report=term
 
 check: $(VENV)/.installed-dev
 	$(BIN)/ruff check .
