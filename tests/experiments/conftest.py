@@ -65,6 +65,5 @@ def reproduced(
 def run_here(commands: dict[str, Command], workers: int, executor: str, told: Callable[[str], None]) -> None:
     """Run command lines of `unjam` in this process."""
     for name, command in commands.items():
-        assert command.words[1:3] == ["-m", "unjam"]
-        app(command.words[3:], standalone_mode=False)
+        app(command.line()[3:], standalone_mode=False)
         told(name)

@@ -7,10 +7,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from unjam.errors import InputError, UnjamError
-from unjam.experiments.executors import Command, run_all
+from unjam.errors import InputError
 from unjam.experiments.folder import read_config
-from unjam.experiments.reproduce import estimated_seconds, make_plan, reproduce, studies_of, training_command
+from unjam.experiments.reproduce import estimated_seconds, make_plan, reproduce, studies_of
 from unjam.experiments.studies import DRAWN_WITH, STUDIES, plan
 from unjam.experiments.studies.plan import PlannedRun
 from unjam.experiments.studies.pool import Pool
@@ -127,24 +126,3 @@ def test_a_stopped_training_goes_on(reproduced: Made, monkeypatch: pytest.Monkey
     assert read_config(folder / "runs" / run.name).steps == 480
     rows = (folder / "runs" / run.name / "progress.jsonl").read_text().splitlines()
     assert [json.loads(row)["actual_steps"] for row in rows] == [160, 320, 480]
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("little")
-def test_trainings_run_in_processes_of_their_own(tmp_path: Path) -> None:
-    run = PlannedRun("little", "plain", 0)
-    run_all({run.name: training_command(run, Pool(tmp_path))}, 1, "local", lambda line: None)
-    assert (tmp_path / "runs/little/plain/0/report.html").is_file()
-    assert "controller:" in (tmp_path / "logs/little/plain/0.log").read_text()
-
-
-def test_one_failure_does_not_stop_the_others(tmp_path: Path) -> None:
-    commands = {
-        "bad": Command(["false"], tmp_path / "bad.log"),
-        "good": Command(["sh", "-c", "echo done"], tmp_path / "logs" / "good.log"),
-    }
-    told: list[str] = []
-    with pytest.raises(UnjamError, match="1 of 2 failed: bad; what the first of them said"):
-        run_all(commands, 1, "local", told.append)
-    assert "done" in commands["good"].log.read_text()
-    assert sorted(line.split(": ")[1] for line in told) == ["bad failed", "good"]

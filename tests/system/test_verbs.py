@@ -44,7 +44,7 @@ METRICS_OF_THE_DESIGN = [
 ]
 
 VERBS = ["scenarios", "drivers", "drive", "train", "evaluate", "model", "fit-drivers", "report"]
-VERBS += ["reproduce", "export", "verify", "watch", "bench", "doctor"]
+VERBS += ["reproduce", "search", "export", "verify", "watch", "bench", "doctor"]
 
 
 def document(ran: subprocess.CompletedProcess[str]) -> Any:

@@ -20,6 +20,7 @@ from unjam.cli.lists import drivers, scenarios
 from unjam.cli.model import model
 from unjam.cli.report import report
 from unjam.cli.reproduce import reproduce
+from unjam.cli.search import search
 from unjam.cli.train import train
 from unjam.cli.verify import verify
 from unjam.cli.watch import watch
@@ -54,7 +55,7 @@ def _root(
 
 for verb in (
     *(scenarios, drivers, drive, train, evaluate, model, fit_drivers),
-    *(report, reproduce, export, verify, watch, bench, doctor),
+    *(report, search, reproduce, export, verify, watch, bench, doctor),
 ):
     app.command()(verb)
 

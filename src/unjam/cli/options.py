@@ -6,7 +6,8 @@ from typing import Annotated, Any
 
 import typer
 
-from unjam.errors import InputError
+from unjam.errors import InputError, wrong_name
+from unjam.experiments.executors import EXECUTORS, Executor
 from unjam.parameters import parse_assignments
 
 ScenarioArgument = Annotated[
@@ -47,6 +48,7 @@ HumansOption = Annotated[
     Path | None,
     typer.Option("--humans", help="Calibrated drivers, of `unjam fit-drivers`: the people on the road."),
 ]
+ExecutorOption = Annotated[str, typer.Option(help="local, or ray: a cluster that shares the folder.")]
 WarmupOption = Annotated[
     int | None, typer.Option("--warmup", help="All-human simulation steps before the CAVs take over.")
 ]
@@ -101,3 +103,11 @@ def new_folder(out: Path | None, name: str) -> Path:
     while (Path("runs") / f"{words}-{number:03d}").exists():
         number += 1
     return Path("runs") / f"{words}-{number:03d}"
+
+
+def executor_named(name: str) -> Executor:
+    """Return where trainings run; raise `InputError` where there is no such executor."""
+    for executor in EXECUTORS:
+        if executor == name:
+            return executor
+    raise wrong_name("executor", name, EXECUTORS)

@@ -5,8 +5,7 @@ from typing import Annotated
 
 import typer
 
-from unjam.cli.options import DEFAULT_WORKERS, JsonOption
-from unjam.errors import wrong
+from unjam.cli.options import DEFAULT_WORKERS, ExecutorOption, JsonOption, executor_named
 
 
 def reproduce(
@@ -15,7 +14,7 @@ def reproduce(
     ],
     seeds: Annotated[int, typer.Option(min=1, help="Trainings of each variant.")] = 3,
     workers: Annotated[int, typer.Option(min=1, help="Trainings at once.")] = DEFAULT_WORKERS,
-    executor: Annotated[str, typer.Option(help="local, or ray: a cluster that shares the folder.")] = "local",
+    executor: ExecutorOption = "local",
     out: Annotated[Path, typer.Option(help="Folder of all studies; what is there already is used.")] = Path(
         "runs/reproduce"
     ),
@@ -38,8 +37,7 @@ def reproduce(
     """
     from unjam.cli.output import aside, console, print_json
 
-    if executor not in ("local", "ray"):
-        raise wrong("executor", executor, "local, ray")
+    runner = executor_named(executor)
     from unjam.experiments.reproduce import make_plan
     from unjam.experiments.reproduce import reproduce as run
     from unjam.experiments.studies.pool import Pool
@@ -60,7 +58,7 @@ def reproduce(
     )
     if dry_run:
         return
-    folders = run(plan, workers, executor, aside.print)
+    folders = run(plan, workers, runner, aside.print)
     if json:
         print_json({"folders": [str(folder) for folder in folders]})
         return

@@ -1,7 +1,6 @@
 """Making what studies need, each training once, and drawing them. `unjam reproduce`."""
 
 import json
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -9,9 +8,9 @@ from typing import Any
 
 from unjam.controller import make_driver
 from unjam.errors import InputError, wrong_name
-from unjam.experiments.config import load_config, to_toml
+from unjam.experiments.config import load_config
 from unjam.experiments.evaluate import evaluate, held_out_seeds, save_evaluation
-from unjam.experiments.executors import Command, Executor, Told, run_all
+from unjam.experiments.executors import Executor, Told, run_all
 from unjam.experiments.folder import read_config
 from unjam.experiments.manifest import manifest
 from unjam.experiments.studies import DRAWN_WITH, STUDIES
@@ -126,7 +125,7 @@ def reproduce(
     for road in plan.roads:
         told(f"drivers that do not learn: {road}")
         drive_references(road, pool, workers)
-    commands = {run.name: training_command(run, pool) for run in plan.runs}
+    commands = {run.name: pool.command(run) for run in plan.runs}
     run_all(commands, workers, executor, told)
     written = []
     for name in plan.names:
@@ -157,16 +156,3 @@ def drive_references(road: str, pool: Pool, workers: int) -> None:
     with Workers(workers) as processes:
         found = evaluate(scenario, drivers, held_out_seeds(config.evaluation.episodes), processes)
     save_evaluation(pool.drives_of(road), found, {"scenario": config.scenario, "manifest": manifest()})
-
-
-def training_command(run: PlannedRun, pool: Pool) -> Command:
-    """Return the command line that begins a training, or goes on with it."""
-    folder, plan = pool.folder_of(run), pool.folder / "plans" / f"{run.name}.toml"
-    words = [sys.executable, "-m", "unjam", "train"]
-    if (folder / "config.toml").is_file():
-        words += ["--resume", str(folder), "--workers", "1", "--steps", str(run.config.steps)]
-    else:
-        make_folder(plan.parent)
-        write_whole(plan, to_toml(run.config))
-        words += ["--config", str(plan), "--workers", "1", "--out", str(folder)]
-    return Command(words, pool.folder / "logs" / f"{run.name}.log")

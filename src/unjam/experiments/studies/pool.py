@@ -9,9 +9,11 @@ from typing import Any
 
 import numpy as np
 
+from unjam.experiments.executors import Command
 from unjam.experiments.folder import read_config
 from unjam.experiments.judge import TRAINED
 from unjam.experiments.studies.plan import PlannedRun
+from unjam.experiments.trainings import training_command
 from unjam.reports.results import EVALUATION_FILE, Results, read_progress, read_results, read_rows
 
 REFERENCES: dict[str, str] = {
@@ -82,6 +84,12 @@ class Pool:
     def has_drives(self, road: str) -> bool:
         """Return whether the drivers that do not learn have driven a road."""
         return (self.drives_of(road) / EVALUATION_FILE).is_file()
+
+    def command(self, run: PlannedRun) -> Command:
+        """Return the command line that begins a training, or goes on with it."""
+        plan = self.folder / "plans" / f"{run.name}.toml"
+        log = self.folder / "logs" / f"{run.name}.log"
+        return training_command(run.config, self.folder_of(run), plan, log)
 
     def trained(self, runs: Sequence[PlannedRun]) -> list[TrainedRun]:
         """Return finished trainings."""

@@ -1,0 +1,82 @@
+"""`unjam search`: find settings that learn better."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from unjam.cli.options import (
+    DEFAULT_WORKERS,
+    ExecutorOption,
+    JsonOption,
+    OutOption,
+    RewardOption,
+    assignments,
+    executor_named,
+    new_folder,
+)
+
+
+def search(
+    scenario: Annotated[
+        str | None, typer.Argument(help="Name of the scenario; the configuration's if left out.")
+    ] = None,
+    vary: Annotated[
+        list[str] | None,
+        typer.Option(help="What is varied: key=low..high, key=low..high:log, or key=a,b,c."),
+    ] = None,
+    trials: Annotated[int, typer.Option(min=1, help="Trainings in all.")] = 20,
+    preset: Annotated[str, typer.Option(help="Named starting point: demo, paper.")] = "",
+    config: Annotated[Path | None, typer.Option(help="TOML file with any keys of the configuration.")] = None,
+    settings: Annotated[
+        list[str] | None,
+        typer.Option("--set", help="Any key of the configuration, the same in all trials: key=value."),
+    ] = None,
+    steps: Annotated[int | None, typer.Option(min=1, help="Actual simulator steps of each.")] = None,
+    seed: Annotated[int | None, typer.Option(min=0, help="Seed of each training, and of the search.")] = None,
+    agent: Annotated[str | None, typer.Option(help="Learner: trpo, ppo, sac.")] = None,
+    expert: Annotated[str | None, typer.Option(help="Driver that the residual is added to.")] = None,
+    reward: RewardOption = "",
+    workers: Annotated[int, typer.Option(min=1, help="Trainings at once.")] = DEFAULT_WORKERS,
+    executor: ExecutorOption = "local",
+    out: OutOption = None,
+    json: JsonOption = False,
+) -> None:
+    """Search for settings that learn better: many trainings, proposed by Optuna.
+
+    Trials are judged by their validations, never by the held-out seeds. After a stop the same command goes
+    on; the best settings are in best.toml, for `unjam train --config`.
+
+    Examples:
+
+      unjam search ring --steps 60000 --vary trpo.target_kl=0.003..0.1:log --vary policy.hold=0.1..2.0
+
+      unjam search merge --agent ppo --vary expert=acc,bcm,lacc --trials 30 --workers 8 --out runs/search
+
+      unjam search ring --vary policy.exploration_std=0.05..0.5 --executor ray --workers 64 --out /shared/it
+    """
+    from unjam.cli.output import aside, console, print_json
+    from unjam.experiments.config import load_config
+    from unjam.experiments.search import BEST, check_space, space_of
+    from unjam.experiments.search import search as run
+
+    flags = {"scenario": scenario, "steps": steps, "seed": seed, "agent": agent, "expert": expert}
+    changes: dict[str, Any] = {key: value for key, value in flags.items() if value is not None}
+    changes |= ({"reward": reward} if reward else {}) | assignments(settings)
+    base, space = load_config(config, preset, changes), space_of(vary or [])
+    runner = executor_named(executor)
+    base = replace(base, workers=1)
+    check_space(base, space)
+    folder = new_folder(out, f"search-{Path(base.scenario).stem}")
+    found = run(base, space, trials, folder, workers, runner, (lambda line: None) if json else aside.print)
+    best = folder / BEST
+    if json:
+        rows = [{"trial": one.number, "gain": one.gain, "values": one.values} for one in found]
+        print_json({"folder": str(folder), "best": str(best), "trials": rows})
+        return
+    for one in found[:5]:
+        values = ", ".join(f"{key}={value}" for key, value in one.values.items())
+        gain = "failed" if one.gain is None else f"{one.gain:+.1f}"
+        console.print(f"trial {one.number}: {gain} beyond the expert, validation seeds: {values}")
+    console.print(f"train with the best: unjam train --config {best}", soft_wrap=True)
