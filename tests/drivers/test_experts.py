@@ -28,6 +28,8 @@ EXPERTS = [
     "ovm",
     "pacer",
     "pacer:harmonics=[7,-0.8,0.7,-1.3,0.7]",
+    "jam-absorber",
+    "jam-absorber:first_position=-1000,last_position=1000,jam_speed=15",
     "constant:acceleration=0.2",
 ]
 

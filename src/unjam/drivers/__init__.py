@@ -7,6 +7,7 @@ from unjam.drivers.constant import Constant
 from unjam.drivers.driver import Driver, Memory
 from unjam.drivers.follower_stopper import FollowerStopper
 from unjam.drivers.idm import IDM, Human
+from unjam.drivers.jam_absorber import JamAbsorber
 from unjam.drivers.local_state import LocalState
 from unjam.drivers.ovm import OVM
 from unjam.drivers.pacer import Pacer
@@ -25,6 +26,7 @@ __all__ = [
     "Driver",
     "FollowerStopper",
     "Human",
+    "JamAbsorber",
     "LocalState",
     "Memory",
     "PISaturation",

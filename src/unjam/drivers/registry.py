@@ -16,6 +16,7 @@ from unjam.drivers.driver import Driver
 from unjam.drivers.follower_stopper import FollowerStopper
 from unjam.drivers.from_file import FileDriver, is_file_reference
 from unjam.drivers.idm import IDM, Human
+from unjam.drivers.jam_absorber import JamAbsorber
 from unjam.drivers.local_state import ObservationPart
 from unjam.drivers.mixed import Mixed
 from unjam.drivers.network import network_arrays, network_from_arrays
@@ -36,6 +37,7 @@ DRIVERS: dict[str, type[Driver]] = {
     "bcm": BCM,
     "ovm": OVM,
     "pacer": Pacer,
+    "jam-absorber": JamAbsorber,
     "constant": Constant,
 }
 
