@@ -1,15 +1,21 @@
 """The studies beside the comparisons, on a ring so small that training takes a second."""
 
 import json
+import math
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
-from unjam.experiments.studies import figure_5, figure_8, figure_10, theory
+from unjam.experiments.studies import figure_5, figure_8, figure_10, plan, theory
+from unjam.experiments.studies.curves import curves_of
 from unjam.experiments.studies.plan import PlannedRun
 from unjam.experiments.studies.pool import Pool
+from unjam.experiments.studies.table import table_rows
+from unjam.reports.results import read_rows
 
 Made = tuple[Path, list[str]]
 VARIANTS = ("plain", "virtual")
@@ -54,6 +60,32 @@ def test_the_same_traffic_is_shown_of_all(monkeypatch: pytest.MonkeyPatch, repro
     assert learned == ["plain", "with a model"]
     assert len({episode.loop_length for episode in shown}) == 1
     assert len({episode.speeds.shape for episode in shown}) == 1
+
+
+def test_who_learns_from_another_reward_is_judged_by_that_one(
+    monkeypatch: pytest.MonkeyPatch, reproduced: Made
+) -> None:
+    folder, _ = reproduced
+    before = table_rows(Pool(folder), "little", VARIANTS, 2)[-1]
+    assert (before["beyond"]["metric"], math.isnan(before["return"]["mean"])) == ("return", False)
+    variant = plan.VARIANTS["virtual"]
+    other = replace(variant, changes={**variant.changes, "reward": "eq16"})
+    monkeypatch.setitem(plan.VARIANTS, "virtual", other)
+    row = table_rows(Pool(folder), "little", VARIANTS, 2)[-1]
+    assert (row["beyond"]["metric"], math.isnan(row["return"]["mean"])) == ("return_eq16", True)
+    expert = np.mean(
+        [one["return_eq16"] for one in Pool(folder).references("little")[row["beyond"]["expert"]]]
+    )
+    mean = np.mean([one["return_eq16"] for run in range(2) for one in rows_of_run(folder, run)])
+    assert row["beyond_best_expert"]["mean"] == pytest.approx(mean - expert)
+    curves = curves_of(Pool(folder), "little", VARIANTS, 2)
+    assert "return_mean" in curves["plain"]
+    assert "return_mean" not in curves["virtual"]
+    assert "cav_mean_speed" in curves["virtual"]
+
+
+def rows_of_run(folder: Path, seed: int) -> list[dict[str, Any]]:
+    return read_rows(folder / "runs" / "little" / "virtual" / str(seed))["trained"]
 
 
 def test_untrained_policies_are_compared_on_the_same_seeds(little: pytest.MonkeyPatch) -> None:

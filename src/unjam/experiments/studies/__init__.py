@@ -1,6 +1,6 @@
 """The studies of `unjam reproduce`: the paper's tables and figures."""
 
-from unjam.experiments.studies.comparison import FIGURE_9, TABLE_1, TABLE_2
+from unjam.experiments.studies.comparison import FIGURE_9, LONG, ON_EXPERTS, TABLE_1, TABLE_2
 from unjam.experiments.studies.figure_5 import FIGURE_5
 from unjam.experiments.studies.figure_6 import run as run_figure_6
 from unjam.experiments.studies.figure_8 import FIGURE_8
@@ -24,6 +24,8 @@ STUDIES: dict[str, Study] = {
     "figure-9": FIGURE_9,
     "figure-10": FIGURE_10,
     "theory": THEORY,
+    "long": LONG,
+    "on-experts": ON_EXPERTS,
 }
 """every study by name"""
 

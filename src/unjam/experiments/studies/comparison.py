@@ -5,10 +5,10 @@ from functools import partial
 from pathlib import Path
 
 from unjam.experiments.studies.curves import curves_of, draw_curves
-from unjam.experiments.studies.plan import PAPERS_ROADS, planned
+from unjam.experiments.studies.plan import PAPERS_ROADS, PlannedRun, planned
 from unjam.experiments.studies.pool import Pool
 from unjam.experiments.studies.study import Study
-from unjam.experiments.studies.table import best_expert, table_rows, write_table
+from unjam.experiments.studies.table import best_expert, metric_of, table_rows, write_table
 from unjam.files import to_json, write_whole
 
 LEARNERS = ("trpo", "ppo", "sac", "proposed", "without-model", "ours")
@@ -25,13 +25,13 @@ def _write(
     """Write table and curves of some variants on some roads."""
     write_table([row for road in roads for row in table_rows(pool, road, variants, seeds)], folder)
     by_road = {road: curves_of(pool, road, variants, seeds) for road in roads}
-    references = {}
+    references, metric = {}, metric_of(PlannedRun(roads[0], variants[0], 0).config)
     for road in roads:
         found = pool.references(road)
-        best = best_expert(found)
+        best = best_expert(found, metric)
         references[road] = {"all human": found["human"], "best expert": found[best]}
     write_whole(folder / "curves.json", to_json(by_road))
-    draw_curves(by_road, references).savefig(folder / "curves.png")
+    draw_curves(by_road, references, metric).savefig(folder / "curves.png")
 
 
 def comparison(title: str, variants: Sequence[str], roads: Sequence[str]) -> Study:
@@ -46,4 +46,14 @@ def comparison(title: str, variants: Sequence[str], roads: Sequence[str]) -> Stu
 
 TABLE_1 = comparison("TRPO, PPO, SAC and the proposed method on three roads", LEARNERS, PAPERS_ROADS)
 TABLE_2 = comparison("what each part of the method is worth, on the ring", ABLATION, ("ring",))
+LONG = comparison(
+    "the paper's four million steps, and ours trained on, on the ring",
+    ("trpo-long", "proposed-long", "best"),
+    ("ring",),
+)
+ON_EXPERTS = comparison(
+    "ours on the figure eight: on the best expert and on PI, with model and without",
+    ("ours", "ours-with-model", "ours-on-pi"),
+    ("figure-eight",),
+)
 FIGURE_9 = comparison("PPO and SAC within the framework, on the ring", FRAMEWORK, ("ring",))

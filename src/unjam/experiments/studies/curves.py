@@ -10,25 +10,32 @@ from matplotlib.figure import Figure
 
 from unjam.experiments.studies.plan import VARIANTS, PlannedRun
 from unjam.experiments.studies.pool import Pool
+from unjam.experiments.studies.table import metric_of
 from unjam.reports.figures import INK, LINES, STYLE
 from unjam.reports.statistics import estimate
 
 POINTS = 100
 """of a curve"""
 DRAWN = {"return_mean": "return, in training", "cav_mean_speed": "CAV's mean speed, in training [m/s]"}
+RATES = ("cav_mean_speed",)
 NAMES = (*DRAWN, "return_validation")
 
 
 def curves_of(pool: Pool, road: str, variants: Sequence[str], seeds: int) -> dict[str, Any]:
-    """Return the curves of a road: by variant the steps, and what is drawn over them, a list per seed."""
+    """Return the curves of a road: by variant the steps, and what is drawn over them, a list per seed.
+
+    Returns of another reward than that of the first variant are left out.
+    """
     found: dict[str, Any] = {}
+    metric = metric_of(PlannedRun(road, variants[0], 0).config)
     for variant in variants:
+        comparable = metric_of(PlannedRun(road, variant, 0).config) == metric
         runs = pool.trained([PlannedRun(road, variant, seed) for seed in range(seeds)])
         first = max(run.progress[0]["actual_steps"] for run in runs)
         last = min(run.progress[-1]["actual_steps"] for run in runs)
         grid = np.linspace(first, last, POINTS)
         found[variant] = {"steps": grid.round().tolist()}
-        for name in NAMES:
+        for name in NAMES if comparable else RATES:
             found[variant][name] = [_on(grid, run.progress, name) for run in runs]
     return found
 
@@ -40,13 +47,16 @@ def _on(grid: np.ndarray, progress: list[dict[str, Any]], name: str) -> list[flo
 
 
 def draw_curves(
-    by_road: dict[str, dict[str, Any]], references: dict[str, dict[str, list[dict[str, Any]]]]
+    by_road: dict[str, dict[str, Any]],
+    references: dict[str, dict[str, list[dict[str, Any]]]],
+    metric: str = "return",
 ) -> Figure:
     """Draw return and speed in training against actual steps, a row of panels per road.
 
     Args:
         by_road: what `curves_of` returned, by road.
         references: rows of drivers that do not learn, by road and label, drawn as lines.
+        metric: which of their returns.
     """
     with rc_context(STYLE):
         figure = Figure(figsize=(10.5, 2.6 * len(by_road) + 0.5), layout="constrained", dpi=130)
@@ -54,20 +64,22 @@ def draw_curves(
         for (road, curves), line in zip(by_road.items(), panels, strict=True):
             for (name, label), axes in zip(DRAWN.items(), line, strict=True):
                 _draw(axes, curves, name)
-                metric = {"return_mean": "return"}.get(name, name)
+                of_rows = metric if name == "return_mean" else name
                 for (reference, rows), style in zip(references[road].items(), ("--", ":"), strict=False):
-                    value = estimate([row[metric] for row in rows]).mean
+                    value = estimate([row[of_rows] for row in rows]).mean
                     axes.axhline(value, color=INK, lw=1.0, ls=style, label=reference)
                 axes.set_title(f"{road}: {label}", loc="left", fontsize=9, color=INK)
                 axes.margins(x=0.01)
         for axes in panels[-1]:
             axes.set_xlabel("actual simulator steps [thousands]")
-        figure.legend(*panels[0, 0].get_legend_handles_labels(), loc="outside upper left", ncols=6)
+        figure.legend(*panels[0, -1].get_legend_handles_labels(), loc="outside upper left", ncols=6)
         return figure
 
 
 def _draw(axes: Axes, curves: dict[str, Any], name: str) -> None:
     for (variant, curve), colour in zip(curves.items(), LINES[1:], strict=False):
+        if name not in curve:
+            continue
         steps, values = np.array(curve["steps"]) / 1000.0, np.array(curve[name])
         axes.fill_between(steps, values.min(0), values.max(0), color=colour, alpha=0.15, lw=0)
         axes.plot(steps, values.mean(0), color=colour, lw=1.5, label=VARIANTS[variant].label)

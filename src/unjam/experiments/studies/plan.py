@@ -49,6 +49,8 @@ VARIANTS: dict[str, Variant] = {
     "proposed-long": Variant("proposed, 4 M steps", "paper", {}, LONG_BUDGET),
     "ours": Variant("ours", "best", {}),
     "ours-without-model": Variant("ours without model", "best", {"virtual.virtual_ratio": 0.0}),
+    "ours-with-model": Variant("ours with model", "best", {"virtual.virtual_ratio": 5.0}),
+    "ours-on-pi": Variant("ours on PI", "best", {"expert": "pi"}),
     "best": Variant("ours, trained on", "best", {}, None),
 }
 """the paper's methods with the paper's settings, and what we make of them"""

@@ -30,6 +30,8 @@ REFERENCES: dict[str, str] = {
     "OVM": "ovm",
     "pacer": "pacer",
     "varying pacer": "pacer:varying=true",
+    "gentle varying pacer": "pacer:varying=true,time_constant=1",
+    "jam absorber": "jam-absorber",
 }
 """drivers that do not learn, beside those that do: label and how `unjam drive` names them"""
 EXPERTS = tuple(label for label in REFERENCES if label not in ("human", "zero", "constant +0.1"))

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from unjam.experiments.config import RunConfig
 from unjam.experiments.studies.paper import PAPER
 from unjam.experiments.studies.plan import VARIANTS, PlannedRun
 from unjam.experiments.studies.pool import EXPERTS, Pool, TrainedRun
@@ -23,6 +24,7 @@ Rows = list[dict[str, Any]]
 
 HONEST = (
     "return",
+    "return_eq16",
     "mean_speed",
     "mean_speed_steady",
     "speed_limit_ratio_steady",
@@ -33,6 +35,11 @@ HONEST = (
     "collisions",
 )
 """metrics of the deterministic policy on held-out seeds"""
+
+
+def metric_of(config: RunConfig) -> str:
+    """Return which return a training is judged by: that of its reward, which all drivers have."""
+    return "return_eq16" if config.reward == "eq16" else "return"
 
 
 def best_expert(references: dict[str, Rows], metric: str = "return") -> str:
@@ -54,12 +61,16 @@ def table_rows(pool: Pool, road: str, variants: Sequence[str], seeds: int) -> Ro
         rows.append(row)
     for variant in variants:
         runs = pool.trained([PlannedRun(road, variant, seed) for seed in range(seeds)])
-        rows.append(_of_variant(road, variant, runs, references[best]))
+        rows.append(_of_variant(road, variant, runs, references))
     return rows
 
 
-def _of_variant(road: str, variant: str, runs: list[TrainedRun], expert: Rows) -> dict[str, Any]:
-    reported = PAPER.get((road, variant))
+def _of_variant(
+    road: str, variant: str, runs: list[TrainedRun], references: dict[str, Rows]
+) -> dict[str, Any]:
+    reported, metric = PAPER.get((road, variant)), metric_of(runs[0].run.config)
+    best = best_expert(references, metric)
+    expert = references[best]
     row: dict[str, Any] = {
         "road": road,
         "name": VARIANTS[variant].label,
@@ -71,16 +82,18 @@ def _of_variant(road: str, variant: str, runs: list[TrainedRun], expert: Rows) -
         "paper": reported._asdict() if reported else None,
     }
     for name in HONEST:
-        values = [_mean(_finite(run.rows, name)) for run in runs]
+        own = name != "return" or metric == "return"  # returns of another reward are no returns here
+        values = [_mean(_finite(run.rows, name)) if own else float("nan") for run in runs]
         row[name] = entries(estimate(values, interquartile_mean))
     row["paper_convention"] = {
         "reward": _mean_and_std([run.in_training("return_mean") for run in runs]),
         "speed": _mean_and_std([run.in_training("cav_mean_speed") for run in runs]),
         "std": _mean_and_std([run.in_training("speed_std_cav") for run in runs]),
     }
-    gains = [paired_difference(run.rows, expert, "return").mean for run in runs]
+    gains = [paired_difference(run.rows, expert, metric).mean for run in runs]
+    row["beyond"] = {"expert": best, "metric": metric}
     row["beyond_best_expert"] = entries(estimate(gains))
-    improved = probability_of_improvement([run.rows for run in runs], expert, "return")
+    improved = probability_of_improvement([run.rows for run in runs], expert, metric)
     row["probability_of_improvement"] = entries(improved)
     row["seconds"] = _mean([run.seconds for run in runs])
     row["gains"] = gains
