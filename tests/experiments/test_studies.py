@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 import torch
 
-from unjam.experiments.studies import figure_5, figure_8, figure_10, plan, theory
+from unjam.experiments.studies import figure_5, figure_8, figure_10, plan, robustness, theory
 from unjam.experiments.studies.curves import curves_of
 from unjam.experiments.studies.plan import PlannedRun
 from unjam.experiments.studies.pool import Pool
+from unjam.experiments.studies.robustness import Condition
 from unjam.experiments.studies.table import table_rows
 from unjam.reports.results import read_rows
 
@@ -48,6 +49,29 @@ def test_controllers_are_carried_over_to_other_traffic(
     rows = figure_10.carried_over(Pool(folder), 2)
     assert [row["driver"] for row in rows] == ["human", "pi", "plain 0", "plain 1"]
     assert all(row["road"] == "six" and np.isfinite(row["mean_speed"]["mean"]) for row in rows)
+
+
+def test_controllers_and_experts_meet_what_they_have_not_trained_with(
+    monkeypatch: pytest.MonkeyPatch, reproduced: Made
+) -> None:
+    folder, _ = reproduced
+    late = Condition("late", impaired={"delay": 0.3})
+    conditions = (Condition("as in training"), Condition("noise", {"noise": 0.4}), late)
+    monkeypatch.setitem(robustness.CONDITIONS, "little", conditions)
+    monkeypatch.setitem(robustness.CONTROLLERS, "little", PlannedRun("little", "plain", 0))
+    monkeypatch.setitem(robustness.EXPERTS, "little", ("PI",))
+    rows = robustness.under_conditions(Pool(folder), "little", 2, episodes=2)
+    assert [(row["condition"], row["driver"]) for row in rows] == [
+        (condition.name, driver) for condition in conditions for driver in ("people", "PI", "trained")
+    ]
+    speeds = {(row["condition"], row["driver"]): row["mean_speed"]["mean"] for row in rows}
+    driven = read_rows(folder / "runs" / "little" / "plain" / "0")["trained"]
+    assert speeds["as in training", "trained"] == np.mean([row["mean_speed"] for row in driven])
+    assert speeds["noise", "people"] != speeds["as in training", "people"] == speeds["late", "people"]
+    assert speeds["late", "PI"] != speeds["as in training", "PI"]
+    ours, theirs = (speeds["noise", driver] for driver in ("trained", "PI"))
+    gain = {(row["condition"], row["driver"]): row["faster_than_expert"]["mean"] for row in rows}
+    assert gain["noise", "trained"] == pytest.approx(ours - theirs)
 
 
 def test_the_same_traffic_is_shown_of_all(monkeypatch: pytest.MonkeyPatch, reproduced: Made) -> None:

@@ -128,15 +128,18 @@ def drivers(json: JsonOption = False) -> None:
       unjam drivers
     """
     from unjam.cli.output import console, print_json
+    from unjam.controller.naming import SHIPPED, shipped_names
     from unjam.drivers.registry import DRIVERS
 
     if json:
-        print_json(
-            {
-                name: {"about": _first_line(kind), "parameters": parameter_rows(kind, kind())}
-                for name, kind in DRIVERS.items()
-            }
-        )
+        named = {
+            name: {"about": _first_line(kind), "parameters": parameter_rows(kind, kind())}
+            for name, kind in DRIVERS.items()
+        }
+        shipped = {
+            f"{SHIPPED}{name}": {"about": _about_shipped(name), "parameters": []} for name in shipped_names()
+        }
+        print_json(named | shipped)
         return
     for name, kind in DRIVERS.items():
         console.print(f"[bold]{name}[/bold]  {_first_line(kind)}")
@@ -144,7 +147,25 @@ def drivers(json: JsonOption = False) -> None:
         if rows:
             console.print(_parameter_table(rows, "parameter"))
         console.print()
-    console.print("Your own: --driver path.py:name, a function or a class; check it with unjam.check_driver.")
+    for name in shipped_names():
+        console.print(f"[bold]{SHIPPED}{name}[/bold]  {_about_shipped(name)}")
+    console.print(
+        "\nYour own: --driver path.py:name, a function or a class; check it with unjam.check_driver."
+    )
+
+
+def _about_shipped(name: str) -> str:
+    """Return what a shipped controller is, and what it was measured to do, from its manifest."""
+    from unjam.controller.file import read_controller
+    from unjam.controller.naming import shipped_file
+
+    told = read_controller(shipped_file(name)).manifest
+    expert, metrics, road = told["expert"], told["metrics"], told["run"]["scenario"]
+    ours, theirs = (metrics[label]["mean_speed"]["mean"] for label in ("trained", expert))
+    return (
+        f"{expert} + residual, trained on {road}: {ours:.2f} m/s of all vehicles on "
+        f"{metrics['trained']['episodes']} held-out seeds, its expert {theirs:.2f}"
+    )
 
 
 def _first_line(kind: type) -> str:

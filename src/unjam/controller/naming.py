@@ -1,6 +1,7 @@
 """Every way to name a driver: by name, by file, by run, or several at once."""
 
 import re
+from importlib.resources import files
 from pathlib import Path
 
 from unjam.controller.file import SUFFIX, load_controller
@@ -8,6 +9,10 @@ from unjam.drivers.driver import Driver
 from unjam.drivers.from_file import is_file_reference
 from unjam.drivers.mixed import Mixed
 from unjam.drivers.registry import DRIVERS, named_driver
+from unjam.errors import wrong_name
+
+SHIPPED = "unjam:"
+"""what the name of a controller begins with that is part of the package"""
 
 _SEVERAL = re.compile(r"\+(?=[^\W\d]|[./~])")
 """between two drivers of a mixture; not the + of 1e+5"""
@@ -18,7 +23,8 @@ def make_driver(text: str, time_step: float) -> Driver:
 
     Args:
         text: a name (`pi`), with parameters (`pi:time_constant=1,window=30`), your own (`path.py:name`), a
-            run folder, or a `.unjam` file; or several of them joined by `+`, for CAVs side by side.
+            run folder, a `.unjam` file, or a shipped controller (`unjam:ring-best`); or several of them
+            joined by `+`, for CAVs side by side.
         time_step: time between two decisions of the road [s].
 
     Raises:
@@ -28,7 +34,25 @@ def make_driver(text: str, time_step: float) -> Driver:
     parts = [] if path.exists() else _SEVERAL.split(text)
     if len(parts) > 1:
         return Mixed(tuple(make_driver(part, time_step) for part in parts))
+    if text.startswith(SHIPPED):
+        return load_controller(shipped_file(text.removeprefix(SHIPPED)))
     named = text.partition(":")[0] in DRIVERS or is_file_reference(text)
     if not named and (text.endswith(SUFFIX) or path.is_dir()):
         return load_controller(path)
     return named_driver(text, time_step)
+
+
+def shipped_names() -> list[str]:
+    """Return the names of the controllers that are part of the package: `ring-best`."""
+    return sorted(path.stem for path in _shipped_folder().glob(f"*{SUFFIX}"))
+
+
+def shipped_file(name: str) -> Path:
+    """Return the file of a shipped controller; raise `InputError` where there is none of that name."""
+    if name not in shipped_names():
+        raise wrong_name("driver", f"{SHIPPED}{name}", [f"{SHIPPED}{known}" for known in shipped_names()])
+    return _shipped_folder() / f"{name}{SUFFIX}"
+
+
+def _shipped_folder() -> Path:
+    return Path(str(files("unjam") / "controllers"))

@@ -47,7 +47,9 @@ Recipe = dict[str, Any]
 
 def driver_names() -> str:
     """Return what `--driver` allows, for messages."""
-    return ", ".join([*DRIVERS, "path.py:name", "a run folder", "a .unjam file", "several joined by +"])
+    return ", ".join(
+        [*DRIVERS, "path.py:name", "a run folder", "a .unjam file", "unjam:ring-best", "several joined by +"]
+    )
 
 
 def split_parameters(text: str) -> tuple[str, dict[str, Any]]:

@@ -58,7 +58,18 @@ BEST: dict[str, dict[str, Any]] = {
         "virtual": {"virtual_ratio": 0.0},
         "evaluation": {"every": 2, "validation_episodes": 8},
     },
-    "merge": {"expert": "bcm", "steps": 300_000},
+    # Among these the residual does not pay yet; see docs/results.md.
+    "merge": {
+        "expert": "jam-absorber",
+        "steps": 300_000,
+        "policy": {
+            "observe": ["local", "expert_acceleration", "expert_memory", "route_position"],
+            "exploration_std": 0.3,
+        },
+        "trpo": {"batch_steps": 6000, "gamma": 0.995},
+        "virtual": {"virtual_ratio": 0.0},
+        "evaluation": {"every": 6, "validation_episodes": 8},
+    },
 }
 """the preset `best`: what is known to reach furthest, road by road"""
 

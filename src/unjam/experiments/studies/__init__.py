@@ -5,6 +5,7 @@ from unjam.experiments.studies.figure_5 import FIGURE_5
 from unjam.experiments.studies.figure_6 import run as run_figure_6
 from unjam.experiments.studies.figure_8 import FIGURE_8
 from unjam.experiments.studies.figure_10 import FIGURE_10
+from unjam.experiments.studies.robustness import ROBUSTNESS
 from unjam.experiments.studies.study import Study
 from unjam.experiments.studies.theory import THEORY
 
@@ -26,6 +27,7 @@ STUDIES: dict[str, Study] = {
     "theory": THEORY,
     "long": LONG,
     "on-experts": ON_EXPERTS,
+    "robustness": ROBUSTNESS,
 }
 """every study by name"""
 
