@@ -29,26 +29,56 @@ def paper_convention(study: str, road: str) -> pd.DataFrame:
     return pd.DataFrame(table)
 
 
-def honest(study: str, road: str) -> pd.DataFrame:
+COLUMNS = {
+    "return": ("return", 0),
+    "return, Eq. 16": ("return_eq16", 0),
+    "mean speed [m/s]": ("mean_speed", 2),
+    "steady [m/s]": ("mean_speed_steady", 2),
+    "of the limit, steady": ("speed_limit_ratio_steady", 3),
+    "std across vehicles [m/s]": ("speed_std_fleet", 2),
+    "smallest headway [s]": ("min_headway", 2),
+    "leave [veh/h]": ("throughput_veh_per_h", 0),
+    "wait [veh]": ("backlog_veh", 0),
+    "collisions": ("collisions", 2),
+}
+"""what the honest tables show: a metric and its digits"""
+OF_THE_RING = ("return", "mean speed [m/s]", "of the limit, steady", "std across vehicles [m/s]")
+OF_THE_RING += ("smallest headway [s]", "collisions")
+OF_THE_EIGHT = ("return", "return, Eq. 16", "mean speed [m/s]", "steady [m/s]", "std across vehicles [m/s]")
+OF_THE_EIGHT += ("collisions",)
+
+
+def honest(study: str, road: str, columns: tuple[str, ...] = OF_THE_RING) -> pd.DataFrame:
     """Return a table in the honest convention."""
     table = []
     for row in rows_of(study, road):
         beyond, better = row.get("beyond_best_expert"), row.get("probability_of_improvement")
-        table.append(
-            {
-                "": f"{row['name']}{' (best expert)' if row.get('best_expert') else ''}",
-                "trainings": row["trainings"] or "",
-                "return": number(row["return"]["mean"], 0),
-                "mean speed [m/s]": number(row["mean_speed"]["mean"], 2),
-                "of the limit, steady": number(row["speed_limit_ratio_steady"]["mean"], 3),
-                "std across vehicles [m/s]": number(row["speed_std_fleet"]["mean"], 2),
-                "smallest headway [s]": number(row["min_headway"]["mean"], 2),
-                "collisions": number(row["collisions"]["mean"], 2),
-                "beyond": "" if beyond is None else interval(beyond, 0, "+"),
-                "better": "" if better is None else f"{100 * better['mean']:.0f} %",
-            }
-        )
+        cells = {
+            "": f"{row['name']}{' (best expert)' if row.get('best_expert') else ''}",
+            "trainings": row["trainings"] or "",
+        }
+        for name in columns:
+            key, digits = COLUMNS[name]
+            cells[name] = number(row[key]["mean"], digits)
+        cells["beyond"] = "" if beyond is None else interval(beyond, 0, "+")
+        cells["better"] = "" if better is None else f"{100 * better['mean']:.0f} %"
+        table.append(cells)
     return pd.DataFrame(table)
+
+
+def robustness(road: str) -> pd.DataFrame:
+    """Return mean speed of all vehicles by condition and driver, and what the trained one adds to its expert."""
+    rows = json.loads((RESULTS / "robustness" / "robustness.json").read_text())
+    table: dict[str, dict[str, str]] = {}
+    for row in rows:
+        if row["road"] == road:
+            cells = table.setdefault(row["condition"], {"": row["condition"]})
+            cells[f"{row['driver']} [m/s]"] = number(row["mean_speed"]["mean"], 2)
+            if row["driver"] == "trained":
+                cells["beyond its expert [m/s]"] = interval(row["faster_than_expert"], 2, "+")
+                cells["its smallest headway [s]"] = number(row["min_headway"]["mean"], 2)
+                cells["its collisions"] = number(row["collisions"]["mean"], 2)
+    return pd.DataFrame(table.values())
 
 
 def number(value: float | None, digits: int) -> str:

@@ -10,7 +10,7 @@ import pytest
 from unjam.errors import InputError
 from unjam.experiments.folder import read_config
 from unjam.experiments.reproduce import estimated_seconds, make_plan, reproduce, studies_of
-from unjam.experiments.studies import DRAWN_WITH, STUDIES, plan
+from unjam.experiments.studies import STUDIES, TOGETHER, plan
 from unjam.experiments.studies.plan import PlannedRun
 from unjam.experiments.studies.pool import Pool
 from unjam.files import write_whole
@@ -28,10 +28,12 @@ def test_every_study_lists_trainings_that_can_be_configured(name: str) -> None:
         assert config.make_scenario().horizon > 0
 
 
-def test_all_is_every_study_and_figures_name_the_table_that_they_are_drawn_with() -> None:
+def test_all_is_every_study_and_figures_are_drawn_with_their_tables() -> None:
     assert set(studies_of(["all"])) == set(STUDIES)
-    for figure, table in DRAWN_WITH.items():
-        assert set(studies_of([figure])) == {table}
+    assert set(studies_of(["figure-7"])) == {"table-2"}
+    assert set(studies_of(["figure-4"])) == set(studies_of(["table-1"]))
+    assert set(studies_of(["table-1"])) == {f"table-1-{road}" for road in ("ring", "figure-eight", "merge")}
+    assert {study for names in TOGETHER.values() for study in names} == set(STUDIES)
 
 
 def test_an_unknown_study_lists_the_known(tmp_path: Path) -> None:

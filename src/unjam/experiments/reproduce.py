@@ -13,7 +13,7 @@ from unjam.experiments.evaluate import evaluate, held_out_seeds, save_evaluation
 from unjam.experiments.executors import Executor, Told, run_all
 from unjam.experiments.folder import read_config
 from unjam.experiments.manifest import manifest
-from unjam.experiments.studies import DRAWN_WITH, STUDIES
+from unjam.experiments.studies import STUDIES, TOGETHER
 from unjam.experiments.studies.plan import ROADS, PlannedRun
 from unjam.experiments.studies.pool import REFERENCES, Pool
 from unjam.experiments.studies.study import Study
@@ -73,12 +73,11 @@ def make_plan(names: Sequence[str], seeds: int, pool: Pool) -> Plan:
 
 def studies_of(names: Sequence[str]) -> dict[str, Study]:
     """Return the studies of these names; `all` is all of them."""
-    known = {**{name: name for name in STUDIES}, **DRAWN_WITH}
     for name in names:
-        if name not in ("all", *known):
-            raise wrong_name("study", name, [*known, "all"])
-    chosen = [known[name] for name in names if name != "all"]
-    return {name: study for name, study in STUDIES.items() if name in chosen or "all" in names}
+        if name not in (*STUDIES, *TOGETHER):
+            raise wrong_name("study", name, [*STUDIES, *TOGETHER])
+    chosen = {study for name in names for study in TOGETHER.get(name, (name,))}
+    return {name: study for name, study in STUDIES.items() if name in chosen}
 
 
 def estimated_seconds(run: PlannedRun) -> float:

@@ -17,7 +17,7 @@ FIGURE_6 = Study(
 )
 
 STUDIES: dict[str, Study] = {
-    "table-1": TABLE_1,
+    **TABLE_1,
     "figure-5": FIGURE_5,
     "table-2": TABLE_2,
     "figure-6": FIGURE_6,
@@ -31,5 +31,10 @@ STUDIES: dict[str, Study] = {
 }
 """every study by name"""
 
-DRAWN_WITH = {"figure-4": "table-1", "figure-7": "table-2"}
-"""figures that are drawn with a table, from the same trainings"""
+TOGETHER: dict[str, tuple[str, ...]] = {
+    "table-1": tuple(TABLE_1),
+    "figure-4": tuple(TABLE_1),
+    "figure-7": ("table-2",),
+    "all": tuple(STUDIES),
+}
+"""names of the paper for one study or several: figures are drawn with their table, of the same trainings"""

@@ -44,7 +44,12 @@ def comparison(title: str, variants: Sequence[str], roads: Sequence[str]) -> Stu
     )
 
 
-TABLE_1 = comparison("TRPO, PPO, SAC and the proposed method on three roads", LEARNERS, PAPERS_ROADS)
+TABLE_1 = {
+    f"table-1-{road}": comparison(
+        f"TRPO, PPO, SAC, the proposed method and ours on {road}", LEARNERS, (road,)
+    )
+    for road in PAPERS_ROADS
+}
 TABLE_2 = comparison("what each part of the method is worth, on the ring", ABLATION, ("ring",))
 LONG = comparison(
     "the paper's four million steps, and ours trained on, on the ring",
