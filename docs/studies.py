@@ -67,7 +67,7 @@ def honest(study: str, road: str, columns: tuple[str, ...] = OF_THE_RING) -> pd.
 
 
 def robustness(road: str) -> pd.DataFrame:
-    """Return mean speed of all vehicles by condition and driver, and what the trained one adds to its expert."""
+    """Return the mean speed of all vehicles by condition and driver, and what training has added."""
     rows = json.loads((RESULTS / "robustness" / "robustness.json").read_text())
     table: dict[str, dict[str, str]] = {}
     for row in rows:

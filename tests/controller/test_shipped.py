@@ -1,0 +1,43 @@
+"""The controllers that are part of the package."""
+
+import numpy as np
+import pytest
+
+import unjam
+from unjam.controller import make_driver
+from unjam.controller.naming import SHIPPED, shipped_file, shipped_names
+from unjam.controller.verify import verify_controller
+from unjam.drivers import ResidualDriver
+from unjam.errors import InputError
+from unjam.reports.statistics import paired_difference
+
+
+@pytest.mark.parametrize("name", shipped_names())
+def test_each_is_whole_and_says_what_it_was_trained_on(name: str) -> None:
+    verify_controller(shipped_file(name))
+    assert isinstance(make_driver(f"{SHIPPED}{name}", 0.1), ResidualDriver)
+
+
+def test_there_is_one_for_each_closed_road() -> None:
+    assert {"ring-best", "figure-eight-best"} <= set(shipped_names())
+
+
+@pytest.mark.parametrize("name", ["nothing", "", "../ring-best", "ring-best.unjam"])
+def test_another_name_lists_those_that_there_are(name: str) -> None:
+    with pytest.raises(InputError, match="allowed: unjam:figure-eight-best, unjam:ring-best"):
+        make_driver(f"{SHIPPED}{name}", 0.1)
+
+
+def test_the_rings_earns_more_than_its_expert_on_every_seed() -> None:
+    found = unjam.drive("ring", ["pi", "unjam:ring-best"], episodes=2, workers=1)
+    gain = paired_difference(found.rows["unjam:ring-best"], found.rows["pi"], "return")
+    assert gain.low > 100
+
+
+@pytest.mark.slow
+def test_the_figure_eights_is_faster_than_its_expert_over_the_radii() -> None:
+    expert = "pacer:varying=true,time_constant=1"
+    road = {"radius": [32, 35]}
+    found = unjam.drive("figure-eight", [expert, "unjam:figure-eight-best"], episodes=8, road=road, workers=2)
+    speeds = [np.mean([row["mean_speed"] for row in found.rows[name]]) for name in found.rows]
+    assert speeds[1] > speeds[0] + 0.2
