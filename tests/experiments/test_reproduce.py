@@ -98,6 +98,9 @@ def test_the_table_is_made_of_the_rows_of_its_trainings(reproduced: Made) -> Non
         json.loads((folder / "runs/little/plain" / seed / "progress.jsonl").read_text().splitlines()[-1])
         for seed in ("0", "1")
     ]
+    lengths = table["plain"]["steady_by_draw"]["length"]
+    assert list(lengths) == sorted(lengths, key=float)
+    assert min(lengths.values()) <= table["plain"]["mean_speed_steady"]["mean"] <= max(lengths.values())
     convention = table["plain"]["paper_convention"]
     assert convention["speed"]["mean"] == pytest.approx(np.mean([row["cav_mean_speed"] for row in progress]))
     assert math.isclose(convention["reward"]["mean"], np.mean([row["return_mean"] for row in progress]))

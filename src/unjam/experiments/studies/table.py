@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from unjam.experiments.config import RunConfig
+from unjam.experiments.config import RunConfig, load_config
 from unjam.experiments.studies.paper import PAPER
-from unjam.experiments.studies.plan import VARIANTS, PlannedRun
+from unjam.experiments.studies.plan import ROADS, VARIANTS, PlannedRun
 from unjam.experiments.studies.pool import EXPERTS, Pool, TrainedRun
 from unjam.files import to_json, write_whole
 from unjam.reports.statistics import (
@@ -58,6 +58,7 @@ def table_rows(pool: Pool, road: str, variants: Sequence[str], seeds: int) -> Ro
         row |= {"best_expert": label == best}
         row |= {name: entries(estimate(_finite(found, name))) for name in HONEST}
         row["paper_convention"] = _as_in_the_paper(found)
+        row["steady_by_draw"] = _by_draw(road, found)
         rows.append(row)
     for variant in variants:
         runs = pool.trained([PlannedRun(road, variant, seed) for seed in range(seeds)])
@@ -90,6 +91,7 @@ def _of_variant(
         "speed": _mean_and_std([run.in_training("cav_mean_speed") for run in runs]),
         "std": _mean_and_std([run.in_training("speed_std_cav") for run in runs]),
     }
+    row["steady_by_draw"] = _by_draw(road, [one for run in runs for one in run.rows])
     gains = [paired_difference(run.rows, expert, metric).mean for run in runs]
     row["beyond"] = {"expert": best, "metric": metric}
     row["beyond_best_expert"] = entries(estimate(gains))
@@ -98,6 +100,18 @@ def _of_variant(
     row["seconds"] = _mean([run.seconds for run in runs])
     row["gains"] = gains
     return row
+
+
+def _by_draw(road: str, rows: Rows) -> dict[str, dict[str, float]]:
+    """Return the steady mean speed by each number that episodes draw: the length, or the radius."""
+    ranges = load_config(changes=ROADS[road]).make_scenario().drawn_ranges
+    return {
+        name: {
+            f"{value:g}": _mean(_finite([row for row in rows if row[name] == value], "mean_speed_steady"))
+            for value in sorted({row[name] for row in rows})
+        }
+        for name in ranges
+    }
 
 
 def entries(found: Estimate) -> dict[str, float]:
