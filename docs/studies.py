@@ -66,6 +66,18 @@ def honest(study: str, road: str, columns: tuple[str, ...] = OF_THE_RING) -> pd.
     return pd.DataFrame(table)
 
 
+def by_draw(study: str, road: str, names: tuple[str, ...]) -> pd.DataFrame:
+    """Return the steady speed of some drivers by what episodes draw."""
+    table = []
+    for row in rows_of(study, road):
+        if row["name"] in names:
+            (drawn,) = row["steady_by_draw"].values()
+            table.append(
+                {"": row["name"], **{f"{value} m": number(mean, 2) for value, mean in drawn.items()}}
+            )
+    return pd.DataFrame(table)
+
+
 def robustness(road: str) -> pd.DataFrame:
     """Return the mean speed of all vehicles by condition and driver, and what training has added."""
     rows = json.loads((RESULTS / "robustness" / "robustness.json").read_text())

@@ -25,6 +25,7 @@ TARGET = ROOT / "results" / "soak" / "soak.json"
 def soak(names: list[str]) -> None:
     """Inject the faults of these names; the rows of others stay as they were measured before."""
     rows = {row["name"]: row for row in json.loads(TARGET.read_text())["rows"]} if TARGET.exists() else {}
+    about = manifest()  # now: later the results themselves are a change of the tree
     for name in names:
         fault, started = FAULTS[name], time.monotonic()
         with tempfile.TemporaryDirectory() as folder:
@@ -39,7 +40,7 @@ def soak(names: list[str]) -> None:
         }
         print(json.dumps(rows[name]), flush=True)
         ordered = [rows[each] for each in FAULTS if each in rows]
-        write_whole(TARGET, to_json({"manifest": manifest(), "rows": ordered}, indent=1) + "\n")
+        write_whole(TARGET, to_json({"manifest": about, "rows": ordered}, indent=1) + "\n")
 
 
 if __name__ == "__main__":
