@@ -24,10 +24,10 @@ for road in ramp A10KW; do
         -d human -d pi -d acc >/dev/null
 done
 for road in ring ring-warm ring-jammed figure-eight merge; do
-    pacer="-d pacer"
-    [ $road = merge ] && pacer=  # it needs a closed road
+    own="-d pacer"
+    [ $road = merge ] && own="-d jam-absorber"  # a pacer needs a closed road
     unjam drive $road --episodes 10 --out "$runs/all-on-$road" \
-        -d human -d idm -d pi:time_constant=0 -d pi -d follower-stopper -d acc -d lacc -d bcm -d ovm $pacer \
+        -d human -d idm -d pi:time_constant=0 -d pi -d follower-stopper -d acc -d lacc -d bcm -d ovm $own \
         -d constant -d constant:acceleration=0.1 >/dev/null
 done
 python results/experts/pacer_long.py "$runs/pacer"

@@ -51,7 +51,7 @@ def best_expert(references: dict[str, Rows], metric: str = "return") -> str:
 def table_rows(pool: Pool, road: str, variants: Sequence[str], seeds: int) -> Rows:
     """Return a row per driver that does not learn, and per variant, on a road."""
     references = pool.references(road)
-    best = best_expert(references)
+    best = best_expert(references, metric_of(PlannedRun(road, variants[0], 0).config))
     rows: Rows = []
     for label, found in references.items():
         row = {"road": road, "name": label, "learns": False, "trainings": 0, "episodes": len(found)}
