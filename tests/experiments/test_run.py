@@ -155,7 +155,7 @@ def test_the_number_of_workers_changes_nothing(uninterrupted: Path, tmp_path: Pa
     assert outcome(tmp_path / "two") == outcome(uninterrupted)
 
 
-@pytest.mark.parametrize("iterations", [1, 3])
+@pytest.mark.parametrize("iterations", [pytest.param(1, marks=pytest.mark.slow), 3])
 def test_a_run_that_was_stopped_ends_as_if_it_had_not_been(
     uninterrupted: Path, tmp_path: Path, iterations: int, learn: Learn
 ) -> None:
