@@ -1,0 +1,158 @@
+"""The paper's claims beside what the studies found, from files under results/."""
+
+import json
+from typing import Any
+
+import pandas as pd
+from studies import interval, number, rows_of
+from tables import RESULTS
+
+Claim = tuple[str, str, str]
+"""what the paper says, whether it held, by which numbers"""
+UNKNOWN = "not measured yet"
+
+
+def claims() -> pd.DataFrame:
+    """Return all claims but those on car-following data, which `people.py` has."""
+    rows = [best_on(road) for road in ("ring", "figure-eight", "merge")]
+    rows += [
+        initial_policy(),
+        model_alone(),
+        unstable(),
+        ppo_and_sac(),
+        volumes(),
+        training_time(),
+        model_error(),
+        percent_over_ppo(),
+        beyond_the_expert(),
+    ]
+    return pd.DataFrame(rows, columns=["the paper", "here", "number"])
+
+
+def table(study: str, road: str) -> dict[str, dict[str, Any]]:
+    """Return the rows of a study by name; none where it has not been measured."""
+    if not (RESULTS / study / "table.json").is_file():
+        return {}
+    return {row["name"]: row for row in rows_of(study, road)}
+
+
+def of(rows: dict[str, dict[str, Any]], name: str, metric: str = "return") -> float:
+    """Return the mean of a metric."""
+    return rows[name][metric]["mean"]
+
+
+def verdict(held: bool) -> str:
+    """Return it in words."""
+    return "held" if held else "not held"
+
+
+def best_on(road: str) -> Claim:
+    """Is the paper's method better than TRPO, PPO and SAC, with its settings?"""
+    words = f"best of all learners on {road}"
+    study = "table-2" if road == "ring" else f"table-1-{road}"
+    rows = table(f"table-1-{road}", road) or table(study, road)
+    if not rows:
+        return words, UNKNOWN, ""
+    others = [name for name in ("TRPO", "PPO", "SAC") if name in rows]
+    returns = ", ".join(f"{name} {of(rows, name):.0f}" for name in ("proposed", *others))
+    held = all(of(rows, "proposed") > of(rows, name) for name in others)
+    so_far = " so far" if len(others) < 3 else ""
+    return words, f"{verdict(held)}{so_far}", f"return, held-out: {returns}"
+
+
+def initial_policy() -> Claim:
+    """Is the expert worth something at the start?"""
+    rows = table("table-2", "ring")
+    held = of(rows, "proposed") > of(rows, "no initial policy")
+    numbers = f"{of(rows, 'proposed'):.0f} with, {of(rows, 'no initial policy'):.0f} without"
+    return "the initial policy improves the result (ring)", verdict(held), f"return, held-out: {numbers}"
+
+
+def model_alone() -> Claim:
+    """Is MB-TRPO better than TRPO?"""
+    rows = table("table-2", "ring")
+    numbers = f"{of(rows, 'MB-TRPO'):.0f} with, {of(rows, 'TRPO'):.0f} without"
+    words = "a learned model alone improves TRPO (ring)"
+    return words, verdict(of(rows, "MB-TRPO") > of(rows, "TRPO")), f"return, held-out: {numbers}"
+
+
+def unstable() -> Claim:
+    """Do trainings of MB-TRPO differ more than those of TRPO?"""
+    gains = {name: table("table-2", "ring")[name]["gains"] for name in ("MB-TRPO", "TRPO")}
+    ranges = {name: max(found) - min(found) for name, found in gains.items()}
+    numbers = ", ".join(f"{name} {value:.0f}" for name, value in ranges.items())
+    held = ranges["MB-TRPO"] > ranges["TRPO"]
+    return "MB-TRPO is unstable", verdict(held), f"from best to worst training, return: {numbers}"
+
+
+def ppo_and_sac() -> Claim:
+    """Do PPO and SAC gain within the framework?"""
+    words, rows = "the framework improves PPO and SAC as well (ring)", table("figure-9", "ring")
+    if not rows:
+        return words, UNKNOWN, ""
+    pairs = [(name, f"proposed with {name}") for name in ("PPO", "SAC")]
+    numbers = ", ".join(f"{one} {of(rows, one):.0f}, within {of(rows, two):.0f}" for one, two in pairs)
+    return words, verdict(all(of(rows, two) > of(rows, one) for one, two in pairs)), numbers
+
+
+def volumes() -> Claim:
+    """Is the paper's method best with 5, 11 and 22 vehicles?"""
+    words, numbers, held = "best with 5, 11 and 22 vehicles, trained for each", [], []
+    for road, count in (("ring-5", 5), ("ring-11", 11), ("ring", 22)):
+        rows = table("figure-10", road)
+        if not rows:
+            return words, UNKNOWN, ""
+        others = {name: of(rows, name) for name in ("TRPO", "PPO", "SAC")}
+        held.append(of(rows, "proposed") > max(others.values()))
+        numbers.append(f"{count}: {of(rows, 'proposed'):.0f}, best other {max(others.values()):.0f}")
+    return words, verdict(all(held)), "return, held-out: " + "; ".join(numbers)
+
+
+def training_time() -> Claim:
+    """Does the paper's method take 37 % longer than TRPO, and less than PPO and SAC?"""
+    words, path = (
+        "37 % more training time than TRPO, 4.6 % less than PPO and SAC",
+        RESULTS / "figure-8/time.json",
+    )
+    if not path.is_file():
+        return words, UNKNOWN, ""
+    over = json.loads(path.read_text())["over_trpo"]
+    held = abs(over["proposed"] - 1.37) < 0.1 and over["proposed"] < min(over["ppo"], over["sac"])
+    numbers = ", ".join(f"{name} {over[name]:.2f}" for name in ("proposed", "ppo", "sac"))
+    return words, verdict(held), f"times TRPO's, side by side: {numbers}"
+
+
+def model_error() -> Claim:
+    """Does eps_m fall during training?"""
+    words, path = "the model error falls during training", RESULTS / "theory/theory.json"
+    if not path.is_file():
+        return words, UNKNOWN, ""
+    runs = json.loads(path.read_text())["model"]["proposed"]
+    fell = [run[-1]["eps_m"] < run[0]["eps_m"] for run in runs]
+    ends = "; ".join(f"{run[0]['eps_m']:.2f} to {run[-1]['eps_m']:.2f}" for run in runs)
+    return words, verdict(all(fell)), f"eps_m, first to last iteration: {ends}"
+
+
+def percent_over_ppo() -> Claim:
+    """Is it 483 % over PPO?"""
+    rows = table("table-2", "ring")
+    best = max(of(rows, name) for name in rows)
+    words = "483 % more return than PPO, 34 % more than SAC"
+    return (
+        words,
+        "impossible",
+        f"PPO's 1,057 times 5.83 is 6,162; no driver earns more than 2,481, ours {best:.0f}",
+    )
+
+
+def beyond_the_expert() -> Claim:
+    """Is the residual worth anything beyond the expert?"""
+    rows = table("table-2", "ring")
+    found = {name: interval(rows[name]["beyond_best_expert"], 0, "+") for name in ("proposed", "ours")}
+    better = number(100 * rows["proposed"]["probability_of_improvement"]["mean"], 0)
+    numbers = (
+        f"the paper's settings {found['proposed']}, better in {better} % of episodes; ours {found['ours']}"
+    )
+    held = rows["proposed"]["beyond_best_expert"]["low"] > 20
+    words = "the residual improves on its expert (ring; the paper does not show the expert alone)"
+    return words, verdict(held) if held else "hardly", numbers
