@@ -48,7 +48,7 @@ class JamAbsorber(Driver):
     """acceleration for each metre of gap too much [1/s2]"""
     speed_gain: NotNegative = 1.2
     """acceleration for each m/s that the leader is faster [1/s]"""
-    time_gap: NotNegative = 0.5
+    time_gap: NotNegative = 1.4
     """wanted gap over own speed [s]"""
     standstill_gap: NotNegative = 4.0
     """wanted gap of a standing vehicle [m]"""
