@@ -67,6 +67,7 @@ def shipped(driver: Driver, path: Path, states: LocalState) -> Path:
 def test_the_plain_reader_drives_as_unjam_without_it(tmp_path: Path) -> None:
     drivers = [named_driver(name, 0.1) for name in EXPERTS if name != "human"]
     drivers += [
+        Pacer(varying=True, time_constant=1.0),
         residual(PISaturation(), hold=10),
         residual(Pacer(lap_time=40.0), hold=3, outputs=2),
         residual(residual(residual(FollowerStopper(), 1, hold=3), 2), 3, hold=5),
@@ -85,7 +86,7 @@ def test_the_plain_reader_drives_as_unjam_without_it(tmp_path: Path) -> None:
 
 def test_the_plain_reader_compares_itself_with_the_recorded_sample(tmp_path: Path) -> None:
     path = shipped(residual(PISaturation()), tmp_path / "it.unjam", perceived())
-    command = [sys.executable, "-I", str(EXAMPLES / "run_controller.py"), str(path)]
+    command = [sys.executable, "-E", "-s", str(EXAMPLES / "run_controller.py"), str(path)]
     ran = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
     assert ran.stdout.startswith("40 decisions, at most ")
     other = path.read_bytes().replace(b'"hold": 1,', b'"hold": 2,')
@@ -94,7 +95,11 @@ def test_the_plain_reader_compares_itself_with_the_recorded_sample(tmp_path: Pat
 
 
 def test_the_plain_reader_is_short() -> None:
-    assert len((EXAMPLES / "run_controller.py").read_text().splitlines()) < 200
+    lines = [
+        len((EXAMPLES / name).read_text().splitlines()) for name in ("run_controller.py", "plain_experts.py")
+    ]
+    assert max(lines) < 200
+    assert lines[0] < 120
 
 
 def free_port() -> int:
@@ -118,7 +123,7 @@ def test_the_client_drives_a_vehicle_of_a_running_sumo(tmp_path: Path) -> None:
     record = tmp_path / "record.xml"
     sumo = [sumo_program("sumo"), "-c", str(road), "--remote-port", str(port), "--no-step-log"]
     sumo += ["--fcd-output", str(record), "--precision", "9"]
-    for name in ("traci_client.py", "run_controller.py"):
+    for name in ("traci_client.py", "run_controller.py", "plain_experts.py"):
         shutil.copy(EXAMPLES / name, tmp_path)
     with subprocess.Popen(sumo, stdout=subprocess.DEVNULL) as running:
         try:

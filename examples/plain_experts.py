@@ -1,0 +1,132 @@
+"""The experts of unjam in plain Python: the wanted acceleration, for parameters p, state s and memory m.
+
+A controller needs the one that its residual is added to.
+"""
+
+import math
+from collections import deque
+from types import SimpleNamespace
+from typing import Any, NamedTuple
+
+
+class State(NamedTuple):
+    """What a vehicle perceives, SI units; gaps are bumper to bumper, 100 m where nobody is."""
+
+    speed: float
+    leader_speed: float
+    leader_gap: float
+    follower_speed: float
+    follower_gap: float
+    route_position: float = math.nan
+    loop_length: float = math.nan
+
+
+def clip(value: float, low: float, high: float) -> float:
+    return low if value < low else high if value > high else value
+
+
+def mean(p: Any, m: Any, speed: float) -> float:
+    """The mean of what was seen so far, over a sliding window."""
+    if not hasattr(m, "window"):
+        m.window, m.total, m.seen = deque([0.0] * max(1, round(p.window / p.time_step))), 0.0, 0
+    m.total, m.seen = m.total + speed - m.window.popleft(), m.seen + 1
+    m.window.append(speed)
+    return m.total / min(m.seen, len(m.window))
+
+
+def idm(p: Any, s: State, m: Any) -> float:
+    braking = 2.0 * math.sqrt(p.max_acceleration * p.comfortable_deceleration)
+    room = s.speed * p.time_headway + s.speed * (s.speed - s.leader_speed) / braking
+    pressed = ((p.minimum_gap + max(room, 0.0)) / max(s.leader_gap, 0.01)) ** 2
+    return p.max_acceleration * (1.0 - (s.speed / p.desired_speed) ** p.exponent - pressed)
+
+
+def pi(p: Any, s: State, m: Any) -> float:
+    average = mean(p, m, s.speed)
+    command = getattr(m, "command", s.speed if p.first_command == "own-speed" else 0.0)
+    room = (s.leader_gap - p.gap_lower) / (p.gap_upper - p.gap_lower)
+    target = average + p.catch_up_speed * clip(room, 0.0, 1.0)
+    ahead = 2.0 * (s.leader_speed - s.speed)
+    safe = max(ahead, p.safe_gap) if p.safe_gap_rule == "closing" else p.safe_gap
+    alpha = clip((s.leader_gap - safe) / 2.0, 0.0, 1.0)
+    beta = 1.0 - 0.5 * alpha
+    m.command = beta * (alpha * target + (1.0 - alpha) * s.leader_speed) + (1.0 - beta) * command
+    m.features = average / 10.0, m.command / 10.0
+    return (m.command - s.speed) / max(p.time_constant, p.time_step)
+
+
+def follower_stopper(p: Any, s: State, m: Any) -> float:
+    average = mean(p, m, s.leader_speed)
+    desired = average if p.desired_speed is None else p.desired_speed
+    closing, borders = min(s.leader_speed - s.speed, 0.0), zip(p.gaps, p.decelerations, strict=True)
+    stop, follow, free = (gap + closing**2 / (2.0 * braking) for gap, braking in borders)
+    leading = min(s.leader_speed, desired)
+    command = leading * clip((s.leader_gap - stop) / (follow - stop), 0.0, 1.0)
+    command += (desired - leading) * clip((s.leader_gap - follow) / (free - follow), 0.0, 1.0)
+    return (command - s.speed) / max(p.time_constant, p.time_step)
+
+
+def acc(p: Any, s: State, m: Any) -> float:
+    excess = s.leader_gap - p.standstill_gap - p.time_gap * s.speed
+    following = p.gap_gain * excess + p.speed_gain * (s.leader_speed - s.speed)
+    if not hasattr(p, "lag"):
+        return min(following, p.free_gain * (p.set_speed - s.speed))
+    before = getattr(m, "acceleration", 0.0)
+    m.acceleration = before + min(1.0, p.time_step / p.lag) * (following - before)
+    return m.acceleration
+
+
+def bcm(p: Any, s: State, m: Any) -> float:
+    between = (s.leader_speed - s.speed) - (s.speed - s.follower_speed)
+    towards = p.desired_speed_gain * (p.desired_speed - s.speed)
+    return p.gap_gain * (s.leader_gap - s.follower_gap) + p.speed_gain * between + towards
+
+
+def ovm(p: Any, s: State, m: Any) -> float:
+    share = clip((s.leader_gap - p.stop_gap) / (p.go_gap - p.stop_gap), 0.0, 1.0)
+    optimal = p.largest_speed / 2.0 * (1.0 - math.cos(math.pi * share))
+    return p.gap_gain * (optimal - s.speed) + p.speed_gain * (s.leader_speed - s.speed)
+
+
+# What `varying` stands for, by the length of the lap [m]: harmonics, gain, wanted gap.
+TUNED = {
+    422.2: ((6.729, -2.092, 1.602, -0.929, 0.851, -0.096, 0.105), 0.051, 0.483),
+    449.0: ((7.449, -2.059, 1.966, -0.94, 0.791, -0.028, 0.01), 0.047, 0.509),
+    462.5: ((7.973, -1.865, 2.48, -0.422, 0.173, 0.027, 0.063), 0.038, 0.545),
+    475.9: ((8.35, -2.057, 3.128, 0.477, 0.086, -0.086, 0.075), 0.04, 0.552),
+    489.3: ((9.039, -1.791, 3.513, 1.051, 0.015, 0.024, 0.216), 0.044, 0.581),
+}
+
+
+def pacer(p: Any, s: State, m: Any) -> float:
+    loop, free = s.loop_length, s.leader_gap
+    if p.varying:
+        harmonics, gain, wanted = TUNED[min(TUNED, key=lambda lap: abs(loop - lap))]
+        tuned = {"harmonics": harmonics, "gain": gain, "wanted_gap": wanted}
+        p = SimpleNamespace(**{**vars(p), **tuned, "gathering_gap": 0.5, "regathering_gap": 0.45})
+    was = 0.0 if free < p.regathering_gap * loop else getattr(m, "features", (0.0,))[0]
+    m.features = (float(free >= p.gathering_gap * loop or was > 0.0),)
+    (pace, *rest), place = p.harmonics or (loop / p.lap_time,), 2.0 * math.pi * s.route_position / loop
+    for number, (cosine, sine) in enumerate(zip(rest[::2], rest[1::2], strict=True), start=1):
+        pace += cosine * math.cos(number * place) + sine * math.sin(number * place)
+    pace = max(pace + p.gain * (free - p.wanted_gap * loop), 1.0)
+    return ((pace if m.features[0] else p.gathering_speed) - s.speed) / p.time_constant
+
+
+def jam_absorber(p: Any, s: State, m: Any) -> float:
+    place, gap, ahead = s.route_position, s.leader_gap, s.leader_speed
+    jam = p.first_position < place < p.last_position and ahead < p.jam_speed and gap < 60.0
+    waits = jam or getattr(m, "features", (0.0,))[0] > 0.0
+    gone = (gap >= p.room and ahead >= p.going_speed) or gap >= 99.0
+    m.features = (float(waits and not gone and not place > p.last_position + 50.0),)
+    excess = gap - p.standstill_gap - p.time_gap * s.speed
+    follow = p.gap_gain * excess + p.speed_gain * (ahead - s.speed)
+    return min(p.crawling_speed - s.speed, follow) if m.features[0] else follow
+
+
+def constant(p: Any, s: State, m: Any) -> float:
+    return p.acceleration
+
+
+EXPERTS = {"idm": idm, "pi": pi, "follower-stopper": follower_stopper, "acc": acc, "lacc": acc, "bcm": bcm}
+EXPERTS |= {"ovm": ovm, "pacer": pacer, "jam-absorber": jam_absorber, "constant": constant}
