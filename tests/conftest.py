@@ -13,7 +13,7 @@ from unjam.drivers.network import Network
 from unjam.traffic.simulation import Simulation
 
 # No timed tests, and the same each time. `make test-all` takes the thorough one.
-settings.register_profile("unjam", deadline=None, derandomize=True, max_examples=30)
+settings.register_profile("unjam", deadline=None, derandomize=True, max_examples=20)
 settings.register_profile("thorough", deadline=None, derandomize=True, max_examples=200)
 settings.load_profile("unjam")
 

@@ -39,6 +39,7 @@ def test_the_driver_that_is_timed_keeps_the_contract(hold: int) -> None:
     assert [weight.shape for weight, _ in driver.network.layers] == [(5, 64), (64, 64), (64, 1)]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("short")
 def test_measures_rates_and_their_ratios_and_gives_back_the_cores_that_it_did_not_use() -> None:
     told: list[str] = []

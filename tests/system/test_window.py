@@ -54,6 +54,7 @@ def test_what_the_window_shows_is_the_episode_of_that_seed(
 
 
 @needs_display
+@pytest.mark.slow
 def test_the_window_runs_no_faster_than_asked(display: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("DISPLAY", display)
     started = time.monotonic()

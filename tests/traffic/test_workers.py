@@ -178,7 +178,9 @@ def test_progress_is_told_for_each_task() -> None:
     assert any(task == 0 and 0 < steps < 15_000 for task, steps in told)
 
 
-@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGSEGV, signal.SIGSTOP])
+@pytest.mark.parametrize(
+    "how", [signal.SIGKILL, pytest.param(signal.SIGSEGV, marks=pytest.mark.slow), signal.SIGSTOP]
+)
 def test_an_episode_whose_worker_is_lost_is_repeated_to_the_same_bytes(
     how: signal.Signals, undisturbed: list[Any]
 ) -> None:
@@ -199,6 +201,7 @@ def test_an_episode_whose_worker_is_lost_is_repeated_to_the_same_bytes(
     assert fingerprint(found) == undisturbed[0]
 
 
+@pytest.mark.slow
 def test_losing_worker_after_worker_changes_nothing(undisturbed: list[Any]) -> None:
     killed: list[int] = []
     one_at_a_time = threading.Lock()
@@ -288,6 +291,7 @@ def test_a_driver_that_hangs_is_ended(drivers: Path) -> None:
     assert "no sign of life for 2 s" in failed.reason
 
 
+@pytest.mark.slow
 def test_a_driver_that_thinks_long_does_not_count_as_hung(drivers: Path) -> None:
     slow = EpisodeTask(replace(SHORT, horizon=110), FileDriver(drivers, "thinks_long"), (0,))
     with Workers(1, silence=2.0, attempts=1) as workers:

@@ -64,11 +64,11 @@ BEST: dict[str, dict[str, Any]] = {
         "steps": 300_000,
         "policy": {
             "observe": ["local", "expert_acceleration", "expert_memory", "route_position"],
-            "exploration_std": 0.3,
+            "exploration_std": 0.2,
         },
         "trpo": {"batch_steps": 6000, "gamma": 0.995},
         "virtual": {"virtual_ratio": 0.0},
-        "evaluation": {"every": 6, "validation_episodes": 8},
+        "evaluation": {"every": 6, "validation_episodes": 16},
     },
 }
 """the preset `best`: what is known to reach furthest, road by road"""
