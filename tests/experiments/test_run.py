@@ -212,6 +212,7 @@ def test_a_run_that_goes_on_with_a_larger_budget_ends_as_one_in_one_go(
     assert outcome(folder) == outcome(uninterrupted)
 
 
+@pytest.mark.slow
 def test_validating_at_the_end_of_a_smaller_budget_does_not_change_what_is_learned(
     tmp_path: Path, learn: Learn
 ) -> None:

@@ -11,7 +11,8 @@ import pytest
 from unjam.errors import InputError, MissingPartError, UnjamError
 from unjam.experiments.config import load_config
 from unjam.experiments.executors import Command, Processes
-from unjam.experiments.search import Choice, Range, check_space, gain_of, search, space_of, trial_config
+from unjam.experiments.search import gain_of, search
+from unjam.experiments.search_space import Choice, Range, check_space, space_of, trial_config
 from unjam.files import to_json
 
 from .test_run import small_config

@@ -22,6 +22,7 @@ Made = tuple[Path, list[str]]
 VARIANTS = ("plain", "virtual")
 
 
+@pytest.mark.slow
 def test_training_time_is_measured_in_turns_for_all_variants(
     monkeypatch: pytest.MonkeyPatch, little: pytest.MonkeyPatch
 ) -> None:

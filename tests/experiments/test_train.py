@@ -164,6 +164,7 @@ def same_rows(ours: list[dict[str, Any]], theirs: list[dict[str, Any]]) -> bool:
     )
 
 
+@pytest.mark.slow
 def test_a_network_learns_without_an_expert(tmp_path: Path) -> None:
     config = small_config(expert="none", evaluation__baselines=(), evaluation__every=0)
     result = train(config, tmp_path / "run")

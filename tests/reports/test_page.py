@@ -2,6 +2,7 @@ import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import pytest
 from playwright.sync_api import Browser, ConsoleMessage, Page, Request, Route, sync_playwright
@@ -17,6 +18,10 @@ LAPTOP = (1280, 800)
 PHONE = (390, 844)
 SECONDS = 15.0
 """length of the shown episodes"""
+
+
+def slowly(size: tuple[int, int]) -> Any:
+    return pytest.param(size, marks=pytest.mark.slow)
 
 
 @pytest.fixture(scope="module")
@@ -130,7 +135,7 @@ class Opener:
 
 
 @pytest.mark.parametrize("size", [LAPTOP, PHONE], ids=["laptop", "phone"])
-@pytest.mark.parametrize(("report", "pictures"), [("driven", 2), ("merged", 2), ("trained", 7)])
+@pytest.mark.parametrize(("report", "pictures"), [("merged", 2), ("trained", 7)])
 def test_every_picture_is_there(
     open_page: Opener, request: pytest.FixtureRequest, report: str, pictures: int, size: tuple[int, int]
 ) -> None:
@@ -140,7 +145,9 @@ def test_every_picture_is_there(
     assert all(width > 200 for width in widths)
 
 
-@pytest.mark.parametrize("size", [LAPTOP, PHONE, (320, 640), (820, 1180)], ids=lambda size: str(size[0]))
+@pytest.mark.parametrize(
+    "size", [PHONE, *map(slowly, (LAPTOP, (320, 640), (820, 1180)))], ids=lambda size: str(size[0])
+)
 @pytest.mark.parametrize("report", ["driven", "merged", "trained"])
 def test_nothing_is_wider_than_the_screen(
     open_page: Opener, request: pytest.FixtureRequest, report: str, size: tuple[int, int]

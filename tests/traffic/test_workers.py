@@ -254,6 +254,7 @@ def test_a_driver_that_always_kills_its_process_fails_alone_after_three_attempts
     assert [fingerprint(episode) for episode in (first, second, *rest)] == expected
 
 
+@pytest.mark.slow
 def test_as_many_workers_are_lost_as_attempts_are_allowed(
     drivers: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

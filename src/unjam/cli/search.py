@@ -58,8 +58,9 @@ def search(
     """
     from unjam.cli.output import aside, console, print_json
     from unjam.experiments.config import load_config
-    from unjam.experiments.search import BEST, check_space, space_of
+    from unjam.experiments.search import BEST
     from unjam.experiments.search import search as run
+    from unjam.experiments.search_space import check_space, space_of
 
     flags = {"scenario": scenario, "steps": steps, "seed": seed, "agent": agent, "expert": expert}
     changes: dict[str, Any] = {key: value for key, value in flags.items() if value is not None}
