@@ -2,7 +2,7 @@ from itertools import pairwise
 
 import numpy as np
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.integrate import quad
 from scipy.stats import norm
@@ -17,7 +17,6 @@ def of(mean: float, std: float) -> Gaussians:
     return Gaussians(torch.tensor([mean]), torch.tensor([std]))
 
 
-@settings(max_examples=10)
 @given(means, stds, means, stds)
 def test_is_half_the_integral_of_the_difference_of_the_densities(
     m: float, s: float, n: float, t: float

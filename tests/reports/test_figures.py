@@ -79,7 +79,7 @@ def drivers(count: int) -> list[Shown]:
     return [shown_of(f"driver {number}", 2.0 + number) for number in range(count)]
 
 
-@pytest.mark.parametrize("count", [1, 4, 6])
+@pytest.mark.parametrize("count", [1, 4, 6, *(pytest.param(n, marks=pytest.mark.slow) for n in (2, 3, 5))])
 @pytest.mark.parametrize("wide", [True, False])
 def test_space_time_has_a_panel_for_each_driver(count: int, wide: bool) -> None:
     panels = panels_of(space_time(drivers(count), wide))
@@ -307,7 +307,7 @@ def segments_of(axes: Axes) -> np.ndarray:
     return np.concatenate([np.array(lines.get_segments()).reshape(-1, 2, 2) for lines in coloured])
 
 
-@pytest.mark.parametrize("count", [1, 4])
+@pytest.mark.parametrize("count", [1, 4, pytest.param(2, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("wide", [True, False])
 def test_space_time_of_the_merge_has_panels_of_highway_and_ramp(count: int, wide: bool) -> None:
     shown = [shown_from(merge_episode(), f"driver {number}") for number in range(count)]

@@ -69,7 +69,9 @@ def test_a_film_can_be_an_mp4(tmp_path: Path) -> None:
     assert near(frames[0], CAV_COLOUR) > 50
 
 
-@pytest.mark.parametrize("pace", [1.0, 10.0])
+@pytest.mark.parametrize(
+    "pace", [1.0, 10.0, *(pytest.param(pace, marks=pytest.mark.slow) for pace in (3.0, 5.0))]
+)
 def test_a_film_runs_as_many_times_as_fast_as_life_as_asked(tmp_path: Path, pace: float) -> None:
     path = tmp_path / "wave.gif"
     write_video(driven(seconds=pace * 0.8), path, "pi", pace)

@@ -48,6 +48,22 @@ HumansOption = Annotated[
     Path | None,
     typer.Option("--humans", help="Calibrated drivers, of `unjam fit-drivers`: the people on the road."),
 ]
+OwnScenarioArgument = Annotated[
+    str | None, typer.Argument(help="Name of the scenario; the configuration's if left out.")
+]
+PresetOption = Annotated[str, typer.Option(help="Named starting point: demo, best, paper.")]
+ConfigOption = Annotated[Path | None, typer.Option(help="TOML file with any keys of the configuration.")]
+SettingsOption = Annotated[
+    list[str] | None,
+    typer.Option("--set", help="Any key of the configuration: key=value, trpo.gamma=0.995."),
+]
+StepsOption = Annotated[int | None, typer.Option(min=1, help="Actual simulator steps to train for.")]
+RunSeedOption = Annotated[int | None, typer.Option(min=0, help="Seed of the whole run.")]
+AgentOption = Annotated[str | None, typer.Option(help="Learner: trpo, ppo, sac.")]
+ExpertOption = Annotated[
+    str | None,
+    typer.Option(help="Driver that the residual is added to, as in drive --driver; none: no expert."),
+]
 ExecutorOption = Annotated[str, typer.Option(help="local, or ray: a cluster that shares the folder.")]
 WarmupOption = Annotated[
     int | None, typer.Option("--warmup", help="All-human simulation steps before the CAVs take over.")
@@ -93,6 +109,20 @@ def parse_range(name: str, text: str | None) -> tuple[int, int] | None:
 def assignments(texts: list[str] | None) -> dict[str, Any]:
     """Return what `--set key=value` options say."""
     return parse_assignments(texts or [], "--set")
+
+
+def run_changes(
+    scenario: str | None,
+    steps: int | None,
+    seed: int | None,
+    agent: str | None,
+    expert: str | None,
+    reward: str,
+) -> dict[str, Any]:
+    """Return what the flags of a training say, where they were given, as changes to its configuration."""
+    flags = {"scenario": scenario, "steps": steps, "seed": seed, "agent": agent, "expert": expert}
+    given = {key: value for key, value in flags.items() if value is not None}
+    return {**given, "reward": reward} if reward else given
 
 
 def new_folder(out: Path | None, name: str) -> Path:

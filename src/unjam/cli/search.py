@@ -2,41 +2,45 @@
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
 from unjam.cli.options import (
     DEFAULT_WORKERS,
+    AgentOption,
+    ConfigOption,
     ExecutorOption,
+    ExpertOption,
     JsonOption,
     OutOption,
+    OwnScenarioArgument,
+    PresetOption,
     RewardOption,
+    RunSeedOption,
+    SettingsOption,
+    StepsOption,
     assignments,
     executor_named,
     new_folder,
+    run_changes,
 )
 
 
 def search(
-    scenario: Annotated[
-        str | None, typer.Argument(help="Name of the scenario; the configuration's if left out.")
-    ] = None,
+    scenario: OwnScenarioArgument = None,
     vary: Annotated[
         list[str] | None,
         typer.Option(help="What is varied: key=low..high, key=low..high:log, or key=a,b,c."),
     ] = None,
     trials: Annotated[int, typer.Option(min=1, help="Trainings in all.")] = 20,
-    preset: Annotated[str, typer.Option(help="Named starting point: demo, paper.")] = "",
-    config: Annotated[Path | None, typer.Option(help="TOML file with any keys of the configuration.")] = None,
-    settings: Annotated[
-        list[str] | None,
-        typer.Option("--set", help="Any key of the configuration, the same in all trials: key=value."),
-    ] = None,
-    steps: Annotated[int | None, typer.Option(min=1, help="Actual simulator steps of each.")] = None,
-    seed: Annotated[int | None, typer.Option(min=0, help="Seed of each training, and of the search.")] = None,
-    agent: Annotated[str | None, typer.Option(help="Learner: trpo, ppo, sac.")] = None,
-    expert: Annotated[str | None, typer.Option(help="Driver that the residual is added to.")] = None,
+    preset: PresetOption = "",
+    config: ConfigOption = None,
+    settings: SettingsOption = None,
+    steps: StepsOption = None,
+    seed: RunSeedOption = None,
+    agent: AgentOption = None,
+    expert: ExpertOption = None,
     reward: RewardOption = "",
     workers: Annotated[int, typer.Option(min=1, help="Trainings at once.")] = DEFAULT_WORKERS,
     executor: ExecutorOption = "local",
@@ -62,9 +66,8 @@ def search(
     from unjam.experiments.search import search as run
     from unjam.experiments.search_space import check_space, space_of
 
-    flags = {"scenario": scenario, "steps": steps, "seed": seed, "agent": agent, "expert": expert}
-    changes: dict[str, Any] = {key: value for key, value in flags.items() if value is not None}
-    changes |= ({"reward": reward} if reward else {}) | assignments(settings)
+    changes = run_changes(scenario, steps, seed, agent, expert, reward)
+    changes |= assignments(settings)
     base, space = load_config(config, preset, changes), space_of(vary or [])
     runner = executor_named(executor)
     base = replace(base, workers=1)

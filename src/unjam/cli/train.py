@@ -9,21 +9,30 @@ import typer
 
 from unjam.cli.options import (
     DEFAULT_WORKERS,
+    AgentOption,
     CavShareOption,
     CavsOption,
     CavTypesOption,
+    ConfigOption,
+    ExpertOption,
     HumansOption,
     JsonOption,
     LengthOption,
     OutOption,
+    OwnScenarioArgument,
+    PresetOption,
     RadiusOption,
     RewardOption,
+    RunSeedOption,
+    SettingsOption,
+    StepsOption,
     VehiclesOption,
     WarmupOption,
     WorkersOption,
     assignments,
     new_folder,
     road_changes,
+    run_changes,
 )
 from unjam.errors import InputError
 
@@ -32,22 +41,14 @@ LINE_EVERY = 5
 
 
 def train(
-    scenario: Annotated[
-        str | None, typer.Argument(help="Name of the scenario; the configuration's if left out.")
-    ] = None,
-    preset: Annotated[str, typer.Option(help="Named starting point: demo, paper.")] = "",
-    config: Annotated[Path | None, typer.Option(help="TOML file with any keys of the configuration.")] = None,
-    settings: Annotated[
-        list[str] | None,
-        typer.Option("--set", help="Any key of the configuration: key=value, trpo.gamma=0.995."),
-    ] = None,
-    steps: Annotated[int | None, typer.Option(min=1, help="Actual simulator steps to train for.")] = None,
-    seed: Annotated[int | None, typer.Option(min=0, help="Seed of the whole run.")] = None,
-    agent: Annotated[str | None, typer.Option(help="Learner: trpo, ppo, sac.")] = None,
-    expert: Annotated[
-        str | None,
-        typer.Option(help="Driver that the residual is added to, as in drive --driver; none: no expert."),
-    ] = None,
+    scenario: OwnScenarioArgument = None,
+    preset: PresetOption = "",
+    config: ConfigOption = None,
+    settings: SettingsOption = None,
+    steps: StepsOption = None,
+    seed: RunSeedOption = None,
+    agent: AgentOption = None,
+    expert: ExpertOption = None,
     reward: RewardOption = "",
     length: LengthOption = None,
     radius: RadiusOption = None,
@@ -86,9 +87,7 @@ def train(
     from unjam.experiments.config import load_config
     from unjam.experiments.folder import check_possible, read_config
 
-    flags = {"scenario": scenario, "steps": steps, "seed": seed, "agent": agent, "expert": expert}
-    changes: dict[str, Any] = {key: value for key, value in flags.items() if value is not None}
-    changes |= {"reward": reward} if reward else {}
+    changes = run_changes(scenario, steps, seed, agent, expert, reward)
     changes |= {
         f"road.{key}": value
         for key, value in road_changes(

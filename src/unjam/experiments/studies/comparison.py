@@ -5,7 +5,7 @@ from functools import partial
 from pathlib import Path
 
 from unjam.experiments.studies.curves import curves_of, draw_curves
-from unjam.experiments.studies.plan import PAPERS_ROADS, PlannedRun, planned
+from unjam.experiments.studies.plan import PAPERS_ROADS, planned
 from unjam.experiments.studies.pool import Pool
 from unjam.experiments.studies.study import Study
 from unjam.experiments.studies.table import best_expert, metric_of, table_rows, write_table
@@ -25,7 +25,7 @@ def _write(
     """Write table and curves of some variants on some roads."""
     write_table([row for road in roads for row in table_rows(pool, road, variants, seeds)], folder)
     by_road = {road: curves_of(pool, road, variants, seeds) for road in roads}
-    references, metric = {}, metric_of(PlannedRun(roads[0], variants[0], 0).config)
+    references, metric = {}, metric_of(roads[0], variants[0])
     for road in roads:
         found = pool.references(road)
         best = best_expert(found, metric)

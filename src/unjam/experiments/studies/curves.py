@@ -27,9 +27,9 @@ def curves_of(pool: Pool, road: str, variants: Sequence[str], seeds: int) -> dic
     Returns of another reward than that of the first variant are left out.
     """
     found: dict[str, Any] = {}
-    metric = metric_of(PlannedRun(road, variants[0], 0).config)
+    metric = metric_of(road, variants[0])
     for variant in variants:
-        comparable = metric_of(PlannedRun(road, variant, 0).config) == metric
+        comparable = metric_of(road, variant) == metric
         runs = pool.trained([PlannedRun(road, variant, seed) for seed in range(seeds)])
         first = max(run.progress[0]["actual_steps"] for run in runs)
         last = min(run.progress[-1]["actual_steps"] for run in runs)

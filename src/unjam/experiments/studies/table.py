@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from unjam.experiments.config import RunConfig, load_config
+from unjam.experiments.config import load_config
 from unjam.experiments.studies.paper import PAPER
 from unjam.experiments.studies.plan import ROADS, VARIANTS, PlannedRun
 from unjam.experiments.studies.pool import EXPERTS, Pool, TrainedRun
@@ -37,9 +37,9 @@ HONEST = (
 """metrics of the deterministic policy on held-out seeds"""
 
 
-def metric_of(config: RunConfig) -> str:
-    """Return which return a training is judged by: that of its reward, which all drivers have."""
-    return "return_eq16" if config.reward == "eq16" else "return"
+def metric_of(road: str, variant: str) -> str:
+    """Return which return trainings are judged by: that of their reward, which all drivers have."""
+    return "return_eq16" if PlannedRun(road, variant, 0).config.reward == "eq16" else "return"
 
 
 def best_expert(references: dict[str, Rows], metric: str = "return") -> str:
@@ -51,7 +51,7 @@ def best_expert(references: dict[str, Rows], metric: str = "return") -> str:
 def table_rows(pool: Pool, road: str, variants: Sequence[str], seeds: int) -> Rows:
     """Return a row per driver that does not learn, and per variant, on a road."""
     references = pool.references(road)
-    best = best_expert(references, metric_of(PlannedRun(road, variants[0], 0).config))
+    best = best_expert(references, metric_of(road, variants[0]))
     rows: Rows = []
     for label, found in references.items():
         row = {"road": road, "name": label, "learns": False, "trainings": 0, "episodes": len(found)}
@@ -69,7 +69,7 @@ def table_rows(pool: Pool, road: str, variants: Sequence[str], seeds: int) -> Ro
 def _of_variant(
     road: str, variant: str, runs: list[TrainedRun], references: dict[str, Rows]
 ) -> dict[str, Any]:
-    reported, metric = PAPER.get((road, variant)), metric_of(runs[0].run.config)
+    reported, metric = PAPER.get((road, variant)), metric_of(road, variant)
     best = best_expert(references, metric)
     expert = references[best]
     row: dict[str, Any] = {
