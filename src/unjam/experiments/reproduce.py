@@ -18,6 +18,7 @@ from unjam.experiments.studies.plan import ROADS, PlannedRun
 from unjam.experiments.studies.pool import REFERENCES, Pool
 from unjam.experiments.studies.study import Study
 from unjam.files import make_folder, to_json, write_whole
+from unjam.scenarios.registry import SCENARIOS
 from unjam.traffic.episode import can_drive
 from unjam.traffic.workers import Workers
 
@@ -88,7 +89,7 @@ def estimated_seconds(run: PlannedRun) -> float:
 
 
 def _kind(road: str) -> str:
-    return ROADS[road]["scenario"]
+    return SCENARIOS[ROADS[road]["scenario"]].title
 
 
 def _check_settings(run: PlannedRun, pool: Pool) -> None:

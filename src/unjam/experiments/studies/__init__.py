@@ -1,6 +1,6 @@
 """The studies of `unjam reproduce`: the paper's tables and figures."""
 
-from unjam.experiments.studies.comparison import FIGURE_9, LONG, ON_EXPERTS, TABLE_1, TABLE_2
+from unjam.experiments.studies.comparison import FIGURE_9, JAMMED, LONG, ON_EXPERTS, TABLE_1, TABLE_2
 from unjam.experiments.studies.figure_5 import FIGURE_5
 from unjam.experiments.studies.figure_6 import run as run_figure_6
 from unjam.experiments.studies.figure_8 import FIGURE_8
@@ -27,6 +27,7 @@ STUDIES: dict[str, Study] = {
     "theory": THEORY,
     "long": LONG,
     "on-experts": ON_EXPERTS,
+    "jammed": JAMMED,
     "robustness": ROBUSTNESS,
 }
 """every study by name"""

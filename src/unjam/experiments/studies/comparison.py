@@ -61,4 +61,9 @@ ON_EXPERTS = comparison(
     ("ours", "ours-with-model", "ours-on-pi"),
     ("figure-eight",),
 )
+JAMMED = comparison(
+    "ours on a ring whose wave has grown before the CAV takes over",
+    ("ours", "ours-without-model"),
+    ("ring-jammed",),
+)
 FIGURE_9 = comparison("PPO and SAC within the framework, on the ring", FRAMEWORK, ("ring",))

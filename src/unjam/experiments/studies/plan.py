@@ -15,6 +15,7 @@ LONG_BUDGET = 4_000_000
 
 ROADS: dict[str, dict[str, Any]] = {
     "ring": {"scenario": "ring"},
+    "ring-jammed": {"scenario": "ring-jammed"},
     "ring-11": {"scenario": "ring", "road.vehicles": 11},
     "ring-5": {"scenario": "ring", "road.vehicles": 5},
     "figure-eight": {"scenario": "figure-eight"},

@@ -29,6 +29,7 @@ HONEST = (
     "mean_speed_steady",
     "speed_limit_ratio_steady",
     "speed_std_fleet",
+    "time_to_dissolve",
     "throughput_veh_per_h",
     "backlog_veh",
     "min_headway",
