@@ -16,8 +16,11 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet -c const
 demo: $(VENV)/.installed
 	$(BIN)/unjam train ring --preset demo
 
+# The tests of a file share what they have made
+SPREAD := -n 2 --dist loadfile --no-loadscope-reorder
+
 test: $(VENV)/.installed-dev
-	$(BIN)/python -m pytest -n 2 --dist loadfile -m "not slow"
+	$(BIN)/python -m pytest $(SPREAD) -m "not slow"
 
 test-all: $(VENV)/.installed-dev
 	$(BIN)/python -m pytest -n 2 --hypothesis-profile=thorough
@@ -25,7 +28,7 @@ test-all: $(VENV)/.installed-dev
 # Which lines no test runs; with TESTS="" also those of the slow ones
 TESTS ?= -m "not slow"
 coverage: $(VENV)/.installed-dev
-	$(BIN)/python -m pytest -n 2 --dist loadfile $(TESTS) --cov --cov-report=term
+	$(BIN)/python -m pytest $(SPREAD) $(TESTS) --cov --cov-report=term
 
 check: $(VENV)/.installed-dev
 	$(BIN)/ruff check .

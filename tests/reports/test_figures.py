@@ -103,7 +103,7 @@ def test_space_time_colours_all_panels_on_one_scale() -> None:
         for lines in lines_of(axes)
         if lines.get_array() is not None
     ]
-    assert len(coloured) == 3 * 5
+    assert sum(len(lines.get_segments()) for lines in coloured) > 3 * 5 * 250
     fastest = np.ceil(max(episode.speeds.max() for episode in shown))
     assert {(lines.norm.vmin, lines.norm.vmax) for lines in coloured} == {(0.0, fastest)}
 
@@ -135,23 +135,22 @@ def test_space_time_draws_no_line_across_the_seam_of_the_ring(steps: int) -> Non
         assert np.abs(np.diff(segments[:, :, 1], axis=1)).max() < LENGTH / 2
         assert segments[:, :, 1].min() >= 0
         assert segments[:, :, 1].max() <= LENGTH
-        assert len(segments) < min(steps, len(shown_of(steps=steps).times)), "the ring was gone around"
+    assert len(segments_of(panel)) < 5 * steps, "the ring was gone around"
 
 
 def test_space_time_marks_the_cav_and_nobody_else() -> None:
     shown = shown_of(vehicles=6)
     [panel] = panels_of(space_time([shown]))
-    marked = [lines for lines in lines_of(panel) if lines.get_array() is None]
-    assert len(lines_of(panel)) == 6 + 1
-    assert [to_hex(np.asarray(lines.get_color())[0]) for lines in marked] == [CAV_COLOUR]
-    first = np.array(marked[0].get_segments())[0, 0]
-    assert first[1] == pytest.approx(shown.positions[0, 5] % LENGTH, abs=1e-3)
+    marks = marks_of(panel)
+    assert marks[0, 0, 1] == pytest.approx(shown.positions[0, 5] % LENGTH, abs=1e-3)
+    assert len(segments_of(panel)) == pytest.approx(6 * len(marks), rel=0.02)  # but for who crosses the seam
 
 
 def test_space_time_marks_every_cav() -> None:
-    shown = shown_of(cav_ids=["human_0", "cav_0"])
-    [panel] = panels_of(space_time([shown]))
-    assert sum(lines.get_array() is None for lines in lines_of(panel)) == 2
+    (once,), (twice,) = (
+        panels_of(space_time([shown_of(cav_ids=ids)])) for ids in (["cav_0"], ["human_0", "cav_0"])
+    )
+    assert len(marks_of(twice)) == pytest.approx(2 * len(marks_of(once)), rel=0.02)
 
 
 def test_a_long_episode_is_thinned_out_and_a_short_one_is_not() -> None:
@@ -301,6 +300,13 @@ def test_a_drawing_is_an_svg() -> None:
     assert ElementTree.fromstring(data).tag == "{http://www.w3.org/2000/svg}svg"
 
 
+def marks_of(axes: Axes) -> np.ndarray:
+    """Return the ends of all lines in the CAVs' colour, shape (n, 2, 2)."""
+    marked = [lines for lines in lines_of(axes) if lines.get_array() is None]
+    assert {to_hex(np.asarray(lines.get_color())[0]) for lines in marked} == {CAV_COLOUR}
+    return np.concatenate([np.array(lines.get_segments()).reshape(-1, 2, 2) for lines in marked])
+
+
 def segments_of(axes: Axes) -> np.ndarray:
     """Everything that a panel shows of vehicles: (time, position) of both ends, shape (n, 2, 2)."""
     coloured = [lines for lines in lines_of(axes) if lines.get_array() is not None]
@@ -344,9 +350,9 @@ def test_each_vehicle_of_the_merge_is_on_one_panel_at_a_time() -> None:
 def test_cavs_of_the_merge_are_marked(tmp_path: Path) -> None:
     shown = shown_from(merge_episode(), "pi")
     main, ramp = panels_of(space_time([shown]))
-    assert sum(lines.get_array() is None for lines in lines_of(main)) == len(shown.cavs)
-    marked = [lines for lines in lines_of(ramp) if lines.get_array() is None]
-    assert not any(len(lines.get_segments()) for lines in marked)
+    there = ~np.isnan(shown.positions[:, list(shown.cavs)])
+    assert len(marks_of(main)) == pytest.approx(there.sum(), rel=0.1)
+    assert len(marks_of(ramp)) == 0
 
 
 def test_space_time_of_your_own_network_shows_the_route(tmp_path: Path) -> None:

@@ -62,7 +62,7 @@ def png_bytes(figure: Figure, dpi: int = 130) -> bytes:
     figure.savefig(content, format="png", dpi=dpi)
     # A sixth of the size. Maximum coverage keeps colours that are rare: the CAV's, and the fastest.
     quantized = Image.open(content).convert("RGB").quantize(256, Image.Quantize.MAXCOVERAGE)
-    quantized.save(small, "PNG", optimize=True)
+    quantized.save(small, "PNG")
     return small.getvalue()
 
 
@@ -157,28 +157,27 @@ def _trajectories(axes: Axes, episode: Shown, scale: Normalize, branch: str, mai
     for start, end in episode.crossings:
         axes.axhspan(start, end, color=GRID, lw=0)
     positions = _on_branch(episode, branch, main)[::every]
-    cavs = set(episode.cavs)
+    if episode.closed:
+        positions = positions % episode.loop_length
     seam = episode.loop_length / 2 if episode.closed else np.inf
-    for column in range(episode.speeds.shape[1]):
-        position = positions[:, column] % episode.loop_length if episode.closed else positions[:, column]
-        points = np.column_stack([times, position])
-        segments = np.stack([points[:-1], points[1:]], axis=1)
+    for is_cav in (False, True):
+        driven = np.isin(np.arange(episode.speeds.shape[1]), episode.cavs) == is_cav
+        position = positions[:, driven].T
+        points = np.stack([np.broadcast_to(times, position.shape), position], axis=-1)
         keep = np.abs(np.diff(position)) < seam  # not across the seam of the road, nor where nobody is
-        is_cav = column in cavs
+        segments = list(np.stack([points[:, :-1], points[:, 1:]], axis=2)[keep])
         lines = LineCollection(
-            list(segments[keep]),
+            segments,
             cmap=SPEED_COLOURS,
             norm=scale,
             linewidths=(2.6 if is_cav else 1.1) if episode.closed else (1.6 if is_cav else 0.7),
             rasterized=True,
         )
-        lines.set_array(episode.speeds[::every, column][:-1][keep])
+        lines.set_array(episode.speeds[::every, driven].T[:, :-1][keep])
         axes.add_collection(lines)
         if is_cav:
             width = 1.3 if episode.closed else 0.6
-            axes.add_collection(
-                LineCollection(list(segments[keep]), colors="#d7263d", linewidths=width, rasterized=True)
-            )
+            axes.add_collection(LineCollection(segments, colors="#d7263d", linewidths=width, rasterized=True))
 
 
 def over_time(shown: Sequence[Shown], wide: bool = True) -> Figure:
