@@ -1,10 +1,15 @@
 """Tables of the studies that `unjam reproduce` made, from files under results/."""
 
 import json
+import shlex
 from typing import Any
 
 import pandas as pd
 from tables import RESULTS
+
+from unjam.experiments.studies.plan import VARIANTS
+from unjam.experiments.studies.pool import REFERENCES
+from unjam.reports.statistics import estimate
 
 PAPER = {"reward": "return", "speed": "CAV's speed [m/s]", "std": "its std [m/s]"}
 
@@ -91,6 +96,54 @@ def robustness(road: str) -> pd.DataFrame:
                 cells["its smallest headway [s]"] = number(row["min_headway"]["mean"], 2)
                 cells["its collisions"] = number(row["collisions"]["mean"], 2)
     return pd.DataFrame(table.values())
+
+
+def training_time() -> pd.DataFrame:
+    """Return the wall time per 1,000 actual steps by variant and part, and how many times TRPO's it is."""
+    found = json.loads((RESULTS / "figure-8" / "time.json").read_text())
+    table = []
+    for variant, parts in found["mean"].items():
+        cells = {"": VARIANTS[variant].label}
+        cells |= {f"{part} [s]": f"{seconds:.2f}" for part, seconds in parts.items() if part != "validation"}
+        table.append({**cells, "times TRPO's": f"{found['over_trpo'][variant]:.2f}"})
+    return pd.DataFrame(table).fillna("")
+
+
+def carried_over(metric: str = "mean_speed", digits: int = 2) -> pd.DataFrame:
+    """Return a metric of controllers that were trained among 22 vehicles, by the traffic that they met."""
+    rows = json.loads((RESULTS / "figure-10" / "carried-over.json").read_text())
+    table: dict[str, dict[str, str]] = {}
+    for road in dict.fromkeys(row["road"] for row in rows):
+        by_driver: dict[str, list[float]] = {}
+        for row in rows:
+            if row["road"] == road:
+                by_driver.setdefault(row["driver"].rstrip(" 0123456789"), []).append(row[metric]["mean"])
+        table[road] = {"": road}
+        for driver, means in by_driver.items():
+            found = estimate(means)
+            text = f"{found.mean:.{digits}f}"
+            if found.count > 1:
+                text += f" [{min(means):.{digits}f}, {max(means):.{digits}f}]"
+            table[road][f"{driver} ({found.count} trainings)" if found.count > 1 else driver] = text
+    return pd.DataFrame(table.values())
+
+
+def commands(variants: list[str]) -> pd.DataFrame:
+    """Return the command that repeats the training of a row, on the ring and with the first seed."""
+    table = []
+    for name in variants:
+        variant = VARIANTS[name]
+        words = ["unjam", "train", "ring", "--preset", variant.preset, "--seed", "0"]
+        words += ["--steps", str(variant.steps)] if variant.steps else []
+        for key, value in variant.changes.items():
+            words += ["--set", f"{key}={value}"]
+        table.append({"row": variant.label, "command": shlex.join(words)})
+    return pd.DataFrame(table)
+
+
+def drivers() -> pd.DataFrame:
+    """Return how drivers that do not learn are named on the command line."""
+    return pd.DataFrame([{"row": label, "--driver": name} for label, name in REFERENCES.items()])
 
 
 def number(value: float | None, digits: int) -> str:

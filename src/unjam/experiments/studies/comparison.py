@@ -63,7 +63,7 @@ ON_EXPERTS = comparison(
 )
 JAMMED = comparison(
     "ours on a ring whose wave has grown before the CAV takes over",
-    ("ours", "ours-without-model"),
+    ("best", "ours-with-model"),
     ("ring-jammed",),
 )
 FIGURE_9 = comparison("PPO and SAC within the framework, on the ring", FRAMEWORK, ("ring",))

@@ -1,0 +1,68 @@
+"""Tables of what was measured of the paper's theorems, from results/theory/."""
+
+import json
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from studies import interval
+from tables import RESULTS
+
+from unjam.experiments.studies.plan import VARIANTS
+
+
+def measured() -> dict[str, Any]:
+    """Return all that the study wrote."""
+    return json.loads((RESULTS / "theory" / "theory.json").read_text())
+
+
+def untrained() -> pd.DataFrame:
+    """A1: returns of policies that nobody has trained, with the expert below them and without."""
+    table: dict[str, dict[str, str]] = {}
+    for row in measured()["untrained"]:
+        cells = table.setdefault(row["road"], {"": row["road"]})
+        cells[row["policy"]] = interval(row, 0) if "low" in row else f"{row['mean']:.0f}"
+    return pd.DataFrame(table.values())
+
+
+def convergence() -> pd.DataFrame:
+    """A2: which trainings come within 5 % of the best return known, when, and whether they are there last."""
+    table = []
+    for row in measured()["convergence"]:
+        arrivals = ["never" if steps is None else f"{steps:,}" for steps in row["arrivals"]]
+        table.append(
+            {
+                "": row["name"],
+                "trainings": row["trainings"],
+                "arrive after [actual steps]": ", ".join(arrivals),
+                "are there at the end": f"{row['stayed']} of {row['trainings']}",
+                "return at the end, in training": interval(row["last"], 0),
+            }
+        )
+    return pd.DataFrame(table)
+
+
+def model() -> pd.DataFrame:
+    """A3: the model's error and what hangs on it, in the first and the last tenth of the trainings."""
+    table = []
+    for variant, runs in measured()["model"].items():
+        cells: dict[str, Any] = {"": VARIANTS[variant].label}
+        first = [row for run in runs for row in run[: max(1, len(run) // 10)]]
+        last = [row for run in runs for row in run[-max(1, len(run) // 10) :]]
+        for name, heading, digits in (
+            ("eps_m", "eps_m", 3),
+            ("k_star", "k*", 0),
+            ("gap", "gap of returns", 0),
+            ("bound", "bound on it", 0),
+        ):
+            ends = [_mean(rows, name) for rows in (first, last)]
+            cells[f"{heading}, first and last tenth"] = " → ".join(
+                "–" if np.isnan(end) else f"{end:,.{digits}f}" for end in ends
+            )
+        table.append(cells)
+    return pd.DataFrame(table)
+
+
+def _mean(rows: list[dict[str, Any]], name: str) -> float:
+    values = [row[name] for row in rows if row[name] is not None]
+    return float(np.mean(values)) if values else float("nan")
