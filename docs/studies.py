@@ -98,6 +98,25 @@ def robustness(road: str) -> pd.DataFrame:
     return pd.DataFrame(table.values())
 
 
+def merge_capacity() -> pd.DataFrame:
+    """Return how people alone fare on the merge, by how many want to enter and how the road begins."""
+    table = []
+    for path in sorted((RESULTS / "tried" / "merge-capacity").glob("*.json")):
+        standing, inflow = (int(part) for part in path.stem.split("-"))
+        rows = json.loads(path.read_text())["rows"]
+        cells = {"start": f"{standing} standing" if standing else "empty", "highway [veh/h]": f"{inflow:,}"}
+        for heading, name, digits in (
+            ("mean speed [m/s]", "mean_speed", 1),
+            ("steady [m/s]", "mean_speed_steady", 1),
+            ("leave [veh/h]", "throughput_veh_per_h", 0),
+            ("wait [veh]", "backlog_veh", 1),
+        ):
+            found = estimate([row[name] for row in rows])
+            cells[heading] = f"{found.mean:.{digits}f} [{found.low:.{digits}f}, {found.high:.{digits}f}]"
+        table.append(cells)
+    return pd.DataFrame(table)
+
+
 def training_time() -> pd.DataFrame:
     """Return the wall time per 1,000 actual steps by variant and part, and how many times TRPO's it is."""
     found = json.loads((RESULTS / "figure-8" / "time.json").read_text())
@@ -128,11 +147,10 @@ def carried_over(metric: str = "mean_speed", digits: int = 2) -> pd.DataFrame:
     return pd.DataFrame(table.values())
 
 
-def commands(variants: list[str]) -> pd.DataFrame:
+def commands() -> pd.DataFrame:
     """Return the command that repeats the training of a row, on the ring and with the first seed."""
     table = []
-    for name in variants:
-        variant = VARIANTS[name]
+    for variant in VARIANTS.values():
         words = ["unjam", "train", "ring", "--preset", variant.preset, "--seed", "0"]
         words += ["--steps", str(variant.steps)] if variant.steps else []
         for key, value in variant.changes.items():

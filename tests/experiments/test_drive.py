@@ -10,6 +10,7 @@ from unjam.drivers import IDM, LocalState, PISaturation
 from unjam.drivers.driver import Driver, Memory
 from unjam.errors import InputError
 from unjam.experiments.drive import DriveResult, drive, raise_failures
+from unjam.experiments.evaluate import held_out_seeds
 from unjam.files import to_json
 from unjam.reports.metrics import METRICS
 from unjam.reports.results import read_results
@@ -38,6 +39,12 @@ def test_a_row_measures_the_episode_of_its_seed(compared: DriveResult) -> None:
     for row in compared.rows["pi"]:
         (trajectory,) = run_episode(ring, PISaturation(), (row["seed"],)).trajectories
         assert row["return"] == trajectory.reward.sum()
+
+
+def test_held_out_seeds_are_those_that_judge_trainings() -> None:
+    judged = drive("ring", "pi", episodes=2, road=ROAD, workers=1, held_out=True).rows["pi"]
+    again = [run_episode(Ring(**ROAD), PISaturation(), seed).trajectories[0] for seed in held_out_seeds(2)]
+    assert [row["return"] for row in judged] == [trajectory.reward.sum() for trajectory in again]
 
 
 def test_what_was_driven_is_written_with_a_report(compared: DriveResult) -> None:
@@ -175,6 +182,7 @@ def started(monkeypatch: pytest.MonkeyPatch) -> Callable[[], bool]:
         {"reward": "nowhere.py:gold"},
         {"episodes": 0},
         {"seed": -1},
+        {"seed": 3, "held_out": True},
         {"workers": -1},
     ],
     ids=str,

@@ -42,6 +42,9 @@ def drive(
     ],
     episodes: EpisodesOption = 5,
     seed: SeedOption = 0,
+    held_out: Annotated[
+        bool, typer.Option("--held-out", help="On the seeds that judge trainings, instead of --seed.")
+    ] = False,
     length: LengthOption = None,
     radius: RadiusOption = None,
     vehicles: VehiclesOption = None,
@@ -74,6 +77,8 @@ def drive(
       unjam drive my.sumocfg --cav-share 0.1 --driver pi
 
       unjam drive ring-jammed -d human -d pi --humans drivers.json
+
+      unjam drive ring -d pi -d runs/ring-001 --held-out --episodes 20
     """
     from unjam.cli.output import aside, console, counting_steps, metrics_table, print_json
     from unjam.experiments.drive import drive as run
@@ -87,7 +92,7 @@ def drive(
     total = make_scenario(scenario, road).horizon * episodes * len(driver)
     folder = new_folder(out, f"drive-{Path(scenario).stem}") if report else None
     with counting_steps(f"driving {Path(scenario).name}", total) as steps:
-        result = run(scenario, driver, episodes, seed, road, reward, workers, folder, steps)
+        result = run(scenario, driver, episodes, seed, road, reward, workers, folder, steps, held_out)
     if json:
         print_json(result.document())
     elif any(row["status"] != "failed" for rows in result.rows.values() for row in rows):

@@ -10,7 +10,7 @@ from unjam.controller import make_driver
 from unjam.drivers.driver import Driver
 from unjam.drivers.registry import driver_names, free_label
 from unjam.errors import InputError, wrong
-from unjam.experiments.evaluate import evaluate, raise_failure, save_evaluation
+from unjam.experiments.evaluate import evaluate, held_out_seeds, raise_failure, save_evaluation
 from unjam.experiments.manifest import manifest
 from unjam.files import make_folder
 from unjam.reports.html import write_report
@@ -70,6 +70,7 @@ def drive(
     workers: int | None = None,
     out: Path | str | None = None,
     progress: Callable[[Any, int], None] | None = None,
+    held_out: bool = False,
 ) -> DriveResult:
     """Run episodes and measure them.
 
@@ -84,6 +85,7 @@ def drive(
         workers: processes; all cores by default. The result does not depend on it.
         out: folder for the results and a report.html; None: nothing is written.
         progress: told now and then how many decisions an episode has made.
+        held_out: on the seeds that judge trainings, instead of `seed` and those after it.
 
     Raises:
         InputError: something is wrong with the arguments; nothing was started.
@@ -91,6 +93,8 @@ def drive(
     for name, number, least in (("episodes", episodes, 1), ("seed", seed, 0), ("workers", workers, 1)):
         if number is not None and number < least:
             raise wrong(name, number, f">= {least}")
+    if held_out and seed:
+        raise wrong("seed", seed, "none with held-out seeds")
     made = make_scenario(scenario, road)
     given = [driver] if isinstance(driver, (str, Driver)) else list(driver)
     drivers: dict[str, Driver] = {}
@@ -108,7 +112,7 @@ def drive(
     if folder is not None:
         make_folder(folder)
 
-    seeds = [(seed + index,) for index in range(episodes)]
+    seeds = held_out_seeds(episodes) if held_out else [(seed + index,) for index in range(episodes)]
     with Workers(min(workers or os.cpu_count() or 1, episodes * len(drivers))) as pool:
         found = evaluate(made, drivers, seeds, pool, reward, progress)
     report = None
