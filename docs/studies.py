@@ -42,6 +42,7 @@ COLUMNS = {
     "of the limit, steady": ("speed_limit_ratio_steady", 3),
     "std across vehicles [m/s]": ("speed_std_fleet", 2),
     "smallest headway [s]": ("min_headway", 2),
+    "wave dissolved after [s]": ("time_to_dissolve", 0),
     "leave [veh/h]": ("throughput_veh_per_h", 0),
     "wait [veh]": ("backlog_veh", 0),
     "collisions": ("collisions", 2),
@@ -49,6 +50,7 @@ COLUMNS = {
 """what the honest tables show: a metric and its digits"""
 OF_THE_RING = ("return", "mean speed [m/s]", "of the limit, steady", "std across vehicles [m/s]")
 OF_THE_RING += ("smallest headway [s]", "collisions")
+OF_THE_JAMMED = (*OF_THE_RING[:3], "wave dissolved after [s]", *OF_THE_RING[3:])
 OF_THE_EIGHT = ("return", "return, Eq. 16", "mean speed [m/s]", "steady [m/s]", "std across vehicles [m/s]")
 OF_THE_EIGHT += ("collisions",)
 

@@ -19,12 +19,12 @@ def test_each_is_whole_and_says_what_it_was_trained_on(name: str) -> None:
 
 
 def test_there_is_one_for_each_closed_road() -> None:
-    assert {"ring-best", "figure-eight-best"} <= set(shipped_names())
+    assert {"ring-best", "ring-jammed-best", "figure-eight-best"} <= set(shipped_names())
 
 
 @pytest.mark.parametrize("name", ["nothing", "", "../ring-best", "ring-best.unjam"])
 def test_another_name_lists_those_that_there_are(name: str) -> None:
-    with pytest.raises(InputError, match="allowed: unjam:figure-eight-best, unjam:ring-best"):
+    with pytest.raises(InputError, match="allowed: unjam:figure-eight-best, unjam:ring-best, "):
         make_driver(f"{SHIPPED}{name}", 0.1)
 
 
@@ -32,6 +32,12 @@ def test_the_rings_earns_more_than_its_expert_on_every_seed() -> None:
     found = unjam.drive("ring", ["pi", "unjam:ring-best"], episodes=2, workers=1)
     gain = paired_difference(found.rows["unjam:ring-best"], found.rows["pi"], "return")
     assert gain.low > 100
+
+
+def test_the_jammed_rings_dissolves_the_wave_sooner_than_its_expert() -> None:
+    found = unjam.drive("ring-jammed", ["pi", "unjam:ring-jammed-best"], episodes=2, workers=1)
+    sooner = paired_difference(found.rows["pi"], found.rows["unjam:ring-jammed-best"], "time_to_dissolve")
+    assert sooner.low > 5
 
 
 @pytest.mark.slow
