@@ -20,7 +20,7 @@ from unjam.reports.results import Shown
 SPEED_COLOURS = "viridis"
 """slow is dark, fast is bright: also without colour vision, and in print"""
 INK, MUTED, GRID = "#1f2933", "#697586", "#e4e7eb"
-LINES = ["#7b8794", "#e07a1f", "#2b6cb0", "#2f855a", "#b83280", "#805ad5", "#c05621", "#1a202c"]
+LINES = ["#7b8794", "#e07a1f", "#2b6cb0", "#2f855a", "#b83280", "#805ad5", "#1a202c", "#00a3c4"]
 """of drivers, in the order in which they are shown"""
 POINTS_IN_TIME = 600
 """moments that a picture shows of an episode"""
