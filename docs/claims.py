@@ -3,6 +3,7 @@
 import json
 from typing import Any
 
+import numpy as np
 import pandas as pd
 from studies import interval, number, rows_of
 from tables import RESULTS
@@ -10,15 +11,24 @@ from tables import RESULTS
 Claim = tuple[str, str, str]
 """what the paper says, whether it held, by which numbers"""
 UNKNOWN = "not measured yet"
+ROADS = ("ring", "figure-eight", "merge")
+OTHERS = {"TRPO": "trpo", "PPO": "ppo", "SAC": "sac"}
+TENTH = 10
+"""points of a curve of 100"""
 
 
 def claims() -> pd.DataFrame:
     """Return all claims but those on car-following data, which `people.py` has."""
-    rows = [best_on(road) for road in ("ring", "figure-eight", "merge")]
+    rows = [claim(road) for claim in (best_on, fastest_on, first_rounds_on) for road in ROADS]
     rows += [
+        ppo_ends_lower(),
+        *(ppo_slows_down(road) for road in ("ring", "figure-eight")),
+        sac_swings(),
+        collisions(),
         initial_policy(),
         model_alone(),
         unstable(),
+        trpo_slowest(),
         ppo_and_sac(),
         volumes(),
         training_time(),
@@ -58,6 +68,99 @@ def best_on(road: str) -> Claim:
     held = all(of(rows, "proposed") > of(rows, name) for name in others)
     so_far = " so far" if len(others) < 3 else ""
     return words, f"{verdict(held)}{so_far}", f"return, held-out: {returns}"
+
+
+def fastest_on(road: str) -> Claim:
+    """Has the paper's method the highest `average speed`, in its convention?"""
+    words, rows = f"fastest of all learners on {road}", table(f"table-1-{road}", road)
+    if not rows:
+        return words, UNKNOWN, ""
+    speeds = {name: rows[name]["paper_convention"]["speed"]["mean"] for name in ("proposed", *OTHERS)}
+    numbers = ", ".join(f"{name} {speed:.2f}" for name, speed in speeds.items())
+    return (
+        words,
+        verdict(max(speeds, key=speeds.__getitem__) == "proposed"),
+        f"CAV in training, m/s: {numbers}",
+    )
+
+
+def curve(study: str, road: str, variant: str, name: str) -> np.ndarray:
+    """Return a learning curve, mean over the trainings; empty where it has not been measured."""
+    path = RESULTS / study / "curves.json"
+    if not path.is_file():
+        return np.zeros(0)
+    return np.mean(json.loads(path.read_text())[road][variant][name], axis=0)
+
+
+def first_rounds_on(road: str) -> Claim:
+    """Does it earn more in the first tenth of the training?"""
+    words = f"more reward in the first rounds on {road}"
+    curves = {
+        name: curve(f"table-1-{road}", road, variant, "return_mean")
+        for name, variant in {"proposed": "proposed", **OTHERS}.items()
+    }
+    if not len(curves["proposed"]):
+        return words, UNKNOWN, ""
+    starts = {name: found[:TENTH].mean() for name, found in curves.items()}
+    numbers = ", ".join(f"{name} {value:.0f}" for name, value in starts.items())
+    held = max(starts, key=starts.__getitem__) == "proposed"
+    return words, verdict(held), f"return, first tenth of the training: {numbers}"
+
+
+def ppo_ends_lower() -> Claim:
+    """Is PPO's final reward lower?"""
+    rows = table("table-1-ring", "ring")
+    ends = [rows[name]["paper_convention"]["reward"]["mean"] for name in ("PPO", "proposed")]
+    numbers = f"return, last tenth of the training: {ends[0]:.0f} against {ends[1]:.0f}"
+    return "PPO's final reward is 42 % lower (ring)", verdict(ends[0] < ends[1]), numbers
+
+
+def ppo_slows_down(road: str) -> Claim:
+    """Does PPO's speed fall in the later stages?"""
+    speeds = curve(f"table-1-{road}", road, "ppo", "cav_mean_speed").reshape(-1, TENTH).mean(axis=1)
+    numbers = f"CAV in training: {speeds.max():.2f} m/s in its fastest tenth, {speeds[-1]:.2f} in the last"
+    return f"PPO's speed falls late on {road}", verdict(speeds[-1] < 0.95 * speeds.max()), numbers
+
+
+def sac_swings() -> Claim:
+    """Does the CAV of SAC swing more, the longer it learns?"""
+    stds = (
+        curve("table-1-figure-eight", "figure-eight", "sac", "speed_std_cav").reshape(-1, TENTH).mean(axis=1)
+    )
+    # The first tenth is SAC's start, with actions drawn at random.
+    numbers = f"CAV in training: {stds[1]:.2f} m/s in the second tenth, {stds[-1]:.2f} in the last"
+    return "SAC's speed std rises on figure-eight", verdict(stds[-1] > stds[1]), numbers
+
+
+def collisions() -> Claim:
+    """Are collisions rare?"""
+    studies = [(f"table-1-{road}", road) for road in ROADS]
+    rows = [row for study, road in studies for row in table(study, road).values() if row["learns"]]
+    most = max(row["collisions"]["mean"] for row in rows)
+    numbers = (
+        f"at most {most:.2f} in an episode, held-out, over {sum(row['trainings'] for row in rows)} trainings"
+    )
+    return "collisions are rare, whoever learns", verdict(most < 0.05), numbers
+
+
+def trpo_slowest() -> Claim:
+    """Do the other variants of Table 2 reach TRPO's own final return before it does?"""
+    names = {
+        "TRPO": "trpo",
+        "MB-TRPO": "mb-trpo",
+        "no initial policy": "no-initial-policy",
+        "proposed": "proposed",
+    }
+    curves = {name: curve("table-2", "ring", variant, "return_mean") for name, variant in names.items()}
+    goal = 0.9 * curves["TRPO"][-TENTH:].mean()
+    arrivals = {name: int(np.argmax(found >= goal)) for name, found in curves.items()}
+    numbers = ", ".join(f"{name} {3 * percent},000" for name, percent in arrivals.items())
+    held = max(arrivals, key=arrivals.__getitem__) == "TRPO"
+    return (
+        "vanilla TRPO is the slowest (ring)",
+        verdict(held),
+        f"actual steps to 0.9 of TRPO's final return: {numbers}",
+    )
 
 
 def initial_policy() -> Claim:

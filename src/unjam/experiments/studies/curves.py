@@ -17,8 +17,8 @@ from unjam.reports.statistics import estimate
 POINTS = 100
 """of a curve"""
 DRAWN = {"return_mean": "return, in training", "cav_mean_speed": "CAV's mean speed, in training [m/s]"}
-RATES = ("cav_mean_speed",)
-NAMES = (*DRAWN, "return_validation")
+RATES = ("cav_mean_speed", "speed_std_cav")
+NAMES = (*DRAWN, "return_validation", "speed_std_cav")
 
 
 def curves_of(pool: Pool, road: str, variants: Sequence[str], seeds: int) -> dict[str, Any]:
