@@ -52,7 +52,7 @@ def model() -> pd.DataFrame:
         for name, heading, digits in (
             ("eps_m", "eps_m", 3),
             ("k_star", "k*", 0),
-            ("gap", "gap of returns", 0),
+            ("gap", "gap of returns", 2),
             ("bound", "bound on it", 0),
         ):
             ends = [_mean(rows, name) for rows in (first, last)]
