@@ -132,6 +132,7 @@ def draw(by_variant: dict[str, list[list[dict[str, Any]]]]) -> Figure:
                     axes.plot(steps, [row[name] for row in run], color=colour, lw=1.2, label=words)
             axes.set_title(label, loc="left", fontsize=9, color=INK)
             axes.set_xlabel("actual simulator steps [thousands]")
+        panels[1].set_yscale("log")  # from 2 to 500
         figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper left", ncols=5)
         return figure
 
