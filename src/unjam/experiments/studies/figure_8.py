@@ -26,6 +26,8 @@ MEASURED = (
 STEPS, ROUNDS = 24_000, 3
 """actual steps of each measured training, and how often all take their turn"""
 START_STEPS = 3_000
+NOT_MEASURED = "validation"
+"""the part that is switched off, for it is the same for all"""
 
 
 def measured_seconds(steps: int = STEPS, rounds: int = ROUNDS) -> dict[str, list[dict[str, float]]]:
@@ -52,33 +54,34 @@ def measured_seconds(steps: int = STEPS, rounds: int = ROUNDS) -> dict[str, list
 def _per_thousand(folder: Path) -> dict[str, float]:
     rows = read_progress(folder)
     thousands = rows[-1]["actual_steps"] / 1000.0
-    parts = dict.fromkeys(part for row in rows for part in row["seconds"])
+    parts = dict.fromkeys(part for row in rows for part in row["seconds"] if part != NOT_MEASURED)
     return {part: sum(row["seconds"].get(part, 0.0) for row in rows) / thousands for part in parts}
 
 
 def _write(pool: Pool, seeds: int, folder: Path, workers: int) -> None:
     found = measured_seconds()
-    means = {
-        variant: {part: sum(turn.get(part, 0.0) for turn in turns) / len(turns) for part in turns[0]}
+    # A turn that something else on the machine slowed down does not count.
+    medians = {
+        variant: sorted(turns, key=lambda parts: sum(parts.values()))[len(turns) // 2]
         for variant, turns in found.items()
     }
-    total = {variant: sum(parts.values()) for variant, parts in means.items()}
+    total = {variant: sum(parts.values()) for variant, parts in medians.items()}
     over_trpo = {variant: seconds / total["trpo"] for variant, seconds in total.items()}
-    numbers = {"turns": found, "mean": means, "over_trpo": over_trpo}
+    numbers = {"turns": found, "median": medians, "over_trpo": over_trpo}
     write_whole(folder / "time.json", to_json(numbers, indent=1))
-    draw(means).savefig(folder / "time.png")
+    draw(medians).savefig(folder / "time.png")
 
 
-def draw(means: dict[str, dict[str, float]]) -> Figure:
+def draw(seconds: dict[str, dict[str, float]]) -> Figure:
     """Draw the parts of training, a bar per variant."""
     with rc_context(STYLE):
-        figure = Figure(figsize=(10.5, 0.4 * len(means) + 1.2), layout="constrained", dpi=130)
+        figure = Figure(figsize=(10.5, 0.4 * len(seconds) + 1.2), layout="constrained", dpi=130)
         axes = figure.subplots()
-        parts = list(dict.fromkeys(part for seconds in means.values() for part in seconds))
-        labels = [VARIANTS[variant].label for variant in means]
-        left = [0.0] * len(means)
+        parts = list(dict.fromkeys(part for found in seconds.values() for part in found))
+        labels = [VARIANTS[variant].label for variant in seconds]
+        left = [0.0] * len(seconds)
         for part, colour in zip(parts, LINES, strict=False):
-            widths = [seconds.get(part, 0.0) for seconds in means.values()]
+            widths = [found.get(part, 0.0) for found in seconds.values()]
             axes.barh(labels, widths, left=left, color=colour, label=part)
             left = [start + width for start, width in zip(left, widths, strict=True)]
         axes.invert_yaxis()
