@@ -40,7 +40,7 @@ bless: $(VENV)/.installed-dev
 	$(BIN)/python tests/golden/bless.py "$(WHY)"
 
 docs: $(VENV)/.installed-dev
-	$(BIN)/python -m sphinx -q -W -b html docs docs/_build/html
+	$(BIN)/python -m sphinx -q -E -W -b html docs docs/_build/html
 	@echo docs/_build/html/index.html
 
 # Thousands of injected faults, half an hour: results/soak/soak.json

@@ -28,7 +28,7 @@ def paper_convention(study: str, road: str) -> pd.DataFrame:
         for key, heading in PAPER.items():
             ours, reported = row["paper_convention"][key], (row.get("paper") or {}).get(key)
             digits = 0 if key == "reward" else 2
-            cells[heading] = f"{ours['mean']:.{digits}f} ± {ours['std']:.{digits}f}"
+            cells[heading] = unbroken(f"{ours['mean']:.{digits}f} ± {ours['std']:.{digits}f}")
             cells[f"{heading}, paper"] = "" if reported is None else f"{reported:.{digits}f}"
         table.append(cells)
     return pd.DataFrame(table)
@@ -175,4 +175,9 @@ def interval(entries: dict[str, Any], digits: int, sign: str = "") -> str:
     """Return an estimate with its interval."""
     values = [entries[name] for name in ("mean", "low", "high")]
     mean, low, high = ("–" if value is None else f"{value:{sign}.{digits}f}" for value in values)
-    return f"{mean} [{low}, {high}]"
+    return unbroken(f"{mean} [{low}, {high}]")
+
+
+def unbroken(text: str) -> str:
+    """Return a text that stays on one line of a table."""
+    return text.replace(" ", "\N{NO-BREAK SPACE}")

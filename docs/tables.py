@@ -119,6 +119,10 @@ def soak_origin() -> str:
 def show(table: pd.DataFrame, index: bool = False, digits: int = 3) -> HTML:
     """Return a table in the style of the site."""
     html = table.to_html(
-        index=index, border=0, classes="docutils align-default", float_format=f"{{:.{digits}f}}".format
+        index=index,
+        border=0,
+        justify="left",
+        classes="docutils align-default",
+        float_format=f"{{:.{digits}f}}".format,
     )
     return HTML(f'<div class="table-wrapper">{html}</div>')

@@ -52,7 +52,7 @@ VARIANTS: dict[str, Variant] = {
     "ours-without-model": Variant("ours without model", "best", {"virtual.virtual_ratio": 0.0}),
     "ours-with-model": Variant("ours with model", "best", {"virtual.virtual_ratio": 5.0}),
     "ours-on-pi": Variant("ours on PI", "best", {"expert": "pi"}),
-    "best": Variant("ours, trained on", "best", {}, None),
+    "best": Variant("ours, all its steps", "best", {}, None),
 }
 """the paper's methods with the paper's settings, and what we make of them"""
 
