@@ -65,7 +65,7 @@ def test_a_study_leaves_its_trainings_numbers_picture_and_manifest(reproduced: M
     assert sum("failed" in line for line in told) == 0
     manifest = json.loads((folder / "little" / "manifest.json").read_text())
     assert manifest["seeds"] == 2
-    assert len({entry["sha256"] for entry in manifest["trainings"]}) == 4
+    assert len({entry["weights_sha256"] for entry in manifest["trainings"]}) == 4
 
 
 def test_what_is_there_is_not_trained_again(reproduced: Made) -> None:

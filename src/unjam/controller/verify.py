@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from unjam.controller.archive import GRAPH, MANIFEST, SAMPLE, WEIGHTS
-from unjam.controller.file import Controller, read_controller
+from unjam.controller.file import Controller, hash_of, read_controller
 from unjam.controller.graph import check_graph, run_graph
 from unjam.controller.manifest import description
 from unjam.controller.sample import read_sample, replay
@@ -36,11 +36,11 @@ def verify_controller(path: Path | str) -> list[Verified]:
     """
     controller = read_controller(path)
     driver, manifest, parts = controller.driver, controller.manifest, controller.parts
-    shapes = ", ".join(f"{name} {len(part):,} bytes" for name, part in parts.items() if name != MANIFEST)
+    sizes = ", ".join(f"{name} {len(part):,} bytes" for name, part in parts.items() if name != MANIFEST)
     verified = [
-        Verified("parts", f"{shapes}; each has the hash that the manifest names"),
+        Verified("parts", f"{sizes}; each has the hash that the manifest names"),
         Verified("driver", describe(driver)),
-        Verified("weights", f"{len(parts[WEIGHTS]):,} bytes, finite, of the shapes that the driver needs"),
+        Verified("weights", f"finite, of the shapes that the driver needs; SHA-256 {hash_of(parts[WEIGHTS])}"),
     ]
     if manifest["format"] > 1:
         _check_description(controller)

@@ -144,7 +144,7 @@ def reproduce(
 def _trained_by(run: PlannedRun, pool: Pool) -> dict[str, Any]:
     """Return what is needed to repeat a training, and what its controller is known by."""
     made = json.loads((pool.folder_of(run) / "manifest.json").read_text())
-    return {"run": run.name, "commit": made["commit"], "sha256": pool.sha256(run)}
+    return {"run": run.name, "commit": made["commit"], "weights_sha256": pool.weights_sha256(run)}
 
 
 def drive_references(road: str, pool: Pool, workers: int) -> None:

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from unjam.controller.archive import WEIGHTS, unpack_parts
 from unjam.experiments.executors import Command
 from unjam.experiments.folder import read_config
 from unjam.experiments.judge import TRAINED
@@ -105,9 +106,10 @@ class Pool:
         """Return the rows of the drivers that do not learn, by label, on the seeds that judge."""
         return read_rows(self.drives_of(road))
 
-    def sha256(self, run: PlannedRun) -> str:
-        """Return the hash of a trained controller."""
-        return hashlib.sha256((self.folder_of(run) / "controller.unjam").read_bytes()).hexdigest()
+    def weights_sha256(self, run: PlannedRun) -> str:
+        """Return the hash of a trained network: the same whichever unjam repeats the training."""
+        parts = unpack_parts(self.folder_of(run) / "controller.unjam")
+        return hashlib.sha256(parts[WEIGHTS]).hexdigest()
 
     def results(self, run: PlannedRun) -> Results:
         """Return all that the folder of a training says, pictures included."""
