@@ -40,7 +40,9 @@ def verify_controller(path: Path | str) -> list[Verified]:
     verified = [
         Verified("parts", f"{sizes}; each has the hash that the manifest names"),
         Verified("driver", describe(driver)),
-        Verified("weights", f"finite, of the shapes that the driver needs; SHA-256 {hash_of(parts[WEIGHTS])}"),
+        Verified(
+            "weights", f"finite, of the shapes that the driver needs; SHA-256 {hash_of(parts[WEIGHTS])}"
+        ),
     ]
     if manifest["format"] > 1:
         _check_description(controller)
