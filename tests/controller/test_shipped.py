@@ -9,6 +9,7 @@ from unjam.controller.naming import SHIPPED, shipped_file, shipped_names
 from unjam.controller.verify import verify_controller
 from unjam.drivers import ResidualDriver
 from unjam.errors import InputError
+from unjam.experiments.presets import BEST
 from unjam.reports.statistics import paired_difference
 
 
@@ -18,13 +19,13 @@ def test_each_is_whole_and_says_what_it_was_trained_on(name: str) -> None:
     assert isinstance(make_driver(f"{SHIPPED}{name}", 0.1), ResidualDriver)
 
 
-def test_there_is_one_for_each_closed_road() -> None:
-    assert {"ring-best", "ring-jammed-best", "figure-eight-best"} <= set(shipped_names())
+def test_there_is_one_for_each_preset_that_is_known_to_reach_furthest() -> None:
+    assert set(shipped_names()) == {f"{scenario}-best" for scenario in BEST}
 
 
 @pytest.mark.parametrize("name", ["nothing", "", "../ring-best", "ring-best.unjam"])
 def test_another_name_lists_those_that_there_are(name: str) -> None:
-    with pytest.raises(InputError, match="allowed: unjam:figure-eight-best, unjam:ring-best, "):
+    with pytest.raises(InputError, match="allowed: unjam:figure-eight-best, unjam:merge-best, "):
         make_driver(f"{SHIPPED}{name}", 0.1)
 
 
