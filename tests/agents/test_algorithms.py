@@ -35,7 +35,9 @@ TO_LEARN: dict[str, LearnerSettings] = {
 @pytest.mark.parametrize(
     ("target", "hold"), [(constant_target, 1), pytest.param(sloped_target, 5, marks=pytest.mark.slow)]
 )
-@pytest.mark.parametrize("agent", LEARNERS)
+@pytest.mark.parametrize(
+    "agent", [pytest.param(name, marks=pytest.mark.slow) if name == "ppo" else name for name in LEARNERS]
+)
 def test_learns_to_be_at_the_target(agent: str, target: Target, hold: int) -> None:
     policy = PolicySettings(hidden=(16,), exploration_std=0.2)
     episodes = 8 if hold == 1 else 20

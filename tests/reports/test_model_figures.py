@@ -29,7 +29,7 @@ def drawn(axes: Axes) -> dict[str, np.ndarray]:
     return {str(line.get_label()): np.asarray(line.get_ydata(), float) for line in axes.lines}
 
 
-@pytest.mark.parametrize("wide", [True, False])
+@pytest.mark.parametrize("wide", [True, pytest.param(False, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", PICTURES)
 def test_every_panel_has_a_title_and_lines_and_a_picture_can_be_made(name: str, wide: bool) -> None:
     draw, panels = PICTURES[name]

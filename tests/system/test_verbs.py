@@ -212,11 +212,10 @@ def test_train_without_an_expert(unjam: Run) -> None:
     assert found["gain"] is None
 
 
-@pytest.mark.parametrize(
-    "road", [("ring", *SMALL), pytest.param(("merge", "--set", "horizon=20"), marks=pytest.mark.slow)]
-)
-def test_watch_writes_a_film_without_a_display(road: tuple[str, ...], unjam: Run, tmp_path: Path) -> None:
-    ran = unjam("watch", *road, "--driver", "pi", "--video", "film.gif", environment={"DISPLAY": ""})
+@pytest.mark.slow
+def test_watch_writes_a_film_of_a_road_with_ends(unjam: Run, tmp_path: Path) -> None:
+    command = ("watch", "merge", "--set", "horizon=20", "--driver", "pi", "--video", "film.gif")
+    ran = unjam(*command, environment={"DISPLAY": ""})
     assert ran.returncode == 0, ran.stderr
     assert (tmp_path / "film.gif").read_bytes()[:4] == b"GIF8"
 

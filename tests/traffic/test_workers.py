@@ -179,7 +179,11 @@ def test_progress_is_told_for_each_task() -> None:
 
 
 @pytest.mark.parametrize(
-    "how", [signal.SIGKILL, pytest.param(signal.SIGSEGV, marks=pytest.mark.slow), signal.SIGSTOP]
+    "how",
+    [
+        signal.SIGKILL,
+        *(pytest.param(other, marks=pytest.mark.slow) for other in (signal.SIGSEGV, signal.SIGSTOP)),
+    ],
 )
 def test_an_episode_whose_worker_is_lost_is_repeated_to_the_same_bytes(
     how: signal.Signals, undisturbed: list[Any]
