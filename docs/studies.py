@@ -5,11 +5,10 @@ import shlex
 from typing import Any
 
 import pandas as pd
-from tables import RESULTS
+from tables import RESULTS, metrics_of
 
 from unjam.experiments.studies.plan import VARIANTS
 from unjam.experiments.studies.pool import REFERENCES
-from unjam.reports.statistics import estimate
 
 PAPER = {"reward": "return", "speed": "CAV's speed [m/s]", "std": "its std [m/s]"}
 
@@ -102,21 +101,15 @@ def robustness(road: str) -> pd.DataFrame:
 
 def merge_capacity() -> pd.DataFrame:
     """Return how people alone fare on the merge, by how many want to enter and how the road begins."""
-    table = []
+    names = ("mean_speed", "mean_speed_steady", "throughput_veh_per_h", "backlog_veh")
+    tables = []
     for path in sorted((RESULTS / "tried" / "merge-capacity").glob("*.json")):
         standing, inflow = (int(part) for part in path.stem.split("-"))
-        rows = json.loads(path.read_text())["rows"]
-        cells = {"start": f"{standing} standing" if standing else "empty", "highway [veh/h]": f"{inflow:,}"}
-        for heading, name, digits in (
-            ("mean speed [m/s]", "mean_speed", 1),
-            ("steady [m/s]", "mean_speed_steady", 1),
-            ("leave [veh/h]", "throughput_veh_per_h", 0),
-            ("wait [veh]", "backlog_veh", 1),
-        ):
-            found = estimate([row[name] for row in rows])
-            cells[heading] = f"{found.mean:.{digits}f} [{found.low:.{digits}f}, {found.high:.{digits}f}]"
-        table.append(cells)
-    return pd.DataFrame(table)
+        table = metrics_of(str(path.relative_to(RESULTS)), names)
+        table.insert(0, "highway [veh/h]", f"{inflow:,}")
+        table.insert(0, "start", f"{standing} standing" if standing else "empty")
+        tables.append(table)
+    return pd.concat(tables)
 
 
 def training_time() -> pd.DataFrame:
@@ -128,25 +121,6 @@ def training_time() -> pd.DataFrame:
         cells |= {f"{part} [s]": f"{seconds:.2f}" for part, seconds in parts.items()}
         table.append({**cells, "times TRPO's": f"{found['over_trpo'][variant]:.2f}"})
     return pd.DataFrame(table).fillna("")
-
-
-def carried_over(metric: str = "mean_speed", digits: int = 2) -> pd.DataFrame:
-    """Return a metric of controllers that were trained among 22 vehicles, by the traffic that they met."""
-    rows = json.loads((RESULTS / "figure-10" / "carried-over.json").read_text())
-    table: dict[str, dict[str, str]] = {}
-    for road in dict.fromkeys(row["road"] for row in rows):
-        by_driver: dict[str, list[float]] = {}
-        for row in rows:
-            if row["road"] == road:
-                by_driver.setdefault(row["driver"].rstrip(" 0123456789"), []).append(row[metric]["mean"])
-        table[road] = {"": road}
-        for driver, means in by_driver.items():
-            found = estimate(means)
-            text = f"{found.mean:.{digits}f}"
-            if found.count > 1:
-                text += f" [{min(means):.{digits}f}, {max(means):.{digits}f}]"
-            table[road][f"{driver} ({found.count} trainings)" if found.count > 1 else driver] = text
-    return pd.DataFrame(table.values())
 
 
 def commands() -> pd.DataFrame:

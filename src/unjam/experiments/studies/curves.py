@@ -17,8 +17,7 @@ from unjam.reports.statistics import estimate
 POINTS = 100
 """of a curve"""
 DRAWN = {"return_mean": "return, in training", "cav_mean_speed": "CAV's mean speed, in training [m/s]"}
-RATES = ("cav_mean_speed", "speed_std_cav")
-NAMES = (*DRAWN, "return_validation", "speed_std_cav")
+RETURNS, SPEEDS = ("return_mean", "return_validation"), ("cav_mean_speed", "speed_std_cav")
 
 
 def curves_of(pool: Pool, road: str, variants: Sequence[str], seeds: int) -> dict[str, Any]:
@@ -35,7 +34,7 @@ def curves_of(pool: Pool, road: str, variants: Sequence[str], seeds: int) -> dic
         last = min(run.progress[-1]["actual_steps"] for run in runs)
         grid = np.linspace(first, last, POINTS)
         found[variant] = {"steps": grid.round().tolist()}
-        for name in NAMES if comparable else RATES:
+        for name in (*RETURNS, *SPEEDS) if comparable else SPEEDS:
             found[variant][name] = [_on(grid, run.progress, name) for run in runs]
     return found
 

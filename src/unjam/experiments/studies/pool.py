@@ -1,6 +1,5 @@
 """What studies are made of, once it has been measured: trainings, and drivers that do not learn."""
 
-import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import ceil
@@ -10,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from unjam.controller.archive import WEIGHTS, unpack_parts
+from unjam.controller.file import hash_of
 from unjam.experiments.executors import Command
 from unjam.experiments.folder import read_config
 from unjam.experiments.judge import TRAINED
@@ -108,8 +108,7 @@ class Pool:
 
     def weights_sha256(self, run: PlannedRun) -> str:
         """Return the hash of a trained network: the same whichever unjam repeats the training."""
-        parts = unpack_parts(self.folder_of(run) / "controller.unjam")
-        return hashlib.sha256(parts[WEIGHTS]).hexdigest()
+        return hash_of(unpack_parts(self.folder_of(run) / "controller.unjam")[WEIGHTS])
 
     def results(self, run: PlannedRun) -> Results:
         """Return all that the folder of a training says, pictures included."""
