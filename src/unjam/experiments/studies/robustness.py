@@ -45,32 +45,51 @@ EVERYWHERE = (
     Condition("as in training"),
     Condition("twice the noise", {"noise": 0.4}),
     Condition("people of NGSIM", {"humans": PEOPLE}),
-    Condition("0.3 s late", impaired={"delay": 0.3}),
     Condition("gaps ± 0.5 m", impaired={"gap_noise": 0.5}),
 )
+LATE = Condition("0.3 s late", impaired={"delay": 0.3})
+RINGS = (
+    *EVERYWHERE,
+    LATE,
+    Condition("two CAVs", {"cavs": 2}),
+    Condition("one CAV in 44, 520 m", {"vehicles": 44, "length": [520, 520]}),
+    Condition("200 to 219 m", {"length": [200, 219]}),
+    Condition("271 to 300 m", {"length": [271, 300]}),
+)
 CONDITIONS: dict[str, tuple[Condition, ...]] = {
-    "ring": (
-        *EVERYWHERE,
-        Condition("two CAVs", {"cavs": 2}),
-        Condition("one CAV in 44, 520 m", {"vehicles": 44, "length": [520, 520]}),
-        Condition("200 to 219 m", {"length": [200, 219]}),
-        Condition("271 to 300 m", {"length": [271, 300]}),
-        Condition("after ten minutes of jam", {"warmup": 6000}),
-    ),
+    "ring": (*RINGS, Condition("after ten minutes of jam", {"warmup": 6000})),
+    "ring-jammed": (*RINGS, Condition("before there is a jam", {"warmup": 0})),
     "figure-eight": (
         *EVERYWHERE,
+        LATE,
         Condition("two CAVs", {"cavs": 2}),
         Condition("radius 30 m", {"radius": [30, 30]}),
         Condition("radius 36 to 38 m", {"radius": [36, 38]}),
         Condition("twice as long", {"horizon": 3000}),
     ),
+    "merge": (
+        *EVERYWHERE,
+        Condition("1 s late", impaired={"delay": 1.0}),  # it decides once in a second
+        Condition("a CAV in 20", {"penetration": 0.05}),
+        Condition("a CAV in 5", {"penetration": 0.2}),
+        Condition("1,800 veh/h", {"inflow": 1800}),
+        Condition("200 veh/h from the ramp", {"ramp_flow": 200}),
+    ),
 }
 CONTROLLERS = {
     "ring": PlannedRun("ring", "best", 0),
+    "ring-jammed": PlannedRun("ring-jammed", "best", 2),
     "figure-eight": PlannedRun("figure-eight", "ours", 0),
+    "merge": PlannedRun("merge", "ours", 0),
 }
 """the trainings whose controllers are shipped"""
-EXPERTS = {"ring": ("PI", "PI (paper)"), "figure-eight": ("gentle varying pacer", "PI (paper)")}
+EXPERTS = {
+    "ring": ("PI", "PI (paper)"),
+    "ring-jammed": ("PI", "PI (paper)"),
+    "figure-eight": ("gentle varying pacer", "PI (paper)"),
+    "merge": ("jam absorber", "PI (paper)"),
+}
+"""the shipped controller's own comes first"""
 
 
 def under_conditions(pool: Pool, road: str, processes: int, episodes: int = EPISODES) -> list[dict[str, Any]]:
@@ -106,5 +125,5 @@ ROBUSTNESS = Study(
     "the shipped controllers on roads, among people and with sensors that they have not trained with",
     lambda seeds: list(CONTROLLERS.values()),
     _write,
-    minutes=15.0,
+    minutes=40.0,
 )
