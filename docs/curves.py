@@ -1,4 +1,4 @@
-"""Learning curves with the virtual environment and without it, from files under results/model/."""
+"""Learning with the virtual environment and without it, from what `unjam reproduce table-2` made."""
 
 import json
 from io import BytesIO
@@ -7,48 +7,29 @@ import numpy as np
 import pandas as pd
 from IPython.display import Image
 from matplotlib.figure import Figure
-from tables import RESULTS, rows_of
+from studies import interval, rows_of
+from tables import RESULTS
 
-from unjam.reports.statistics import paired_difference
-
-CURVES = RESULTS / "model" / "curves"
-LABELS = {"with": "with the virtual environment", "without": "without"}
-COLOURS = {"with": "#2b6cb0", "without": "#e07a1f"}
-SEEDS = range(5)
+LABELS = {"ours": "with the virtual environment", "ours-without-model": "without"}
+COLOURS = {"ours": "#2b6cb0", "ours-without-model": "#e07a1f"}
 
 
-def progress(kind: str, seed: int) -> list[dict]:
-    """Return the rows of progress of a run."""
-    text = (CURVES / f"{kind}-{seed}" / "progress.jsonl").read_text()
-    return [json.loads(line) for line in text.splitlines()]
-
-
-def validations(kind: str) -> tuple[np.ndarray, np.ndarray]:
-    """Return actual steps, and the returns on the validation seeds, shape (runs, points)."""
-    curves = []
-    steps = np.zeros(0)
-    for seed in SEEDS:
-        rows = progress(kind, seed)
-        points = [(0, rows[0]["return_expert"])]
-        points += [
-            (row["actual_steps"], row["return_validation"])
-            for row in rows
-            if row["return_validation"] is not None
-        ]
-        steps, returns = np.array(points, float).T
-        curves.append(returns)
-    return steps, np.array(curves)
+def validations(variant: str) -> tuple[np.ndarray, np.ndarray]:
+    """Return actual steps, shape (points,), and the returns on the validation seeds, shape (runs, points)."""
+    curves = json.loads((RESULTS / "table-2" / "curves.json").read_text())["ring"][variant]
+    return np.array(curves["steps"]), np.array(curves["return_validation"])
 
 
 def draw() -> Image:
     """Draw validation against actual steps: mean and range of the runs."""
     figure = Figure(figsize=(9, 3.6), layout="constrained")
     axes = figure.subplots()
-    for kind, label in LABELS.items():
-        steps, curves = validations(kind)
-        axes.fill_between(steps / 1000, curves.min(0), curves.max(0), color=COLOURS[kind], alpha=0.15, lw=0)
-        axes.plot(steps / 1000, curves.mean(0), color=COLOURS[kind], label=label)
-    axes.axhline(curves[0, 0], color="#1f2933", lw=0.8, ls="--", label="expert")
+    for variant, label in LABELS.items():
+        steps, curves = validations(variant)
+        axes.fill_between(
+            steps / 1000, curves.min(0), curves.max(0), color=COLOURS[variant], alpha=0.15, lw=0
+        )
+        axes.plot(steps / 1000, curves.mean(0), color=COLOURS[variant], label=label)
     axes.set_xlabel("actual simulator steps [thousands]")
     axes.set_ylabel("return of an episode, validation")
     axes.legend(frameon=False)
@@ -59,36 +40,26 @@ def draw() -> Image:
     return Image(content.getvalue(), width=900)
 
 
-def reached(kind: str, level: float) -> list[float]:
-    """Return the actual steps after which each run's validation first reached `level`; NaN: never."""
-    steps, curves = validations(kind)
-    found = []
-    for curve in curves:
-        there = np.flatnonzero(curve >= level)
-        found.append(float(steps[there[0]]) if len(there) else float("nan"))
-    return found
-
-
 def judged() -> pd.DataFrame:
-    """Return a table of all runs: gain beyond the expert, steps to what runs without it reach on average."""
-    level = float(validations("without")[1].max(1).mean())
+    """Return what the trainings gain, each, and after how many steps they first reach a level.
+
+    The level is what runs without the virtual environment reach at best, on average.
+    """
+    rows = {row["variant"]: row for row in rows_of("table-2", "ring") if row["learns"]}
+    level = float(validations("ours-without-model")[1].max(1).mean())
     table = []
-    for kind, label in LABELS.items():
-        for seed, steps in zip(SEEDS, reached(kind, level), strict=True):
-            rows = rows_of(f"model/curves/{kind}-{seed}/evaluation.json")
-            gain = paired_difference(rows["trained"], rows["pi"], "return")
-            parts: dict[str, float] = {}
-            for row in progress(kind, seed):
-                for part, seconds in row["seconds"].items():
-                    parts[part] = parts.get(part, 0.0) + seconds
-            table.append(
-                {
-                    "": label,
-                    "training seed": seed,
-                    "beyond the expert": f"{gain.mean:+.0f} [{gain.low:+.0f}, {gain.high:+.0f}]",
-                    f"actual steps to {level:.0f}": "never" if np.isnan(steps) else f"{steps:,.0f}",
-                    "wall time [s]": f"{sum(parts.values()):.0f}",
-                    "of it fit and imagine": f"{parts.get('fit', 0) + parts.get('imagine', 0):.0f}",
-                }
-            )
+    for variant, label in LABELS.items():
+        steps, curves = validations(variant)
+        there = [int(steps[np.argmax(curve >= level)]) for curve in curves if curve.max() >= level]
+        row = rows[variant]
+        table.append(
+            {
+                "": label,
+                "trainings": len(curves),
+                "beyond the best expert": interval(row["beyond_best_expert"], 0, "+"),
+                "each": ", ".join(f"{gain:+.0f}" for gain in row["gains"]),
+                f"reach {level:.0f}": f"{len(there)} of {len(curves)}",
+                "after actual steps": ", ".join(f"{count:,}" for count in sorted(there)),
+            }
+        )
     return pd.DataFrame(table)

@@ -52,12 +52,17 @@ OF_THE_RING += ("smallest headway [s]", "collisions")
 OF_THE_JAMMED = (*OF_THE_RING[:3], "wave dissolved after [s]", *OF_THE_RING[3:])
 OF_THE_EIGHT = ("return", "return, Eq. 16", "mean speed [m/s]", "steady [m/s]", "std across vehicles [m/s]")
 OF_THE_EIGHT += ("collisions",)
+OF_THE_MERGE = ("return", "mean speed [m/s]", "steady [m/s]", "leave [veh/h]", "wait [veh]", "collisions")
 
 
-def honest(study: str, road: str, columns: tuple[str, ...] = OF_THE_RING) -> pd.DataFrame:
-    """Return a table in the honest convention."""
+def honest(
+    study: str, road: str, columns: tuple[str, ...] = OF_THE_RING, names: tuple[str, ...] = ()
+) -> pd.DataFrame:
+    """Return a table in the honest convention, of the drivers of these names or of all."""
     table = []
     for row in rows_of(study, road):
+        if names and row["name"] not in names:
+            continue
         beyond, better = row.get("beyond_best_expert"), row.get("probability_of_improvement")
         cells = {
             "": f"{row['name']}{' (best expert)' if row.get('best_expert') else ''}",
@@ -110,6 +115,27 @@ def merge_capacity() -> pd.DataFrame:
         table.insert(0, "start", f"{standing} standing" if standing else "empty")
         tables.append(table)
     return pd.concat(tables)
+
+
+def carried_over() -> pd.DataFrame:
+    """Return the mean speed by driver and traffic; those that learn did so among 22 vehicles."""
+    rows = json.loads((RESULTS / "figure-10" / "carried-over.json").read_text())
+    means: dict[str, dict[str, list[float]]] = {}
+    for row in rows:
+        by_driver = means.setdefault(row["road"], {})
+        by_driver.setdefault(row["driver"].rstrip(" 0123456789"), []).append(row["mean_speed"]["mean"])
+    return pd.DataFrame(
+        [
+            {"": road, **{driver: over_trainings(found) for driver, found in by_driver.items()}}
+            for road, by_driver in means.items()
+        ]
+    )
+
+
+def over_trainings(means: list[float]) -> str:
+    """Return the mean of a number over trainings, with the smallest and the largest."""
+    text = f"{sum(means) / len(means):.2f}"
+    return text if len(means) == 1 else unbroken(f"{text} [{min(means):.2f}, {max(means):.2f}]")
 
 
 def training_time() -> pd.DataFrame:
