@@ -68,6 +68,7 @@ def test_a_run_that_was_not_evaluated_yet_has_no_metrics(run: Path, tmp_path: Pa
     assert manifest_of(export_controller(tmp_path, tmp_path / "it.unjam").file)["metrics"] is None
 
 
+@pytest.mark.slow
 def test_a_driver_by_itself_gets_step_and_bounds_of_its_road(tmp_path: Path) -> None:
     done = export_controller("pi:window=30", tmp_path / "pi.unjam", scenario="merge")
     assert load_controller(done.file) == PISaturation(window=30, time_step=1.0)

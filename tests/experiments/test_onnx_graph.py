@@ -86,6 +86,7 @@ def test_policy_driver_and_graph_agree_on_a_whole_episode_of_the_ring(simulation
     agree(driver, stay)
 
 
+@pytest.mark.slow
 def test_policy_driver_and_graph_of_sac_agree_where_vehicles_come_and_go(simulation: Simulation) -> None:
     expert = FollowerStopper(time_step=1.0)
     policy = make_squashed_policy(inputs=observation_size(PARTS, expert))
@@ -101,6 +102,7 @@ def test_policy_driver_and_graph_of_sac_agree_where_vehicles_come_and_go(simulat
     agree(driver, stay)
 
 
+@pytest.mark.slow
 def test_driver_and_graph_agree_where_the_place_on_the_road_counts(simulation: Simulation) -> None:
     driver = residual(Pacer(harmonics=(7, -0.8, 0.7, -1.3, 0.7), gathering_gap=0.1), hold=3)
     agree(driver, longest_stay(make_scenario("figure-eight", {"horizon": 400}), driver, simulation))

@@ -167,7 +167,8 @@ def test_a_run_that_was_stopped_ends_as_if_it_had_not_been(
     assert outcome(folder) == outcome(uninterrupted)
 
 
-@pytest.mark.parametrize("agent", [pytest.param("ppo", marks=pytest.mark.slow), "sac"])
+@pytest.mark.slow
+@pytest.mark.parametrize("agent", ["ppo", "sac"])
 def test_a_run_of_any_learner_ends_as_if_it_had_not_been_stopped(
     tmp_path: Path, agent: str, learn: Learn
 ) -> None:

@@ -144,6 +144,7 @@ def test_the_report_shows_the_run(trained: Trained) -> None:
     assert len(page) > 20_000
 
 
+@pytest.mark.slow
 def test_a_finished_run_goes_on_with_a_larger_budget(trained: Trained, tmp_path: Path) -> None:
     folder, longer = tmp_path / "run", replace(trained.config, steps=3 * STEPS)
     shutil.copytree(trained.result.folder, folder)

@@ -136,7 +136,12 @@ class Opener:
 
 @pytest.mark.parametrize("size", [LAPTOP, PHONE], ids=["laptop", "phone"])
 @pytest.mark.parametrize(
-    ("report", "pictures"), [pytest.param("driven", 2, marks=pytest.mark.slow), ("merged", 2), ("trained", 7)]
+    ("report", "pictures"),
+    [
+        pytest.param("driven", 2, marks=pytest.mark.slow),
+        pytest.param("merged", 2, marks=pytest.mark.slow),
+        ("trained", 7),
+    ],
 )
 def test_every_picture_is_there(
     open_page: Opener, request: pytest.FixtureRequest, report: str, pictures: int, size: tuple[int, int]

@@ -168,13 +168,6 @@ def test_doctor_names_what_is_missing(unjam: Run, tmp_path: Path) -> None:
     assert "missing an episode in a worker: libsumo cannot be imported (gone)" in ran.stdout
 
 
-def test_window_without_a_display_is_code_3(unjam: Run) -> None:
-    ran = unjam("watch", "ring", "--driver", "pi", environment={"DISPLAY": ""})
-    assert ran.returncode == 3
-    assert one_line(ran.stderr)
-    assert "--video" in ran.stderr
-
-
 def test_disk_that_fills_up_is_code_74(unjam: Run, tmp_path: Path) -> None:
     def little_space() -> None:
         resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
@@ -187,6 +180,7 @@ def test_disk_that_fills_up_is_code_74(unjam: Run, tmp_path: Path) -> None:
     assert not list((tmp_path / "new").rglob("*.part"))
 
 
+@pytest.mark.slow
 def test_cache_that_cannot_be_written_is_code_74(unjam: Run, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     ran = unjam("drive", "ring", "--driver", "pi", environment={"UNJAM_CACHE": str(tmp_path / "file")})

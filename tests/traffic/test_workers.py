@@ -232,6 +232,7 @@ def test_an_idle_worker_that_is_lost_is_replaced(workers: Workers) -> None:
     assert not is_running(process)
 
 
+@pytest.mark.slow
 def test_a_worker_stopped_while_idle_is_noticed_also_by_a_task_larger_than_the_pipe() -> None:
     large = ResidualDriver(IDM(), random_network(size=200), 1.0)
     with Workers(1, silence=3.0) as workers, ThreadPoolExecutor(1) as thread:
