@@ -16,7 +16,7 @@ ABLATION = (
     *("trpo", "mb-trpo", "no-initial-policy", "without-model", "proposed"),
     *("ours-without-model", "ours"),
 )
-FRAMEWORK = ("ppo", "sac", "proposed-ppo", "proposed-sac", "proposed")
+FRAMEWORK = ("ppo", "sac", "proposed-ppo", "proposed-sac", "proposed", "without-model")
 
 
 def _write(
