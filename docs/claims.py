@@ -61,13 +61,6 @@ def together(verdicts: list[str]) -> str:
     return next((word for word in ("not held", "undecided") if word in verdicts), "held")
 
 
-def best_on(road: str) -> Claim:
-    """Is the paper's method better than TRPO, PPO and SAC, with its settings?"""
-    words, rows = f"best of all learners on {road}", table(f"table-1-{road}", road)
-    numbers = ", ".join(f"{name} {of(rows, name):.0f}" for name in ("proposed", *OTHERS))
-    return words, earns_more(rows, "proposed", *OTHERS), f"return, held-out: {numbers}"
-
-
 def earns_more(rows: dict[str, dict[str, Any]], name: str, *others: str) -> str:
     """Say whether one earns more than all others, trainings of the same seed paired, 95 % interval."""
     gain = {one: np.array(rows[one]["gains"]) for one in (name, *others)}
@@ -80,6 +73,13 @@ def earns_more(rows: dict[str, dict[str, Any]], name: str, *others: str) -> str:
 def largest(values: dict[str, float]) -> str:
     """Return the name of the largest value."""
     return max(values, key=values.__getitem__)
+
+
+def best_on(road: str) -> Claim:
+    """Is the paper's method better than TRPO, PPO and SAC, with its settings?"""
+    words, rows = f"best of all learners on {road}", table(f"table-1-{road}", road)
+    numbers = ", ".join(f"{name} {of(rows, name):.0f}" for name in ("proposed", *OTHERS))
+    return words, earns_more(rows, "proposed", *OTHERS), f"return, held-out: {numbers}"
 
 
 def fastest_on(road: str) -> Claim:

@@ -178,6 +178,8 @@ def test_train_go_on_drive_and_export(unjam: Run, tmp_path: Path) -> None:
     shipped = document(unjam("export", "run", "--to", "ring.unjam", "--json"))
     assert shipped == {"file": "ring.unjam", "onnx": None, "driver": "pi + residual", "decisions": 80}
     assert document(unjam("verify", "ring.unjam", "--json"))["verified"].keys() >= {"weights", "sample"}
+    assert "ok sample: 80 decisions" in unjam("verify", "ring.unjam").stdout
+    assert "ring.unjam: " in unjam("export", "run", "--to", "ring.unjam").stdout
     again = document(unjam("drive", "ring", "--driver", "ring.unjam", *SMALL, "-n", 1, "--json"))
     assert again["mean"] == driven["mean"]
 
@@ -191,9 +193,6 @@ def test_a_trained_run_is_explained_compared_judged_anew_and_an_expert(unjam: Ru
     assert "leader's speed" in table
     assert "bound C" in table
     assert "The virtual environment" in (tmp_path / "run" / "report.html").read_text()
-
-    assert "ring.unjam: " in unjam("export", "run", "--to", "ring.unjam").stdout
-    assert "ok sample: 80 decisions" in unjam("verify", "ring.unjam").stdout
 
     on_top = document(
         unjam(*TINY_RUN, "--steps", 160, "--expert", "run/controller.unjam", "--out", "second", "--json")
