@@ -19,6 +19,9 @@ demo: $(VENV)/.installed
 # The tests of a file share what they have made
 SPREAD := -n 2 --dist loadfile --no-loadscope-reorder
 
+# The suite starts hundreds of interpreters; each finds what another has compiled
+test test-all coverage: export PYTHONDONTWRITEBYTECODE =
+
 test: $(VENV)/.installed-dev
 	$(BIN)/python -m pytest $(SPREAD) -m "not slow"
 

@@ -2,6 +2,7 @@
 
 import itertools
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -34,10 +35,19 @@ def simulation() -> Iterator[Simulation]:
         yield opened
 
 
-@pytest.fixture
-def without_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+@contextmanager
+def empty_pictures() -> Iterator[None]:
     """Leave the pictures of reports empty: drawing them takes five seconds, and few tests look at them."""
-    monkeypatch.setattr("unjam.reports.html.data_uri", lambda figure, kind: f"data:image/{kind};base64,")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("unjam.reports.html.data_uri", lambda figure, kind: f"data:image/{kind};base64,")
+        yield
+
+
+@pytest.fixture
+def without_pictures() -> Iterator[None]:
+    """For a test whose reports need no pictures."""
+    with empty_pictures():
+        yield
 
 
 @pytest.fixture

@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tests.conftest import empty_pictures
 from unjam.controller import load_controller
 from unjam.controller.archive import GRAPH, MANIFEST, SAMPLE, WEIGHTS, unpack_parts
 from unjam.controller.sample import read_sample
@@ -23,7 +24,8 @@ def manifest_of(path: Path) -> dict[str, Any]:
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("runs") / "run"
-    train(small_config(steps=300, virtual__virtual_ratio=0.0), folder)
+    with empty_pictures():
+        train(small_config(steps=300, virtual__virtual_ratio=0.0), folder)
     return folder
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from tests.conftest import empty_pictures
 from unjam.controller import load_controller
 from unjam.drivers import ResidualDriver
 from unjam.drivers.constant import Constant
@@ -25,7 +26,7 @@ from unjam.traffic.workers import Workers
 
 from .test_run import STEPS, learn_with, outcome, small_config
 
-pytestmark = pytest.mark.usefixtures("without_pictures")  # but for those of the run that all share
+pytestmark = pytest.mark.usefixtures("without_pictures")
 
 CONTENT = {
     "checkpoint",
@@ -54,9 +55,10 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Trained:
     folder, config = tmp_path_factory.mktemp("runs") / "finished", small_config()
     told: list[dict[str, Any]] = []
     judged: list[tuple[tuple[str, int], int]] = []
-    result = train(
-        config, folder, told=told.append, progress=lambda episode, steps: judged.append((episode, steps))
-    )
+    with empty_pictures():
+        result = train(
+            config, folder, told=told.append, progress=lambda episode, steps: judged.append((episode, steps))
+        )
     return Trained(config, result, told, judged)
 
 

@@ -319,6 +319,7 @@ def test_results_in_which_every_episode_failed_still_have_a_page(tmp_path: Path)
     assert not re.search(r"\bnan\b", text)
 
 
+@pytest.mark.usefixtures("without_pictures")
 def test_a_run_with_a_virtual_environment_shows_it(tmp_path: Path, written: tuple[str, Page]) -> None:
     folder = run_in(tmp_path / "virtual")
     (folder / "progress.jsonl").write_text("".join(to_json(row) + "\n" for row in progress_of()))

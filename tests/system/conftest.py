@@ -12,6 +12,7 @@ import pytest
 
 Run = Callable[..., subprocess.CompletedProcess[str]]
 
+ROOT = Path(__file__).parents[2]
 UNJAM = Path(sys.executable).with_name("unjam")
 PLAIN = {"NO_COLOR": "1"}
 
@@ -20,9 +21,9 @@ PLAIN = {"NO_COLOR": "1"}
 def warm(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Run]:
     """Runs `unjam` in a folder, in a process of its own that need not import torch again."""
     place = tmp_path_factory.mktemp("warm")
-    server = Path(__file__).with_name("warm.py")
     with subprocess.Popen(
-        [sys.executable, str(server)],
+        [sys.executable, "-m", "tests.system.warm"],
+        cwd=ROOT,
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         text=True,
@@ -31,10 +32,10 @@ def warm(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Run]:
         assert process.stdin is not None
         assert process.stdout is not None
 
-        def run(*arguments: str, folder: Path) -> subprocess.CompletedProcess[str]:
+        def run(*arguments: str, folder: Path, pictures: bool) -> subprocess.CompletedProcess[str]:
             out, errors = place / "out", place / "errors"
             request = {"arguments": arguments, "folder": str(folder), "out": str(out), "errors": str(errors)}
-            print(json.dumps(request), file=process.stdin, flush=True)
+            print(json.dumps({**request, "pictures": pictures}), file=process.stdin, flush=True)
             assert process.stdout is not None
             code = int(process.stdout.readline())
             return subprocess.CompletedProcess(arguments, code, out.read_text(), errors.read_text())
@@ -45,14 +46,20 @@ def warm(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Run]:
 
 @pytest.fixture
 def unjam(tmp_path: Path, warm: Run) -> Run:
-    """Runs `unjam` with arguments in an empty folder; as a new process where its surroundings differ."""
+    """Runs `unjam` with arguments in an empty folder; as a new process where its surroundings differ.
+
+    Without `pictures` those of a report are left empty, where nobody looks at them.
+    """
 
     def run(
-        *arguments: object, environment: Mapping[str, str] | None = None, **options: Any
+        *arguments: object,
+        environment: Mapping[str, str] | None = None,
+        pictures: bool = True,
+        **options: Any,
     ) -> subprocess.CompletedProcess[str]:
         words = [str(argument) for argument in arguments]
         if environment is None and not options:
-            return warm(*words, folder=tmp_path)
+            return warm(*words, folder=tmp_path, pictures=pictures)
         return subprocess.run(
             [UNJAM, *words],
             cwd=tmp_path,

@@ -53,7 +53,8 @@ def document(ran: subprocess.CompletedProcess[str]) -> Any:
 
 
 def test_drive_prints_one_json_document(unjam: Run) -> None:
-    found = document(unjam("drive", "ring", "--driver", "pi", "--episodes", 2, "--seed", 7, *SMALL, "--json"))
+    command = ("drive", "ring", "--driver", "pi", "--episodes", 2, "--seed", 7, *SMALL, "--json")
+    found = document(unjam(*command, pictures=False))
     assert (found["scenario"], found["driver"]) == ("ring", "pi")
     assert [row["seed"] for row in found["episodes"]] == [7, 8]
     for row in found["episodes"]:
@@ -77,10 +78,11 @@ def test_drive_prints_a_table_and_the_path_of_a_report(unjam: Run, tmp_path: Pat
 
 def test_drive_counts_up_its_folders(unjam: Run, tmp_path: Path) -> None:
     (tmp_path / "runs" / "drive-ring-001").mkdir(parents=True)
-    assert unjam("drive", "ring", "--driver", "pi", "-n", 1, *SMALL).returncode == 0
+    assert unjam("drive", "ring", "--driver", "pi", "-n", 1, *SMALL, pictures=False).returncode == 0
     assert sorted(path.name for path in (tmp_path / "runs").iterdir()) == ["drive-ring-001", "drive-ring-002"]
 
 
+@pytest.mark.slow
 def test_drive_does_not_depend_on_the_number_of_workers(unjam: Run) -> None:
     one, two = (
         unjam("drive", "ring", "-d", "pi", "-n", 3, *SMALL, "--no-report", "--json", "--workers", workers)
@@ -90,9 +92,8 @@ def test_drive_does_not_depend_on_the_number_of_workers(unjam: Run) -> None:
 
 
 def test_drive_with_the_users_own_driver_and_reward(unjam: Run, my_drivers: Path) -> None:
-    found = document(
-        unjam("drive", "ring", "-d", "mine.py:gentle", "--reward", "mine.py:calm", "-n", 1, *SMALL, "--json")
-    )
+    command = ("drive", "ring", "-d", "mine.py:gentle", "--reward", "mine.py:calm", "-n", 1, *SMALL, "--json")
+    found = document(unjam(*command, pictures=False))
     assert found["driver"] == "mine.py:gentle"
     assert found["mean"]["return"] > 0
 
@@ -113,7 +114,7 @@ def test_drive_on_the_merge_tells_of_flow_and_backlog(unjam: Run, tmp_path: Path
 def test_drive_on_your_own_network(unjam: Run, tmp_path: Path) -> None:
     file = game(tmp_path, "ramp").name
     common = ["-n", 1, "--set", "horizon=150", "--json"]
-    share = document(unjam("drive", file, "--cav-share", "0.3", "--driver", "pi", *common))
+    share = document(unjam("drive", file, "--cav-share", "0.3", "--driver", "pi", *common, pictures=False))
     assert (share["scenario"], share["episodes"][0]["status"]) == (file, "completed")
     assert share["mean"]["mean_speed"] > 5
     assert (tmp_path / share["report"]).is_file()
@@ -124,7 +125,8 @@ def test_drive_on_your_own_network(unjam: Run, tmp_path: Path) -> None:
 
 
 def test_an_episode_that_fails_keeps_the_others(unjam: Run, my_drivers: Path) -> None:
-    ran = unjam("drive", "ring", "-d", "pi", "-d", "mine.py:broken", "-n", 1, *SMALL, "--json")
+    command = ("drive", "ring", "-d", "pi", "-d", "mine.py:broken", "-n", 1, *SMALL, "--json")
+    ran = unjam(*command, pictures=False)
     assert ran.returncode == 2
     pi, broken = json.loads(ran.stdout)["drivers"]
     assert pi["episodes"][0]["status"] == "completed"
@@ -160,7 +162,7 @@ def test_doctor_finds_everything_here(unjam: Run) -> None:
 
 
 def test_train_go_on_drive_and_export(unjam: Run, tmp_path: Path) -> None:
-    trained = document(unjam(*TINY_RUN, "--steps", 320, "--out", "run", "--json"))
+    trained = document(unjam(*TINY_RUN, "--steps", 320, "--out", "run", "--json", pictures=False))
     run = tmp_path / "run"
     assert {"human", "pi", "trained"} == set(trained["drivers"])
     progress = [json.loads(line) for line in (run / "progress.jsonl").read_text().splitlines()]
@@ -172,7 +174,7 @@ def test_train_go_on_drive_and_export(unjam: Run, tmp_path: Path) -> None:
     assert [row["actual_steps"] for row in progress] == [160, 320, 480]
 
     assert "A trained residual on pi".lower() in (run / "report.html").read_text().lower()
-    driven = document(unjam("drive", "ring", "--driver", "run", *SMALL, "-n", 1, "--json"))
+    driven = document(unjam("drive", "ring", "--driver", "run", *SMALL, "-n", 1, "--json", pictures=False))
     assert driven["episodes"][0]["status"] == "completed"
 
     shipped = document(unjam("export", "run", "--to", "ring.unjam", "--json"))
@@ -180,7 +182,8 @@ def test_train_go_on_drive_and_export(unjam: Run, tmp_path: Path) -> None:
     assert document(unjam("verify", "ring.unjam", "--json"))["verified"].keys() >= {"weights", "sample"}
     assert "ok sample: 80 decisions" in unjam("verify", "ring.unjam").stdout
     assert "ring.unjam: " in unjam("export", "run", "--to", "ring.unjam").stdout
-    again = document(unjam("drive", "ring", "--driver", "ring.unjam", *SMALL, "-n", 1, "--json"))
+    drive = ("drive", "ring", "--driver", "ring.unjam", *SMALL, "-n", 1, "--json")
+    again = document(unjam(*drive, pictures=False))
     assert again["mean"] == driven["mean"]
 
 
@@ -256,15 +259,9 @@ def test_version(unjam: Run) -> None:
     assert unjam("--version").stdout.strip() == f"unjam {package.__version__}"
 
 
-def slowly(road: str) -> Any:
-    return pytest.param(road, marks=pytest.mark.slow)
-
-
-@pytest.mark.parametrize(
-    ("sign", "code"),
-    [pytest.param(signal.SIGINT, 130, marks=pytest.mark.slow), (signal.SIGTERM, 143)],
-)
-@pytest.mark.parametrize("road", ["ring", slowly("figure-eight"), slowly("merge"), slowly("own-network")])
+@pytest.mark.slow
+@pytest.mark.parametrize(("sign", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+@pytest.mark.parametrize("road", ["ring", "figure-eight", "merge", "own-network"])
 def test_a_stopped_run_leaves_no_process_and_can_go_on(
     sign: signal.Signals, code: int, road: str, unjam: Run, tmp_path: Path
 ) -> None:

@@ -9,6 +9,7 @@ import os
 import signal
 import sys
 import traceback
+from contextlib import nullcontext
 
 import torch._dynamo  # noqa: F401  # what the first optimiser of a process imports
 
@@ -17,13 +18,14 @@ import unjam.cli.output
 import unjam.experiments.drive
 import unjam.experiments.model_facts
 import unjam.experiments.train
+from tests.conftest import empty_pictures
 
 LONGEST = 300
 """[s]"""
 
 
-def run(arguments: list[str], folder: str, out: str, errors: str) -> None:
-    """Become `unjam` with these arguments; never returns."""
+def run(arguments: list[str], folder: str, out: str, errors: str, pictures: bool) -> None:
+    """Become `unjam` with these arguments, its reports with pictures or empty ones; never returns."""
     signal.alarm(LONGEST)
     os.chdir(folder)
     for path, stream in ((out, 1), (errors, 2)):
@@ -33,7 +35,8 @@ def run(arguments: list[str], folder: str, out: str, errors: str) -> None:
     sys.path[0] = str(os.path.dirname(sys.executable))
     code = 1
     try:
-        unjam.cli.main()
+        with nullcontext() if pictures else empty_pictures():
+            unjam.cli.main()
     except SystemExit as end:
         code = end.code if isinstance(end.code, int) else int(end.code is not None)
     except BaseException:

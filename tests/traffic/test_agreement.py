@@ -104,7 +104,8 @@ def test_human_rings_agree_with_flow(human_rings: tuple[int, list[Episode]]) -> 
     assert abs(found.std - flow.std) < 0.05 * flow.mean + spread.std / np.sqrt(FLOW_SEEDS)
 
 
-@pytest.mark.parametrize("length", [230, slowly(260)])
+@pytest.mark.slow
+@pytest.mark.parametrize("length", [230, 260])
 def test_rings_with_the_papers_pi_agree_with_flow(length: int, workers: Workers) -> None:
     flow = FLOW_PI[length]
     found, _ = measured(run(workers, ring_warm(length), PISaturation(time_constant=0), range(8)))

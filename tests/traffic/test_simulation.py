@@ -152,7 +152,7 @@ def test_an_error_names_its_own_reason_and_not_an_earlier_one(
         assert not any(other in str(caught.value) for other in others)
 
 
-@pytest.mark.parametrize("backend", ["libsumo", "traci"])
+@pytest.mark.parametrize("backend", ["libsumo", pytest.param("traci", marks=pytest.mark.slow)])
 def test_after_a_refused_road_the_next_one_runs_as_in_a_new_simulation(
     backend: Backend, road: ClosedRoad
 ) -> None:
