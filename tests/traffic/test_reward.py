@@ -154,6 +154,26 @@ def test_tensors_earn_what_arrays_earn(outcome: Outcome, name: str) -> None:
         np.testing.assert_allclose(values.numpy(), expected[term], rtol=0, atol=1e-9)
 
 
+@given(outcomes())
+def test_power_is_flow_times_mean_speed_in_units_of_thirty_vehicles_at_twenty(outcome: Outcome) -> None:
+    for numbers in (outcome, Outcome(*(torch.from_numpy(values) for values in outcome))):
+        terms = REWARDS["power"](numbers)
+        for row, crashed in enumerate(outcome.crashed):
+            speeds = there(outcome.speeds[row])
+            expected = 0.0 if crashed else sum(speeds) / 600.0 * mean(speeds) / 20.0
+            assert float(total(terms)[row]) == pytest.approx(expected, abs=1e-9)
+
+
+def test_power_prefers_free_flow_to_a_jam_of_the_same_flow_and_to_an_empty_road() -> None:
+    free, jammed, empty = (
+        float(total(REWARDS["power"](one(speeds, [0.0])))[0])
+        for speeds in ([20.0] * 30, [10.0] * 60, [20.0] * 3)
+    )
+    assert free == pytest.approx(1.0)
+    assert jammed == pytest.approx(0.5)
+    assert empty == pytest.approx(0.1)
+
+
 def test_a_headway_is_gap_over_speed_and_very_long_for_a_standing_vehicle() -> None:
     gaps, speeds = np.array([10.0, 10.0, 3.0, 0.0]), np.array([5.0, 0.0, 1e-12, 2.0])
     np.testing.assert_allclose(time_headway(gaps, speeds), [2.0, 1e4, 3e3, 0.0])
@@ -162,7 +182,7 @@ def test_a_headway_is_gap_over_speed_and_very_long_for_a_standing_vehicle() -> N
 
 
 def test_rewards_are_found_by_name() -> None:
-    assert set(REWARDS) == {"released", "released-merge", "eq16", "eq16-as-printed"}
+    assert set(REWARDS) == {"released", "released-merge", "eq16", "eq16-as-printed", "power"}
     assert make_reward("released") is released
 
 
@@ -214,6 +234,6 @@ def test_what_ones_own_reward_raises_is_told_with_its_line(tmp_path: Path) -> No
 
 @pytest.mark.parametrize("name", ["fame", "", "Released", "released "])
 def test_an_unknown_reward_lists_the_known(name: str) -> None:
-    known = "released, released-merge, eq16, eq16-as-printed, path.py:name"
+    known = "released, released-merge, eq16, eq16-as-printed, power, path.py:name"
     with pytest.raises(InputError, match=f"reward: {name!r} is not allowed; allowed: {known}"):
         make_reward(name)

@@ -16,7 +16,9 @@ LONGEST_PENALISED_HEADWAY = 1.0
 MOBILITY_WEIGHT, HEADWAY_WEIGHT, ACCELERATION_WEIGHT = 1.0, 0.1, 0.1
 """alpha, beta, gamma of Eq. 16"""
 MERGE_SPEED = 20.0
-"""speed that the merge's reward wants [m/s]"""
+"""speed that the merge's reward wants, and the scale of speeds in power [m/s]"""
+MERGE_VEHICLES = 30.0
+"""scale of how many are on the road in power: about as many as on the merge in free flow"""
 STANDING = 1e-3
 """speed below which a time headway means nothing [m/s]"""
 
@@ -102,11 +104,22 @@ def released_merge(outcome: Outcome) -> dict[str, Array]:
     return {"speed": speed, "headway": headway, "floor": at_least(-speed - headway, 0.0)}
 
 
+def power(outcome: Outcome) -> dict[str, Array]:
+    """Reward flow and speed at once: the distance that all cover, times their mean speed; 0 at a crash.
+
+    About 1 where the merge flows freely. Neither a jam that lets many through nor an empty road earns it.
+    Source: throughput over delay, the power of Kleinrock 1979 (IEEE ICC, 43.1), in vehicles.
+    """
+    flow = _sum(outcome.speeds) / (MERGE_SPEED * MERGE_VEHICLES)
+    return {"power": flow * _mean(outcome.speeds) / MERGE_SPEED * ~outcome.crashed}
+
+
 REWARDS: dict[str, Reward] = {
     "released": released,
     "released-merge": released_merge,
     "eq16": eq16,
     "eq16-as-printed": eq16_as_printed,
+    "power": power,
 }
 
 

@@ -15,7 +15,7 @@ from unjam.reports.statistics import estimate
 from unjam.traffic.workers import Workers
 
 VOLUMES = ("ring-5", "ring-11", "ring")
-LEARNERS = ("trpo", "ppo", "sac", "proposed", "ours")
+LEARNERS = ("trpo", "ppo", "sac", "without-model", "proposed", "ours")
 CARRIED = ("proposed", "ours")
 TRAINED_ON = "ring"
 OTHER_ROADS: dict[str, dict[str, Any]] = {
