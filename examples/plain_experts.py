@@ -120,7 +120,7 @@ def jam_absorber(p: Any, s: State, m: Any) -> float:
     gone = (gap >= p.room and ahead >= p.going_speed) or gap >= 99.0
     m.features = (float(waits and not gone and not place > p.last_position + 50.0),)
     excess = gap - p.standstill_gap - p.time_gap * s.speed
-    follow = p.gap_gain * excess + p.speed_gain * (ahead - s.speed)
+    follow = p.gap_gain * excess + p.speed_gain * (ahead - s.speed) + getattr(p, "push", 0.0)
     return min(p.crawling_speed - s.speed, follow) if m.features[0] else follow
 
 

@@ -44,3 +44,16 @@ def test_it_begins_to_wait_within_its_stretch_alone_and_ends_beyond_it() -> None
 def test_who_has_nobody_ahead_does_not_wait() -> None:
     _, memory = JamAbsorber().act(before(-400.0, 8.0, 8.0, 100.0), {"waits": np.ones(1)})
     assert memory["waits"] == 0.0
+
+
+def test_with_a_push_and_no_wanted_gap_it_closes_up_unless_its_leader_is_slower() -> None:
+    driver = JamAbsorber(gap_gain=0, push=0.9, speed_gain=0.8)
+    for leader_speed, gap, expected in [
+        (20.0, 60.0, 0.9),
+        (20.0, 3.0, 0.9),
+        (19.0, 3.0, 0.1),
+        (17.0, 60.0, -1.5),
+    ]:
+        found, memory = driver.act(before(-400.0, 20.0, leader_speed, gap), driver.initial_memory(1))
+        np.testing.assert_allclose(found, expected)
+        assert memory["waits"] == 0.0

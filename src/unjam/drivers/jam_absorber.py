@@ -52,6 +52,8 @@ class JamAbsorber(Driver):
     """wanted gap over own speed [s]"""
     standstill_gap: NotNegative = 4.0
     """wanted gap of a standing vehicle [m]"""
+    push: NotNegative = 0.0
+    """acceleration besides [m/s2]; without a `gap_gain` it so closes up as far as the shield lets it"""
 
     def initial_memory(self, n: int) -> Memory:
         """Return that nobody waits."""
@@ -68,7 +70,7 @@ class JamAbsorber(Driver):
         too_far = place > self.last_position + OVERRUN
         waits = xp.where(gone | too_far, zero, waits)
         excess = gap - self.standstill_gap - self.time_gap * state.speed
-        follow = self.gap_gain * excess + self.speed_gain * (ahead - state.speed)
+        follow = self.gap_gain * excess + self.speed_gain * (ahead - state.speed) + self.push
         crawl = xp.minimum(self.crawling_speed - state.speed, follow)
         return xp.where(waits > 0.0, crawl, follow), {"waits": waits}
 
