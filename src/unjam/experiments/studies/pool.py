@@ -33,6 +33,7 @@ REFERENCES: dict[str, str] = {
     "varying pacer": "pacer:varying=true",
     "gentle varying pacer": "pacer:varying=true,time_constant=1",
     "jam absorber": "jam-absorber",
+    "closing jam absorber": "jam-absorber:gap_gain=0,push=0.9,speed_gain=0.8",
 }
 """drivers that do not learn, beside those that do: label and how `unjam drive` names them"""
 EXPERTS = tuple(label for label in REFERENCES if label not in ("human", "zero", "constant +0.1"))

@@ -87,7 +87,7 @@ EXPERTS = {
     "ring": ("PI", "PI (paper)"),
     "ring-jammed": ("PI", "PI (paper)"),
     "figure-eight": ("gentle varying pacer", "PI (paper)"),
-    "merge": ("jam absorber", "PI (paper)"),
+    "merge": ("closing jam absorber", "jam absorber", "PI (paper)"),
 }
 """the shipped controller's own comes first"""
 
