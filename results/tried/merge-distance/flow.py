@@ -1,4 +1,5 @@
 """The reward of this training: `unjam train merge --reward flow.py:distance`."""
+
 import numpy as np
 
 
