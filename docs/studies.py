@@ -6,10 +6,13 @@ from typing import Any
 
 import pandas as pd
 from tables import RESULTS, metrics_of
+from tables import rows_of as rows_of_file
 
 from unjam.experiments.studies.plan import VARIANTS
 from unjam.experiments.studies.pool import REFERENCES
 
+FREE = 15.0
+"""mean speed of an episode on the merge in which no jam stayed [m/s]"""
 PAPER = {"reward": "return", "speed": "CAV's speed [m/s]", "std": "its std [m/s]"}
 
 
@@ -115,6 +118,18 @@ def merge_capacity() -> pd.DataFrame:
         table.insert(0, "start", f"{standing} standing" if standing else "empty")
         tables.append(table)
     return pd.concat(tables)
+
+
+def closing_absorber() -> pd.DataFrame:
+    """Return what closing up is worth to the jam absorber, and in how many episodes no jam stays."""
+    names = ("return", "mean_speed", "mean_speed_steady", "throughput_veh_per_h", "backlog_veh")
+    table = metrics_of("tried/merge-closing.json", names)
+    free = {
+        driver: sum(row["mean_speed"] > FREE for row in rows)
+        for driver, rows in rows_of_file("tried/merge-closing.json").items()
+    }
+    table["without a jam"] = [f"{free[driver]} of 20" for driver in table.index]
+    return table
 
 
 def carried_over() -> pd.DataFrame:

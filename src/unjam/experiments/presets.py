@@ -43,6 +43,9 @@ PRESETS: dict[str, dict[str, Any]] = {
     "demo": {"steps": 300_000, "evaluation": {"every": 2}},
 }
 
+CLOSING_ABSORBER = "jam-absorber:gap_gain=0,push=0.9,speed_gain=0.8"
+"""the expert that gets furthest on the merge"""
+
 BEST: dict[str, dict[str, Any]] = {
     "ring": {**PRESETS["demo"], "steps": 2_000_000},
     # A wave that has grown: larger steps of the policy unlearn what the expert can, and no wave comes in the
@@ -68,7 +71,7 @@ BEST: dict[str, dict[str, Any]] = {
     },
     # A jam comes or does not: what a CAV did shows minutes later, and only in the mean of many episodes.
     "merge": {
-        "expert": "jam-absorber:gap_gain=0,push=0.9,speed_gain=0.8",
+        "expert": CLOSING_ABSORBER,
         "steps": 300_000,
         "policy": {
             "observe": ["local", "expert_acceleration", "expert_memory"],

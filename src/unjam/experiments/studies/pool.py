@@ -13,6 +13,7 @@ from unjam.controller.file import hash_of
 from unjam.experiments.executors import Command
 from unjam.experiments.folder import read_config
 from unjam.experiments.judge import TRAINED
+from unjam.experiments.presets import CLOSING_ABSORBER
 from unjam.experiments.studies.plan import PlannedRun
 from unjam.experiments.trainings import training_command
 from unjam.reports.results import EVALUATION_FILE, Results, read_progress, read_results, read_rows
@@ -33,7 +34,7 @@ REFERENCES: dict[str, str] = {
     "varying pacer": "pacer:varying=true",
     "gentle varying pacer": "pacer:varying=true,time_constant=1",
     "jam absorber": "jam-absorber",
-    "closing jam absorber": "jam-absorber:gap_gain=0,push=0.9,speed_gain=0.8",
+    "closing jam absorber": CLOSING_ABSORBER,
 }
 """drivers that do not learn, beside those that do: label and how `unjam drive` names them"""
 EXPERTS = tuple(label for label in REFERENCES if label not in ("human", "zero", "constant +0.1"))
