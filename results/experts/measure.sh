@@ -25,7 +25,8 @@ for road in ramp A10KW; do
 done
 for road in ring ring-warm ring-jammed figure-eight merge; do
     own="-d pacer"
-    [ $road = merge ] && own="-d jam-absorber"  # a pacer needs a closed road
+    # a pacer needs a closed road
+    [ $road = merge ] && own="-d jam-absorber -d jam-absorber:gap_gain=0,push=0.9,speed_gain=0.8"
     unjam drive $road --episodes 10 --out "$runs/all-on-$road" \
         -d human -d idm -d pi:time_constant=0 -d pi -d follower-stopper -d acc -d lacc -d bcm -d ovm $own \
         -d constant -d constant:acceleration=0.1 >/dev/null
