@@ -129,6 +129,7 @@ def closing_absorber() -> pd.DataFrame:
         for driver, rows in rows_of_file("tried/merge-closing.json").items()
     }
     table["without a jam"] = [f"{free[driver]} of 20" for driver in table.index]
+    table.insert(0, "", [driver.replace(",", ", ") for driver in table.index])
     return table
 
 
