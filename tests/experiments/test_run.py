@@ -193,6 +193,7 @@ def test_each_learner_learns_its_own_way(uninterrupted: Path, tmp_path: Path, le
         assert loaded.network.squashes_noise is (agent == "sac")
 
 
+@pytest.mark.slow
 def test_a_run_that_is_stopped_again_and_again_ends_as_if_it_had_not_been(
     uninterrupted: Path, tmp_path: Path, learn: Learn
 ) -> None:
@@ -242,9 +243,10 @@ DAMAGE: dict[str, Callable[[Path], object]] = {
     "damaged checkpoint": lambda folder: (folder / "checkpoint" / "000003" / TENSORS).write_bytes(b"lost"),
     "line cut short": lambda folder: (folder / "progress.jsonl").open("a").write('{"iteration": 4, "actu'),
 }
+KILLED, *OTHERS = DAMAGE
 
 
-@pytest.mark.parametrize("name", DAMAGE)
+@pytest.mark.parametrize("name", [KILLED, *(pytest.param(name, marks=pytest.mark.slow) for name in OTHERS)])
 def test_what_a_crash_left_behind_does_not_show_in_the_end(
     uninterrupted: Path, tmp_path: Path, name: str, learn: Learn
 ) -> None:

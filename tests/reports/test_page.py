@@ -48,7 +48,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The report of `unjam train`."""
     changes = {
         "road": ROAD,
-        "steps": 900,
+        "steps": 600,
         "workers": 1,
         "policy.hidden": (8,),
         "trpo.batch_steps": 300,
@@ -372,7 +372,7 @@ def test_a_run_leads_with_its_gain_and_keeps_its_configuration_at_hand(
     code = page.locator("details code")
     assert not code.is_visible()
     page.locator("summary", has_text="Configuration").click()
-    assert "steps = 900" in code.inner_text()
+    assert "steps = 600" in code.inner_text()
 
 
 def test_the_replay_stays_sharp_when_the_window_changes(open_page: Opener, driven: Path) -> None:

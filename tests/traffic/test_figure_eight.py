@@ -126,7 +126,7 @@ def slowly(*values: object) -> Any:
 @pytest.mark.parametrize(
     ("driver", "radius", "speed"),
     [
-        (Pacer(), 32, 5.8),
+        slowly(Pacer(), 32, 5.8),
         slowly(Pacer(), 35, 6.2),
         slowly(Pacer(varying=True), 32, 6.8),
         slowly(Pacer(varying=True), 33, 6.8),
