@@ -2,13 +2,13 @@
 
 import itertools
 from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import settings
 
+from tests.pictures import empty_pictures
 from unjam.drivers import LocalState
 from unjam.drivers.network import Network
 from unjam.traffic.simulation import Simulation
@@ -33,14 +33,6 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 def simulation() -> Iterator[Simulation]:
     with Simulation() as opened:
         yield opened
-
-
-@contextmanager
-def empty_pictures() -> Iterator[None]:
-    """Leave the pictures of reports empty: drawing them takes five seconds, and few tests look at them."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("unjam.reports.html.data_uri", lambda figure, kind: f"data:image/{kind};base64,")
-        yield
 
 
 @pytest.fixture

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.conftest import empty_pictures
+from tests.pictures import empty_pictures
 from unjam.controller import load_controller
 from unjam.controller.archive import GRAPH, MANIFEST, SAMPLE, WEIGHTS, unpack_parts
 from unjam.controller.sample import read_sample

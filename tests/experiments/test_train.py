@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from tests.conftest import empty_pictures
+from tests.pictures import empty_pictures
 from unjam.controller import load_controller
 from unjam.drivers import ResidualDriver
 from unjam.drivers.constant import Constant

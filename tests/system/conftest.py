@@ -48,7 +48,7 @@ def warm(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Run]:
 def unjam(tmp_path: Path, warm: Run) -> Run:
     """Runs `unjam` with arguments in an empty folder; as a new process where its surroundings differ.
 
-    Without `pictures` those of a report are left empty, where nobody looks at them.
+    Without `pictures` those of a report are left empty, where nobody looks at them; a new process draws them.
     """
 
     def run(

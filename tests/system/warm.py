@@ -18,7 +18,7 @@ import unjam.cli.output
 import unjam.experiments.drive
 import unjam.experiments.model_facts
 import unjam.experiments.train
-from tests.conftest import empty_pictures
+from tests.pictures import empty_pictures
 
 LONGEST = 300
 """[s]"""
