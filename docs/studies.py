@@ -128,7 +128,6 @@ def closing_absorber() -> pd.DataFrame:
         f"{sum(row['mean_speed'] > FREE for row in rows)} of {len(rows)}"
         for rows in rows_of_file("tried/merge-closing.json").values()
     ]
-    table.insert(0, "", [driver.replace(",", ", ") for driver in table.index])
     return table
 
 

@@ -117,8 +117,10 @@ def soak_origin() -> str:
 
 
 def show(table: pd.DataFrame, index: bool = False, digits: int = 3) -> HTML:
-    """Return a table in the style of the site."""
-    html = table.to_html(
+    """Return a table in the style of the site; names in its index break after a comma."""
+    html = table.rename(
+        index=lambda name: name.replace(",", ", ") if isinstance(name, str) else name
+    ).to_html(
         index=index,
         border=0,
         justify="left",
