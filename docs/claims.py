@@ -5,11 +5,11 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from studies import interval, number, rows_of
 from tables import RESULTS
 
-from unjam.experiments.studies.plan import VARIANTS
-from unjam.reports.statistics import estimate
+from studies import interval, number, rows_of
+from unjam.measures.statistics import estimate
+from unjam.studies.plan import VARIANTS
 
 Claim = tuple[str, str, str]
 """what the paper says, whether it held, by which numbers"""

@@ -7,8 +7,9 @@ import numpy as np
 import pandas as pd
 from IPython.display import Image
 from matplotlib.figure import Figure
-from studies import interval, rows_of
 from tables import RESULTS
+
+from studies import interval, rows_of
 
 LABELS = {"ours": "with the virtual environment", "ours-without-model": "without"}
 COLOURS = {"ours": "#2b6cb0", "ours-without-model": "#e07a1f"}

@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 from tables import RESULTS
 
-from unjam.reports.statistics import estimate
+from unjam.measures.statistics import estimate
 
 NETWORKS = {"knowledge": "IDM + residual", "vanilla": "network alone", "nearest row": "nearest row"}
 MODELS = {

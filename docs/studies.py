@@ -8,8 +8,8 @@ import pandas as pd
 from tables import RESULTS, metrics_of
 from tables import rows_of as rows_of_file
 
-from unjam.experiments.studies.plan import VARIANTS
-from unjam.experiments.studies.pool import REFERENCES
+from unjam.studies.plan import VARIANTS
+from unjam.studies.pool import REFERENCES
 
 FREE = 15.0
 """mean speed of an episode on the merge in which no jam stayed [m/s]"""

@@ -7,9 +7,9 @@ from pathlib import Path
 import pandas as pd
 from IPython.display import HTML
 
-from unjam.reports.metrics import METRICS
+from unjam.measures.metrics import METRICS
+from unjam.measures.statistics import estimate
 from unjam.reports.model_story import error_text
-from unjam.reports.statistics import estimate
 
 RESULTS = Path(__file__).parent.parent / "results"
 

@@ -5,10 +5,10 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from studies import interval
 from tables import RESULTS
 
-from unjam.experiments.studies.plan import VARIANTS
+from studies import interval
+from unjam.studies.plan import VARIANTS
 
 
 def measured() -> dict[str, Any]:

@@ -11,7 +11,7 @@ from hypothesis import settings
 from tests.pictures import empty_pictures
 from unjam.drivers import LocalState
 from unjam.drivers.network import Network
-from unjam.traffic.simulation import Simulation
+from unjam.worlds.sumo.simulation import Simulation
 
 # No timed tests, and the same each time. `make test-all` takes the thorough one.
 settings.register_profile("unjam", deadline=None, derandomize=True, max_examples=20)
@@ -19,7 +19,7 @@ settings.register_profile("thorough", deadline=None, derandomize=True, max_examp
 settings.load_profile("unjam")
 
 
-LONGEST = ("system", "experiments", "reports", "traffic")
+LONGEST = ("system", "training", "studies", "reports", "worlds")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -13,22 +13,26 @@ import unjam
 SOURCE = Path(unjam.__file__).parent
 MODULES = {path.relative_to(SOURCE).as_posix(): ast.parse(path.read_text()) for path in SOURCE.rglob("*.py")}
 
-ORDER = ("physics", "drivers", "scenarios", "traffic", "virtual", "agents", "experiments", "cli")
+ORDER = (
+    *("sumo_files", "physics", "drivers", "scenarios", "worlds", "measures", "virtual", "learners"),
+    *("training", "studies", "cli"),
+)
 """each may import those before it, and none after it"""
-EVERYWHERE = {"", "errors", "files", "parameters"}
+EVERYWHERE = {"", "errors", "files", "manifest", "parameters"}
 """what has no place in the order: it imports none of the layers"""
 ALLOWED = {
-    "controller": {"drivers"},
+    "controller": {"drivers", "physics"},
     "following": {"physics", "drivers", "scenarios"},
-    "reports": {"physics", "drivers", "scenarios", "traffic"},
+    "reports": {"physics", "drivers", "scenarios", "worlds", "measures"},
     "virtual": {"following"},
-    "experiments": {"controller", "following", "reports"},
-    "cli": {"controller", "reports"},
-    "environments": {"controller", "physics", "drivers", "scenarios", "traffic", "reports"},
+    "training": {"controller", "reports"},
+    "studies": {"controller", "following", "reports"},
+    "cli": {"controller", "following", "reports"},
+    "environments": {"controller", "physics", "drivers", "scenarios", "worlds", "reports"},
 }
 """what else a part may import"""
 LAZY = {
-    "__init__": {"controller", "drivers", "environments", "experiments", "reports", "traffic"},
+    "__init__": {"controller", "drivers", "environments", "reports", "training", "worlds"},
     "__main__": {"cli"},
 }
 TORCH = {"torch", "stable_baselines3", "sb3_contrib"}
@@ -115,20 +119,27 @@ def test_every_part_has_its_place() -> None:
     assert {part_of(module) for module in MODULES} <= known
 
 
-def test_reports_read_folders_and_know_neither_agents_nor_experiments() -> None:
+def test_reports_read_folders_and_know_neither_learners_nor_trainings() -> None:
     for module, tree in MODULES.items():
         if part_of(module) == "reports":
-            assert not own_imports(tree) & {"agents", "experiments", "controller", "cli"}, module
+            assert not own_imports(tree) & {"learners", "training", "studies", "controller", "cli"}, module
 
 
 def test_sumo_is_imported_in_one_place() -> None:
-    assert importers({"libsumo", "traci", "sumolib"}) == {"traffic/simulation.py"}
+    assert importers({"libsumo", "traci", "sumolib"}) == {"worlds/sumo/simulation.py"}
 
 
 def test_learning_libraries_are_imported_only_where_we_learn() -> None:
     found = importers(TORCH)
-    assert {part_of(module) for module in found} <= {"agents", "experiments", "following", "virtual"}
-    assert "agents/policy.py" in found
+    assert {part_of(module) for module in found} <= {
+        "controller",
+        "following",
+        "learners",
+        "studies",
+        "training",
+        "virtual",
+    }
+    assert "learners/policy.py" in found
 
 
 def test_only_the_command_line_prints_with_its_libraries() -> None:
@@ -206,7 +217,7 @@ def test_help_loads_nothing_that_takes_time(arguments: list[str]) -> None:
 
 
 @pytest.mark.parametrize(
-    "module", ["traffic.worker", "experiments.drive", "experiments.judge", "experiments.config", "controller"]
+    "module", ["worlds.worker", "training.drive", "training.judge", "training.config", "controller"]
 )
 def test_what_learns_nothing_loads_no_learning_library(module: str) -> None:
     found = loaded_by(f"import unjam.{module}")
@@ -215,4 +226,4 @@ def test_what_learns_nothing_loads_no_learning_library(module: str) -> None:
 
 
 def test_a_worker_loads_neither_tables_nor_pictures() -> None:
-    assert not loaded_by("import unjam.traffic.worker") & {"pandas", "matplotlib"}
+    assert not loaded_by("import unjam.worlds.worker") & {"pandas", "matplotlib"}

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 
 from unjam.drivers.pacer import Pacer
-from unjam.experiments.manifest import manifest
 from unjam.files import to_json, write_whole
+from unjam.manifest import manifest
 from unjam.scenarios.figure_eight import FigureEight
-from unjam.traffic.workers import EpisodeTask, Workers
+from unjam.worlds.workers import EpisodeTask, Workers
 
 RADII, SEEDS, STEPS, JUDGED = (32, 33, 34, 35), 10, 6000, 3000
 

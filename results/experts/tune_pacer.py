@@ -15,8 +15,8 @@ import numpy as np
 
 from unjam.drivers.pacer import TUNED, Pacer
 from unjam.scenarios.figure_eight import FigureEight, loop_length
-from unjam.traffic.record import Episode
-from unjam.traffic.workers import EpisodeTask, Workers
+from unjam.worlds.record import Episode
+from unjam.worlds.workers import EpisodeTask, Workers
 
 STEPS, JUDGED, SEEDS = 5000, 3000, 2
 CANDIDATES, BEST = 24, 5

@@ -7,7 +7,7 @@ goes on where it was. FOLDER gets field.json and field.png, which are copied int
 import sys
 from pathlib import Path
 
-from unjam.experiments.studies.field import run
+from unjam.studies.field import run
 
 if __name__ == "__main__":
     folder, ngsim, astazero = map(Path, sys.argv[1:4])

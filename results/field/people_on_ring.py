@@ -7,7 +7,7 @@ FOLDER gets ring.json and ring.png.
 import sys
 from pathlib import Path
 
-from unjam.experiments.studies.people_on_ring import run
+from unjam.studies.people_on_ring import run
 
 if __name__ == "__main__":
     folder, controller, headway, everything = map(Path, sys.argv[1:5])

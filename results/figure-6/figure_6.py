@@ -7,7 +7,7 @@ figure-6.json and figure-6.png, which are copied into results/figure-6/.
 import sys
 from pathlib import Path
 
-from unjam.experiments.studies.figure_6 import REPEATS, run
+from unjam.studies.figure_6 import REPEATS, run
 
 if __name__ == "__main__":
     workers, repeats = [*map(int, sys.argv[2:]), *(2, REPEATS)[len(sys.argv) - 2 :]]

@@ -18,18 +18,16 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 
-from unjam.agents.algorithms import LEARNERS
-from unjam.agents.episodic import Training
 from unjam.drivers.residual import ResidualDriver, observation_size
-from unjam.experiments.config import RunConfig, load_config
-from unjam.experiments.evaluate import raise_failure
-from unjam.experiments.manifest import manifest
 from unjam.files import to_json, write_whole
+from unjam.learners.algorithms import LEARNERS
+from unjam.learners.episodic import Training
+from unjam.manifest import manifest
+from unjam.measures.metrics import measure
 from unjam.reports.figures import INK, LINES, STYLE
-from unjam.reports.metrics import measure
 from unjam.scenarios.scenario import Scenario
-from unjam.traffic.record import Episode
-from unjam.traffic.workers import EpisodeTask, Workers
+from unjam.training.config import RunConfig, load_config
+from unjam.training.evaluate import raise_failure
 from unjam.virtual.comparison import one_step_errors, open_loop
 from unjam.virtual.data import ActualData
 from unjam.virtual.fitting import fit
@@ -37,6 +35,8 @@ from unjam.virtual.model import NUMBERS, EnvironmentModel
 from unjam.virtual.model_error import unexplained
 from unjam.virtual.rollout import draw_starts
 from unjam.virtual.settings import BaseName, VirtualSettings
+from unjam.worlds.record import Episode
+from unjam.worlds.workers import EpisodeTask, Workers
 
 ROADS = ("ring", "figure-eight")
 PASSES = {6_000: 200, 24_000: 100, 100_000: 40}

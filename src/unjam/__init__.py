@@ -20,22 +20,22 @@ if TYPE_CHECKING:
     from unjam.controller.verify import verify_controller
     from unjam.drivers import Driver, LocalState, check_driver
     from unjam.environments.several import parallel_env
-    from unjam.experiments.config import load_config
-    from unjam.experiments.drive import drive
-    from unjam.experiments.export import export_controller
-    from unjam.experiments.train import train
     from unjam.reports.html import write_report
-    from unjam.traffic.episode import run_episode
+    from unjam.training.config import load_config
+    from unjam.training.drive import drive
+    from unjam.training.export import export_controller
+    from unjam.training.train import train
+    from unjam.worlds.drive import run_episode
 
 # Imported when first used: workers must stay free of torch, and the command line quick.
 _PLACES = {
-    "drive": "unjam.experiments.drive",
-    "train": "unjam.experiments.train",
-    "load_config": "unjam.experiments.config",
+    "drive": "unjam.training.drive",
+    "train": "unjam.training.train",
+    "load_config": "unjam.training.config",
     "load_controller": "unjam.controller",
-    "export_controller": "unjam.experiments.export",
+    "export_controller": "unjam.training.export",
     "verify_controller": "unjam.controller.verify",
-    "run_episode": "unjam.traffic.episode",
+    "run_episode": "unjam.worlds.drive",
     "parallel_env": "unjam.environments.several",
     "write_report": "unjam.reports.html",
     "Driver": "unjam.drivers",

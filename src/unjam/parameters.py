@@ -64,3 +64,23 @@ def parse_assignments(texts: list[str], field: str) -> dict[str, Any]:
             raise InputError(f"{field}: {text!r} is not allowed; allowed: key=value")
         values[key.strip()] = parse_value(value.strip())
     return values
+
+
+def merge(values: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
+    """Return `values` with `changes`; tables are merged key by key."""
+    merged = dict(values)
+    for key, value in changes.items():
+        both = isinstance(value, dict) and isinstance(merged.get(key), dict)
+        merged[key] = merge(merged[key], value) if both else value
+    return merged
+
+
+def nested(changes: dict[str, Any]) -> dict[str, Any]:
+    """Return changes whose keys may have dots as tables: `trpo.gamma` becomes `gamma` of the table `trpo`."""
+    tables: dict[str, Any] = {}
+    for key, value in changes.items():
+        inner: Any = value
+        for part in reversed(key.split(".")):
+            inner = {part: inner}
+        tables = merge(tables, inner)
+    return tables

@@ -15,6 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from safetensors.numpy import save
 
+from tests.conftest import random_network
 from unjam.controller import controller_bytes, load_controller
 from unjam.controller.archive import MANIFEST, WEIGHTS
 from unjam.controller.manifest import FORMAT
@@ -28,8 +29,6 @@ from unjam.drivers.network import network_arrays
 from unjam.drivers.registry import recipe_of
 from unjam.drivers.residual import observation_size
 from unjam.errors import InputError
-
-from ..conftest import random_network
 
 ALL_PARTS: tuple[ObservationPart, ...] = (
     *("local", "expert_acceleration", "expert_memory", "loop_length", "place", "route_position"),

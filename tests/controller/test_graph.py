@@ -1,4 +1,4 @@
-"""Graphs made by hand; those of real controllers are in tests/experiments/test_onnx_graph.py."""
+"""Graphs made by hand; those of real controllers are in tests/controller/test_onnx_graph.py."""
 
 import sys
 from collections.abc import Callable
@@ -7,11 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tests.controller.test_sample import perceived
 from unjam.controller.graph import check_graph, run_graph
 from unjam.drivers import LACC, Constant, LocalState
 from unjam.errors import InputError, MissingPartError
-
-from .test_sample import perceived
 
 onnx = pytest.importorskip("onnx")
 pytest.importorskip("onnxruntime")

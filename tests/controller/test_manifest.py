@@ -4,14 +4,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.controller.test_file import ALL_PARTS, residual
 from unjam.controller.manifest import description
 from unjam.drivers import IDM, Driver, FollowerStopper, LocalState, Pacer, PISaturation
 from unjam.drivers.check import random_state
 from unjam.drivers.from_file import FileDriver
 from unjam.drivers.mixed import Mixed
 from unjam.drivers.residual import observed
-
-from .test_file import ALL_PARTS, residual
 
 DRIVERS: dict[str, Driver] = {
     "expert": PISaturation(window=20),

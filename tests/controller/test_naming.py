@@ -3,13 +3,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.controller.test_file import ABOUT, actions, residual, written
 from unjam.controller import controller_bytes, make_driver
 from unjam.drivers import IDM, PISaturation
 from unjam.drivers.from_file import FileDriver
 from unjam.drivers.mixed import Mixed
 from unjam.errors import InputError
-
-from .test_file import ABOUT, actions, residual, written
 
 
 def test_a_run_folder_stands_for_its_controller(tmp_path: Path) -> None:

@@ -2,12 +2,11 @@ import numpy as np
 import pytest
 from safetensors.numpy import load, save
 
+from tests.controller.test_file import residual
 from unjam.controller.sample import read_sample, replay, sample_bytes
 from unjam.drivers import LocalState, PISaturation
 from unjam.drivers.check import random_state
 from unjam.errors import InputError
-
-from .test_file import residual
 
 
 def perceived(decisions: int = 40, seed: int = 0) -> LocalState:

@@ -9,8 +9,8 @@ from unjam.controller.naming import SHIPPED, shipped_file, shipped_names
 from unjam.controller.verify import verify_controller
 from unjam.drivers import ResidualDriver
 from unjam.errors import InputError
-from unjam.experiments.presets import BEST
-from unjam.reports.statistics import paired_difference
+from unjam.measures.statistics import paired_difference
+from unjam.training.presets import BEST
 
 
 @pytest.mark.parametrize("name", shipped_names())

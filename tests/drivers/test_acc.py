@@ -1,9 +1,8 @@
 import numpy as np
 import pytest
 
+from tests.conftest import state_of
 from unjam.drivers import ACC, LACC
-
-from ..conftest import state_of
 
 
 def test_lacc_gives_the_reference_values_of_flow() -> None:

@@ -4,12 +4,11 @@ import numpy as np
 import pytest
 import torch
 
+from tests.conftest import random_network
 from unjam.drivers import DRIVERS, Driver, LocalState, ResidualDriver, check_driver
 from unjam.drivers.check import random_state
 from unjam.drivers.driver import single_row
 from unjam.drivers.registry import driver_from_recipe, named_driver, recipe_of
-
-from ..conftest import random_network
 
 EXPERTS = [
     "human",

@@ -1,9 +1,8 @@
 import numpy as np
 import pytest
 
+from tests.conftest import state_of
 from unjam.drivers import FollowerStopper, LocalState
-
-from ..conftest import state_of
 
 
 def test_flows_reference_values() -> None:

@@ -1,8 +1,7 @@
 import numpy as np
 
+from tests.conftest import state_of
 from unjam.drivers import JamAbsorber, LocalState
-
-from ..conftest import state_of
 
 
 def before(position: float, speed: float, leader_speed: float, gap: float) -> LocalState:

@@ -9,8 +9,8 @@ from unjam.drivers.mixed import Mixed
 from unjam.drivers.registry import describe, driver_from_recipe, recipe_of
 from unjam.errors import InputError
 from unjam.scenarios import Merge, Ring
-from unjam.traffic.episode import run_episode
-from unjam.traffic.simulation import Simulation
+from unjam.worlds.drive import run_episode
+from unjam.worlds.sumo.simulation import Simulation
 
 PI, STOPPER = PISaturation(), FollowerStopper()
 

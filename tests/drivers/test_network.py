@@ -2,10 +2,9 @@ import numpy as np
 import pytest
 import torch
 
+from tests.conftest import random_network
 from unjam.drivers.network import Network, network_arrays, network_from_arrays
 from unjam.errors import InputError
-
-from ..conftest import random_network
 
 
 def test_agrees_with_the_layers_written_out() -> None:

@@ -2,13 +2,12 @@ import numpy as np
 import pytest
 import torch
 
+from tests.conftest import random_network
 from unjam.drivers import IDM, LocalState, PISaturation, ResidualDriver, check_driver
 from unjam.drivers.check import random_state
 from unjam.drivers.driver import single_row
 from unjam.drivers.network import Network
 from unjam.drivers.residual import observation_size
-
-from ..conftest import random_network
 
 ALL_PARTS = ("local", "expert_acceleration", "expert_memory", "loop_length", "place", "route_position")
 

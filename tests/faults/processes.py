@@ -15,16 +15,16 @@ import psutil
 
 from tests.faults.files import any_mutation
 from tests.faults.outcome import Outcome, one_line
-from tests.traffic.own_roads import straight
-from tests.traffic.test_record import fingerprint
-from tests.traffic.test_workers import processes
+from tests.worlds.sumo.own_roads import straight
+from tests.worlds.test_record import fingerprint
+from tests.worlds.test_workers import processes
 from unjam.drivers import IDM, PISaturation
 from unjam.errors import InputError
-from unjam.experiments.checkpoint import load_checkpoint
 from unjam.scenarios import Ring, make_scenario
-from unjam.traffic.episode import run_episode
-from unjam.traffic.simulation import Simulation
-from unjam.traffic.workers import EpisodeTask, Workers
+from unjam.training.checkpoint import load_checkpoint
+from unjam.worlds.drive import run_episode
+from unjam.worlds.sumo.simulation import Simulation
+from unjam.worlds.workers import EpisodeTask, Workers
 
 LARGEST_GROWTH = 20.0
 """MB of memory that any number of resets may cost"""

@@ -16,8 +16,8 @@ sys.path.insert(0, str(ROOT))
 
 from tests.faults.registry import FAULTS  # noqa: E402
 from unjam.errors import wrong_name  # noqa: E402
-from unjam.experiments.manifest import manifest  # noqa: E402
 from unjam.files import to_json, write_whole  # noqa: E402
+from unjam.manifest import manifest  # noqa: E402
 
 TARGET = ROOT / "results" / "soak" / "soak.json"
 

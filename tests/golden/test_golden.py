@@ -17,7 +17,7 @@ from tests.golden.trajectories import (
     table_of,
 )
 from unjam.drivers.registry import DRIVERS
-from unjam.traffic.record import Episode
+from unjam.worlds.record import Episode
 
 BLESS = 'python tests/golden/bless.py "why they have changed"'
 

@@ -11,14 +11,14 @@ from pathlib import Path
 
 import numpy as np
 
-from tests.traffic.own_roads import straight
+from tests.worlds.sumo.own_roads import straight
 from unjam.drivers.registry import DRIVERS, named_driver
 from unjam.scenarios.registry import make_scenario
 from unjam.scenarios.scenario import Scenario
-from unjam.traffic.episode import run_episode
-from unjam.traffic.network_files import sumo_version
-from unjam.traffic.record import Episode
-from unjam.traffic.simulation import Simulation
+from unjam.worlds.drive import run_episode
+from unjam.worlds.record import Episode
+from unjam.worlds.sumo.network_files import sumo_version
+from unjam.worlds.sumo.simulation import Simulation
 
 ROADS = {
     "ring": ("ring", {"horizon": 200}),

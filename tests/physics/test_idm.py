@@ -15,7 +15,7 @@ from unjam.physics import (
     next_speed,
 )
 from unjam.scenarios import Ring
-from unjam.traffic.simulation import Simulation
+from unjam.worlds.sumo.simulation import Simulation
 
 speeds = st.floats(0.0, 29.0)
 gaps = st.floats(0.5, 200.0)

@@ -5,13 +5,12 @@ from pathlib import Path
 
 import numpy as np
 
+from tests.worlds.sumo.own_roads import game
 from unjam.drivers import Human, PISaturation
 from unjam.reports.results import PICTURED, Shown
 from unjam.scenarios import Merge, make_scenario
-from unjam.traffic.episode import run_episode
-from unjam.traffic.record import Episode
-
-from ..traffic.own_roads import game
+from unjam.worlds.drive import run_episode
+from unjam.worlds.record import Episode
 
 
 def shown_from(episode: Episode, driver: str) -> Shown:

@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from PIL import Image
 
+from tests.reports.open_roads import merge_episode, own_episode, shown_from
 from unjam.reports.figures import (
     LINES,
     POINTS_IN_TIME,
@@ -26,8 +27,6 @@ from unjam.reports.figures import (
     time_split,
 )
 from unjam.reports.results import Shown
-
-from .open_roads import merge_episode, own_episode, shown_from
 
 LENGTH = 120.0
 CAV_COLOUR = "#d7263d"

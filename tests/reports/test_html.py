@@ -9,19 +9,18 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
+from tests.measures.test_metrics import LENGTH, episode_of
+from tests.reports.test_model_story import facts_of, progress_of
 from unjam import __version__
 from unjam.errors import DiskError, InputError
-from unjam.experiments.evaluate import Evaluation, save_evaluation
 from unjam.files import to_json
+from unjam.measures.metrics import METRICS, measure
 from unjam.reports.figures import learning_curve
 from unjam.reports.html import write_report
-from unjam.reports.metrics import METRICS, measure
 from unjam.reports.replay import REPLAY_SECONDS
 from unjam.reports.results import read_results
-from unjam.traffic.record import Episode, failed_episode
-
-from .test_metrics import LENGTH, episode_of
-from .test_model_story import facts_of, progress_of
+from unjam.training.evaluate import Evaluation, save_evaluation
+from unjam.worlds.record import Episode, failed_episode
 
 SPEEDS = {"human": 3.0, "pi": 4.0, "trained": 4.5, "follower-stopper": 3.5}
 

@@ -7,10 +7,9 @@ import pytest
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from tests.reports.test_model_story import EXAMPLES, MEMBERS, facts_of, progress_of
 from unjam.reports.figures import data_uri
 from unjam.reports.model_figures import errors, examples, trust
-
-from .test_model_story import EXAMPLES, MEMBERS, facts_of, progress_of
 
 Draw = Callable[[bool], Figure]
 PICTURES: dict[str, tuple[Draw, int]] = {

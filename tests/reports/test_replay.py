@@ -9,10 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
+from tests.reports.open_roads import merge_episode, own_episode, shown_from
 from unjam.reports.replay import _share, replay_data
 from unjam.reports.results import Shown
-
-from .open_roads import merge_episode, own_episode, shown_from
 
 
 def unpacked(driver: dict[str, Any], name: str) -> np.ndarray:

@@ -9,11 +9,11 @@ import pytest
 import unjam
 from unjam.drivers import Human, PISaturation
 from unjam.errors import InputError
-from unjam.experiments.drive import DriveResult
-from unjam.reports.metrics import METRICS
+from unjam.measures.metrics import METRICS
 from unjam.reports.results import Results, command_to_repeat, read_progress, read_results
 from unjam.scenarios import Ring
-from unjam.traffic.episode import run_episode
+from unjam.training.drive import DriveResult
+from unjam.worlds.drive import run_episode
 
 ROAD = {"length": (120, 120), "vehicles": 8, "horizon": 150}
 

@@ -3,12 +3,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.reports.open_roads import merge_episode, own_episode
+from tests.reports.test_video import near
 from unjam.reports.road_picture import CAV_COLOUR, SIZE, draw_road, scenes, split_lines
-from unjam.traffic.record import Episode
-from unjam.traffic.traffic import Scene
-
-from .open_roads import merge_episode, own_episode
-from .test_video import near
+from unjam.worlds.record import Episode
+from unjam.worlds.sumo.traffic import Scene
 
 
 @pytest.fixture(scope="module", params=["merge", "ramp"])

@@ -4,9 +4,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from unjam.reports.metrics import METRICS
+from unjam.measures.metrics import METRICS
+from unjam.measures.statistics import Estimate, estimate
 from unjam.reports.results import Results
-from unjam.reports.statistics import Estimate, estimate
 from unjam.reports.story import (
     cards_of,
     cell_of,

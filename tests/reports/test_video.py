@@ -6,13 +6,12 @@ import numpy as np
 import pytest
 from PIL import Image, ImageSequence
 
+from tests.measures.test_metrics import episode_of
+from tests.reports.open_roads import merge_episode
 from unjam.errors import DiskError, InputError
 from unjam.reports.road_picture import CAV_COLOUR, SIZE
 from unjam.reports.video import FRAMES_PER_SECOND, check_format, write_video
-from unjam.traffic.record import Episode
-
-from .open_roads import merge_episode
-from .test_metrics import episode_of
+from unjam.worlds.record import Episode
 
 SECONDS = 20.0
 

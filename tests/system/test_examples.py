@@ -9,18 +9,17 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
+from tests.controller.test_file import residual
+from tests.controller.test_sample import perceived
+from tests.drivers.test_experts import EXPERTS
+from tests.worlds.sumo.own_roads import straight
 from unjam.controller import controller_bytes
 from unjam.controller.archive import SAMPLE
 from unjam.controller.sample import replay, sample_bytes
 from unjam.drivers import LACC, Driver, FollowerStopper, LocalState, Pacer, PISaturation
 from unjam.drivers.local_state import LARGEST_GAP
 from unjam.drivers.registry import named_driver
-from unjam.traffic.network_files import sumo_program
-
-from ..controller.test_file import residual
-from ..controller.test_sample import perceived
-from ..drivers.test_experts import EXPERTS
-from ..traffic.own_roads import straight
+from unjam.worlds.sumo.network_files import sumo_program
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.experiments.studies.test_field import table
 from tests.faults.processes import SETTINGS, TINY
+from tests.studies.test_field import table
 from tests.system.conftest import UNJAM, Run
-from tests.traffic.own_roads import game, straight
+from tests.worlds.sumo.own_roads import game, straight
 
 SMALL = ["--length", "60", "--vehicles", "5", "--set", "horizon=80"]
 TINY_RUN = [

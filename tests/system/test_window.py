@@ -8,12 +8,11 @@ from pathlib import Path
 
 import pytest
 
+from tests.system.conftest import Run
 from unjam.drivers import PISaturation
-from unjam.experiments.watch import watch_in_window
 from unjam.scenarios import Ring
-from unjam.traffic.episode import run_episode
-
-from .conftest import Run
+from unjam.training.watch import watch_in_window
+from unjam.worlds.drive import run_episode
 
 XVFB = shutil.which("Xvfb")
 needs_display = pytest.mark.skipif(XVFB is None, reason="no Xvfb found: apt-get install xvfb")

@@ -15,9 +15,9 @@ import torch._dynamo  # noqa: F401  # what the first optimiser of a process impo
 
 import unjam.cli
 import unjam.cli.output
-import unjam.experiments.drive
-import unjam.experiments.model_facts
-import unjam.experiments.train
+import unjam.training.drive
+import unjam.training.model_facts
+import unjam.training.train
 from tests.pictures import empty_pictures
 
 LONGEST = 300

@@ -7,9 +7,9 @@ from unjam.drivers.check import random_state
 from unjam.drivers.residual import ResidualDriver
 from unjam.physics.arrays import Array, as_column, namespace, stack_columns
 from unjam.scenarios import Ring
-from unjam.traffic.reward import Outcome, released
 from unjam.virtual.data import ActualData, Recording
 from unjam.virtual.world import Step
+from unjam.worlds.reward import Outcome, released
 
 LOOP = 230.0
 RING = Ring(length=(int(LOOP), int(LOOP)))

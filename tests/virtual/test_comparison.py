@@ -1,15 +1,14 @@
 import numpy as np
 import pytest
 
+from tests.conftest import random_network
+from tests.virtual.little_world import RING, LittleWorld, actual_data
 from unjam.drivers import IDM, ResidualDriver
 from unjam.virtual.comparison import one_step_errors, open_loop, recorded, replay, return_gap
 from unjam.virtual.data import ActualData
 from unjam.virtual.fitting import fit
 from unjam.virtual.model import NUMBERS, EnvironmentModel
 from unjam.virtual.settings import VirtualSettings
-
-from ..conftest import random_network
-from .little_world import RING, LittleWorld, actual_data
 
 DRIVER = ResidualDriver(IDM(), random_network(), 1.0, hold=3)
 SETTINGS = VirtualSettings(members=3, hidden=(32,), epochs=20, batch=128, rate=1e-2)

@@ -5,15 +5,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.conftest import random_network
+from tests.virtual.little_world import LittleWorld, actual_data
+from tests.worlds.test_record import fingerprint
 from unjam.drivers import IDM, LocalState, PISaturation, ResidualDriver
 from unjam.errors import InputError
 from unjam.scenarios import Ring
-from unjam.traffic.record import Episode, Trajectory
 from unjam.virtual.data import ActualData, is_held_out, pack_data, unpack_data
-
-from ..conftest import random_network
-from ..traffic.test_record import fingerprint
-from .little_world import LittleWorld, actual_data
+from unjam.worlds.record import Episode, Trajectory
 
 RING = Ring()
 

@@ -5,18 +5,17 @@ import numpy as np
 import pytest
 import torch
 
+from tests.conftest import random_network
 from unjam.drivers import IDM, Driver, LocalState, PISaturation, ResidualDriver
 from unjam.drivers.check import random_state
 from unjam.drivers.driver import Memory
 from unjam.drivers.from_file import FileDriver
 from unjam.errors import InputError
 from unjam.scenarios import Ring
-from unjam.traffic.episode import run_episode
-from unjam.traffic.simulation import Simulation
 from unjam.virtual.data import ActualData
 from unjam.virtual.expert import ThroughNumPy, memory_on, on_tensors, remembered
-
-from ..conftest import random_network
+from unjam.worlds.drive import run_episode
+from unjam.worlds.sumo.simulation import Simulation
 
 RING = Ring(length=(60, 70), vehicles=5, cavs=2, horizon=90)
 

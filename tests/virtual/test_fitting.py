@@ -4,15 +4,14 @@ import numpy as np
 import pytest
 import torch
 
+from tests.conftest import random_network
+from tests.virtual.little_world import RING, LittleWorld, actual_data
 from unjam.drivers import IDM, ResidualDriver
 from unjam.errors import UnjamError
 from unjam.virtual.data import ActualData, Transitions
 from unjam.virtual.fitting import Fit, fit, inputs_of, targets_of
 from unjam.virtual.model import NOISE_ROWS, TARGETS, EnvironmentModel, predict
 from unjam.virtual.settings import VirtualSettings
-
-from ..conftest import random_network
-from .little_world import RING, LittleWorld, actual_data
 
 SETTINGS = VirtualSettings(members=3, hidden=(32,), epochs=25, patience=6, batch=128, rate=1e-2)
 DRIVER = ResidualDriver(IDM(), random_network(), 1.0)

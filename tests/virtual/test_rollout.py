@@ -9,6 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch.testing import assert_close
 
+from tests.conftest import random_network
+from tests.virtual.little_world import RING, LittleWorld, actual_data
 from unjam.drivers import IDM, Constant, Driver, LocalState, PISaturation, ResidualDriver
 from unjam.drivers.from_file import FileDriver
 from unjam.drivers.local_state import ObservationPart
@@ -26,9 +28,6 @@ from unjam.virtual.rollout import (
 )
 from unjam.virtual.settings import VirtualSettings
 from unjam.virtual.world import BOUNDS, Step, VirtualWorld
-
-from ..conftest import random_network
-from .little_world import RING, LittleWorld, actual_data
 
 PARTS: tuple[ObservationPart, ...] = ("local", "expert_acceleration", "expert_memory")
 

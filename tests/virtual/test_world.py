@@ -15,11 +15,11 @@ from unjam.drivers import LocalState
 from unjam.drivers.check import random_state
 from unjam.drivers.local_state import LARGEST_GAP
 from unjam.scenarios import Ring
-from unjam.traffic.reward import Outcome, make_reward
 from unjam.virtual.base import base_reward, base_step
 from unjam.virtual.model import NUMBERS, TARGETS, EnvironmentModel, torch_generator
 from unjam.virtual.settings import VirtualSettings
 from unjam.virtual.world import BOUNDS, VirtualWorld, reward_on_tensors
+from unjam.worlds.reward import Outcome, make_reward
 
 RING = Ring()
 
@@ -224,4 +224,4 @@ def test_the_virtual_environment_knows_no_simulator() -> None:
     ran = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     loaded = set(ran.stdout.split())
     assert "torch" in loaded
-    assert not loaded & {"libsumo", "traci", "sumolib", "unjam.traffic.simulation"}
+    assert not loaded & {"libsumo", "traci", "sumolib", "unjam.worlds.sumo.simulation"}

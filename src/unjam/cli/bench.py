@@ -22,7 +22,7 @@ def bench(
     from rich.table import Table
 
     from unjam.cli.output import aside, console, print_json
-    from unjam.experiments.speed import measure_speed
+    from unjam.training.speed import measure_speed
 
     found = measure_speed(rounds, lambda line: aside.print(line))
     if json:

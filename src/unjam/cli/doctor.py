@@ -18,7 +18,7 @@ def doctor(json: JsonOption = False) -> None:
       unjam doctor
     """
     from unjam.cli.output import console, print_json
-    from unjam.experiments.health import check_health
+    from unjam.training.health import check_health
 
     checks = check_health()
     missing = [check for check in checks if not check.ok and check.needed]

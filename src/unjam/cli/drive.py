@@ -81,9 +81,9 @@ def drive(
       unjam drive ring -d pi -d runs/ring-001 --held-out --episodes 20
     """
     from unjam.cli.output import aside, console, counting_steps, metrics_table, print_json
-    from unjam.experiments.drive import drive as run
-    from unjam.experiments.drive import raise_failures
     from unjam.scenarios.registry import make_scenario
+    from unjam.training.drive import drive as run
+    from unjam.training.drive import raise_failures
 
     road = {
         **road_changes(length, radius, vehicles, cavs, warmup, cav_share, cav_types, humans),

@@ -37,13 +37,13 @@ def evaluate(
     """
     from unjam.cli.output import aside, console, counting_steps, metrics_table, print_json
     from unjam.drivers.registry import DRIVERS
-    from unjam.experiments.folder import read_config
-    from unjam.experiments.judge import among, comparison, judge
-    from unjam.experiments.train import TrainResult, gain_of
+    from unjam.measures.statistics import summarise
     from unjam.reports.html import write_report
-    from unjam.reports.statistics import summarise
     from unjam.reports.story import signed
-    from unjam.traffic.workers import Workers
+    from unjam.training.folder import read_config
+    from unjam.training.judge import among, comparison, judge
+    from unjam.training.train import TrainResult, gain_of
+    from unjam.worlds.workers import Workers
 
     if humans is not None and out is None:
         raise InputError("humans: it is not allowed without --out: the run keeps its own evaluation")

@@ -36,7 +36,7 @@ def export(
       unjam export pi:window=30 --scenario merge --to pi.unjam
     """
     from unjam.cli.output import aside, console, print_json
-    from unjam.experiments.export import export_controller
+    from unjam.training.export import export_controller
 
     done = export_controller(source, to, onnx, scenario)
     if json:

@@ -85,8 +85,8 @@ def _draw(scenario: Any, name: str, path: Path) -> None:
     from unjam.files import check_folder, write_whole
     from unjam.reports.road_picture import draw_road
     from unjam.scenarios.road import ClosedRoad
-    from unjam.traffic.simulation import Simulation
-    from unjam.traffic.stepping import make_traffic
+    from unjam.worlds.sumo.simulation import Simulation
+    from unjam.worlds.sumo.stepping import make_traffic
 
     check_folder(path)
     with Simulation() as simulation:

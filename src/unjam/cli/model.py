@@ -26,11 +26,11 @@ def model(
     from rich.table import Table
 
     from unjam.cli.output import aside, console, print_json
-    from unjam.experiments.folder import read_config
-    from unjam.experiments.model_facts import newest_model_facts
     from unjam.reports.html import write_report
     from unjam.reports.model_story import bound_of, cells, error_rows, headings, trust_of, verdict_of
     from unjam.reports.results import read_progress
+    from unjam.training.folder import read_config
+    from unjam.training.model_facts import newest_model_facts
 
     facts = newest_model_facts(run, read_config(run))
     ended = (run / "evaluation.json").is_file()

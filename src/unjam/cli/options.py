@@ -7,8 +7,8 @@ from typing import Annotated, Any
 import typer
 
 from unjam.errors import InputError, wrong_name
-from unjam.experiments.executors import EXECUTORS, Executor
 from unjam.parameters import parse_assignments
+from unjam.training.executors import EXECUTORS, Executor
 
 ScenarioArgument = Annotated[
     str, typer.Argument(help="A scenario's name (`unjam scenarios` lists them), or your own .sumocfg file.")

@@ -30,8 +30,8 @@ def print_json(document: Any) -> None:
 
 def metrics_table(rows_by_driver: dict[str, list[dict[str, Any]]]) -> Table:
     """Return the table of all metrics: mean and 95 % bootstrap interval over the episodes."""
-    from unjam.reports.metrics import METRICS
-    from unjam.reports.statistics import estimate
+    from unjam.measures.metrics import METRICS
+    from unjam.measures.statistics import estimate
 
     table = Table(box=None, pad_edge=False, header_style="bold")
     table.add_column("metric")

@@ -38,9 +38,9 @@ def reproduce(
     from unjam.cli.output import aside, console, print_json
 
     runner = executor_named(executor)
-    from unjam.experiments.reproduce import make_plan
-    from unjam.experiments.reproduce import reproduce as run
-    from unjam.experiments.studies.pool import Pool
+    from unjam.studies.pool import Pool
+    from unjam.studies.reproduce import make_plan
+    from unjam.studies.reproduce import reproduce as run
 
     plan = make_plan(studies, seeds, Pool(out))
     minutes = plan.seconds(workers) / 60.0

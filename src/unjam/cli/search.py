@@ -61,10 +61,10 @@ def search(
       unjam search ring --vary policy.exploration_std=0.05..0.5 --executor ray --workers 64 --out /shared/it
     """
     from unjam.cli.output import aside, console, print_json
-    from unjam.experiments.config import load_config
-    from unjam.experiments.search import BEST
-    from unjam.experiments.search import search as run
-    from unjam.experiments.search_space import check_space, space_of
+    from unjam.training.config import load_config
+    from unjam.training.search import BEST
+    from unjam.training.search import search as run
+    from unjam.training.search_space import check_space, space_of
 
     changes = run_changes(scenario, steps, seed, agent, expert, reward)
     changes |= assignments(settings)

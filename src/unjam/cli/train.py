@@ -84,8 +84,8 @@ def train(
 
       unjam train --resume runs/ring-001 --steps 2000000
     """
-    from unjam.experiments.config import load_config
-    from unjam.experiments.folder import check_possible, read_config
+    from unjam.training.config import load_config
+    from unjam.training.folder import check_possible, read_config
 
     changes = run_changes(scenario, steps, seed, agent, expert, reward)
     changes |= {
@@ -111,7 +111,7 @@ def train(
         made = load_config(config, preset, changes)
         folder = new_folder(out, made.scenario)
     check_possible(made)
-    from unjam.experiments.train import train as run  # torch: seconds that nobody waits for a wrong word
+    from unjam.training.train import train as run  # torch: seconds that nobody waits for a wrong word
 
     with nullcontext() if json else _Progress(made.steps, folder) as shown:
         result = run(made, folder, resume is not None, shown and shown.iteration, shown and shown.judging)
@@ -165,7 +165,7 @@ class _Progress:
 
 def _print_result(result: Any, json: bool) -> None:
     from unjam.cli.output import aside, console, metrics_table, print_json
-    from unjam.reports.statistics import summarise
+    from unjam.measures.statistics import summarise
     from unjam.reports.story import signed
 
     if json:

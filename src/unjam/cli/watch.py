@@ -56,13 +56,13 @@ def watch(
     from unjam.cli.output import aside, console, print_json
     from unjam.controller import make_driver
     from unjam.drivers.registry import describe
-    from unjam.experiments.evaluate import raise_failure
-    from unjam.experiments.watch import watch_in_window
     from unjam.files import check_folder
-    from unjam.reports.metrics import measure
+    from unjam.measures.metrics import measure
     from unjam.reports.video import check_format, write_video
     from unjam.scenarios.registry import make_scenario
-    from unjam.traffic.workers import EpisodeTask, Workers
+    from unjam.training.evaluate import raise_failure
+    from unjam.training.watch import watch_in_window
+    from unjam.worlds.workers import EpisodeTask, Workers
 
     road = make_scenario(
         scenario,

@@ -15,10 +15,10 @@ from unjam.drivers.residual import observation_size, observe
 from unjam.errors import EpisodeError, UnjamError
 from unjam.physics.arrays import clip
 from unjam.scenarios.registry import make_scenario
-from unjam.traffic.reward import Outcome, make_reward, time_headway
-from unjam.traffic.simulation import Backend, Simulation, libsumo_is_taken
-from unjam.traffic.stepping import make_traffic
-from unjam.traffic.traffic import Traffic
+from unjam.worlds.reward import Outcome, make_reward, time_headway
+from unjam.worlds.sumo.simulation import Backend, Simulation, libsumo_is_taken
+from unjam.worlds.sumo.stepping import make_traffic
+from unjam.worlds.sumo.traffic import Traffic
 
 Observations = NDArray[np.float32]
 

@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 
 from unjam import __version__
 from unjam.files import check_folder, write_whole
+from unjam.measures.statistics import estimate
 from unjam.reports.figures import (
     data_uri,
     learning_curve,
@@ -23,7 +24,6 @@ from unjam.reports.model_figures import errors, examples, trust
 from unjam.reports.model_story import model_section
 from unjam.reports.replay import replay_data
 from unjam.reports.results import Results, Shown, command_to_repeat, read_results
-from unjam.reports.statistics import estimate
 from unjam.reports.story import Column, cards_of, columns_of, lead_of, names_of, notes_of, table_of, title_of
 
 MOST_PANELS = 6

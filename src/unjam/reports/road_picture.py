@@ -9,8 +9,8 @@ from PIL import Image, ImageDraw, ImageFont
 
 from unjam.reports.figures import colour_table
 from unjam.scenarios.scenario import VEHICLE_LENGTH
-from unjam.traffic.places import places_along
-from unjam.traffic.traffic import Scene
+from unjam.worlds.sumo.places import places_along
+from unjam.worlds.sumo.traffic import Scene
 
 SIZE = 640
 """pixels of the square picture"""

@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from unjam.reports.metrics import METRICS
+from unjam.measures.metrics import METRICS
+from unjam.measures.statistics import Estimate, estimate, paired_difference
 from unjam.reports.results import Results, Shown
-from unjam.reports.statistics import Estimate, estimate, paired_difference
 
 CLOSE_HEADWAY = 1.0
 """time headway below which the report says so [s]; the paper's h_max"""

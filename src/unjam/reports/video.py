@@ -9,7 +9,7 @@ from PIL import Image
 from unjam.errors import InputError, MissingPartError
 from unjam.files import check_folder
 from unjam.reports.road_picture import SIZE, draw_road, scenes
-from unjam.traffic.record import Episode
+from unjam.worlds.record import Episode
 
 FRAMES_PER_SECOND = 20
 FORMATS = (".gif", ".webp", ".mp4")

@@ -12,7 +12,7 @@ from unjam.errors import InputError
 from unjam.parameters import STRICT, build
 from unjam.scenarios.road import OwnRoad, SumoConfiguration
 from unjam.scenarios.scenario import Scenario, obedient_layer, type_xml
-from unjam.scenarios.sumo_files import SumoFiles, read_sumo_files
+from unjam.sumo_files import SumoFiles, read_sumo_files
 
 CAV_TYPES = "cav_of_{}"
 """the type of a CAV whose own type is `{}`"""

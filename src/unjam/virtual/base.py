@@ -13,8 +13,8 @@ from unjam.physics.arrays import Array, as_column, at_least, namespace, stack_co
 from unjam.physics.idm import idm_acceleration
 from unjam.physics.kinematics import next_position, next_speed
 from unjam.scenarios.scenario import Scenario
-from unjam.traffic.people import as_calibrated
-from unjam.traffic.reward import Outcome, Reward, time_headway
+from unjam.worlds.reward import Outcome, Reward, time_headway
+from unjam.worlds.sumo.people import as_calibrated
 
 BASES: dict[str, Callable[[Scenario], Driver] | None] = {
     "idm": lambda scenario: IDM(**asdict(scenario.humans)),

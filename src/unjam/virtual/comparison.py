@@ -11,13 +11,13 @@ from unjam.drivers.constant import Constant
 from unjam.drivers.local_state import LocalState
 from unjam.drivers.residual import ResidualDriver
 from unjam.scenarios.scenario import Scenario
-from unjam.traffic.record import Floats
 from unjam.virtual.data import ActualData, Transitions
 from unjam.virtual.fitting import answers_of, changes_of, inputs_of, targets_of
 from unjam.virtual.model import NUMBERS, EnvironmentModel, torch_generator
 from unjam.virtual.model_error import OneStepErrors
 from unjam.virtual.rollout import begin, imagine
 from unjam.virtual.world import VirtualWorld, World
+from unjam.worlds.record import Floats
 
 
 class OpenLoop(NamedTuple):

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from unjam.drivers.local_state import LocalState
 from unjam.errors import InputError
 from unjam.scenarios.scenario import Scenario
-from unjam.traffic.record import Episode, Floats
+from unjam.worlds.record import Episode, Floats
 
 GOLDEN_RATIO = (5**0.5 - 1) / 2
 """multiples of it, modulo 1, cover the unit interval evenly from the first on, and have no period"""

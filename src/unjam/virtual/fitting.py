@@ -11,13 +11,13 @@ from torch import Tensor
 
 from unjam.errors import UnjamError
 from unjam.scenarios.scenario import Scenario
-from unjam.traffic.record import Floats
-from unjam.traffic.reward import make_reward
 from unjam.virtual.base import base_reward, base_step
 from unjam.virtual.data import Transitions
 from unjam.virtual.model import NOISE_ROWS, NUMBERS, TARGETS, EnvironmentModel
 from unjam.virtual.model_error import SMALLEST_CHANGE, OneStep, OneStepErrors, total_variation, unexplained
 from unjam.virtual.settings import VirtualSettings
+from unjam.worlds.record import Floats
+from unjam.worlds.reward import make_reward
 
 
 @dataclass(frozen=True)

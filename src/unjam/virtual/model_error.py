@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from unjam.traffic.record import Floats
 from unjam.virtual.model import TARGETS
+from unjam.worlds.record import Floats
 
 SMALLEST_CHANGE = 1e-4
 """what varies by less than this is as good as constant [m/s, m, reward]"""

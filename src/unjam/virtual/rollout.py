@@ -15,11 +15,11 @@ from unjam.drivers.local_state import LocalState
 from unjam.drivers.residual import ResidualDriver, observe
 from unjam.errors import UnjamError
 from unjam.physics.arrays import clip
-from unjam.traffic.record import Floats
 from unjam.virtual.data import ActualData
 from unjam.virtual.expert import memory_on, on_tensors, remembered
 from unjam.virtual.settings import VirtualSettings
 from unjam.virtual.world import BOUNDS, World
+from unjam.worlds.record import Floats
 
 
 def rollout_length(eps_m: float, settings: VirtualSettings) -> int:

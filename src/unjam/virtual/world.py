@@ -10,7 +10,6 @@ from unjam.drivers.from_file import is_file_reference
 from unjam.drivers.local_state import LocalState
 from unjam.physics.kinematics import distance_driven
 from unjam.scenarios.scenario import Scenario
-from unjam.traffic.reward import Outcome, Reward, make_reward
 from unjam.virtual.base import base_reward, base_step, largest_gap
 from unjam.virtual.model import (
     NOISE_ROWS,
@@ -21,6 +20,7 @@ from unjam.virtual.model import (
     predict,
     random_members,
 )
+from unjam.worlds.reward import Outcome, Reward, make_reward
 
 GAP_ROWS = slice(len(SPEEDS), len(NUMBERS))
 """where the gaps are among NUMBERS"""

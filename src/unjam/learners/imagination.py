@@ -1,0 +1,196 @@
+"""What Algorithm 1 does between actual episodes: fit the virtual environment, and imagine in it."""
+
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+from math import ceil
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from unjam.drivers.driver import Driver
+from unjam.drivers.network import Network
+from unjam.drivers.residual import ResidualDriver
+from unjam.errors import MissingPartError
+from unjam.learners.rows import Rows
+from unjam.learners.settings import PolicySettings
+from unjam.physics.idm import IDMParameters
+from unjam.scenarios.scenario import Scenario
+from unjam.virtual.data import ActualData, pack_data, unpack_data
+from unjam.virtual.fitting import fit
+from unjam.virtual.model import EnvironmentModel, torch_generator
+from unjam.virtual.people import calibrated_people
+from unjam.virtual.rollout import Rollouts, begin, imagine, return_bound, rollout_length
+from unjam.virtual.settings import VirtualSettings
+from unjam.virtual.world import VirtualWorld
+from unjam.worlds.record import Episode
+
+FIT, STARTS, NOISE, EXPLORATION = 2, 3, 4, 5
+"""what the random numbers of an iteration are for, in their seeds"""
+DATA = "data/"
+
+
+class Imagination:
+    """The virtual environment of a run, and the actual data that it learns from."""
+
+    def __init__(
+        self,
+        settings: VirtualSettings,
+        scenario: Scenario,
+        reward: str,
+        expert: Driver,
+        policy: PolicySettings,
+        run_seed: int,
+    ) -> None:
+        """Begin with physics alone, and without data.
+
+        Raises:
+            MissingPartError: the device that the settings name is not there.
+        """
+        if settings.device == "cuda" and not torch.cuda.is_available():
+            raise MissingPartError("virtual.device: cuda is not there; use cpu")
+        self.settings = settings
+        self.data = ActualData(settings.rows)
+        self.model = EnvironmentModel(settings, len(scenario.drawn_ranges), (run_seed, FIT), settings.device)
+        self.steps = 0
+        """virtual decisions of all iterations so far"""
+        self.facts: dict[str, Any] = {}
+        """what there is to say of the virtual environment in this iteration"""
+        self.scenario = scenario
+        """the road as far as it is known: with calibrated people where the settings ask for them"""
+        self._reward = reward
+        self._expert = expert
+        self._policy = policy
+        self._run_seed = run_seed
+
+    def learn(self, episodes: Sequence[Episode], iteration: int) -> None:
+        """Add actual episodes to D_a, fit the model to it, and find the rollout length of Eq. 15."""
+        first = self.data.episodes
+        self.data.add(episodes, self.scenario)
+        self._newest = [n for n, kept in enumerate(self.data.recordings) if kept.episode >= first]
+        self._actual = sum(len(self.data.recordings[place].reward) for place in self._newest)
+        settings = self.settings
+        if settings.calibrate and first == 0:
+            self._know(calibrated_people(self.data.recordings, self.scenario))
+        found = fit(
+            self.model,
+            self.data.transitions(settings.holdout),
+            settings,
+            self.scenario,
+            self._reward,
+            (self._run_seed, iteration, FIT),
+        )
+        eps_m = found.errors[settings.error]
+        self.k_star = rollout_length(eps_m, settings)
+        self.facts = {
+            "k_star": self.k_star,
+            "eps_m": eps_m,
+            "eps_m_by_estimator": found.errors,
+            "one_step": {name: error._asdict() for name, error in found.one_step.items()},
+            "learned": list(found.learned),
+            "epochs": found.epochs,
+        }
+
+    def imagine(self, network: Network, iteration: int, part: int = 0, parts: int = 1) -> Rows | None:
+        """Return the rows of virtual rollouts with the policy `network`; None where there are none.
+
+        They begin at random decisions of the newest actual episodes at which a residual was due. In all
+        `parts` of an iteration together they make `virtual_ratio` times as many decisions as those have.
+        """
+        driver = self._driver(network)
+        driven = self.k_star // driver.hold * driver.hold
+        looks = self._looks()
+        if driven == 0 or len(looks) == 0:
+            return None
+        count = ceil(self.settings.virtual_ratio * self._actual / parts / driven)
+        seeds = [(self._run_seed, iteration, purpose, part) for purpose in (STARTS, NOISE, EXPLORATION)]
+        generator = np.random.default_rng(np.random.SeedSequence(list(seeds[0])))
+        looks = looks[generator.integers(len(looks), size=count)]
+        device = self.settings.device
+        world = VirtualWorld(
+            self.model, self.scenario, self._reward, torch_generator(seeds[1], device), self.settings.noise
+        )
+        starts = begin(self.data, looks, self._expert, device)
+        rollouts = imagine(driver, world, starts, driven, torch_generator(seeds[2], device))
+        self.steps += rollouts.decisions
+        if part == 0:  # the policy that drove the actual episodes: returns can be compared
+            self.facts |= self._compared(rollouts, driven)
+        return virtual_rows(rollouts, self._policy.critic_sees_road)
+
+    def bound(self, eps_pi: float, gamma: float) -> float:
+        """Return the bound C for this iteration; `gamma` is the discount from look to look."""
+        return self.bound_at(self.k_star, eps_pi, self.facts["eps_m_by_estimator"]["total_variation"], gamma)
+
+    def bound_at(self, k: int, eps_pi: float, eps_m: float, gamma: float) -> float:
+        """Return the bound C with rollouts of `k` decisions; `gamma` is the discount from look to look."""
+        return return_bound(eps_pi, eps_m, k, self.decision_discount(gamma), self.largest_reward)
+
+    @property
+    def largest_reward(self) -> float:
+        """R_max: the largest |reward| of a decision in the actual data."""
+        return max(float(np.abs(kept.reward).max()) for kept in self.data.recordings)
+
+    def decision_discount(self, gamma: float) -> float:
+        """Return the discount from decision to decision; `gamma` is that from look to look."""
+        return gamma ** (1 / self._policy.decisions_held(self.scenario.decision_step))
+
+    def state(self) -> tuple[dict[str, Any], dict[str, torch.Tensor]]:
+        """Return all that a run must keep of it to go on, as JSON and tensors."""
+        facts, arrays = pack_data(self.data)
+        tensors = {f"{DATA}{name}": torch.from_numpy(np.array(array)) for name, array in arrays.items()}
+        tensors |= {name: tensor.cpu() for name, tensor in self.model.state_dict().items()}
+        return {"steps": self.steps, "data": facts, "people": asdict(self.scenario.humans)}, tensors
+
+    def restore(self, facts: dict[str, Any], tensors: dict[str, torch.Tensor]) -> None:
+        """Go on from what `state` returned."""
+        arrays = {name.removeprefix(DATA): t.numpy() for name, t in tensors.items() if name.startswith(DATA)}
+        self.data = unpack_data(facts["data"], arrays)
+        self.steps = facts["steps"]
+        self._know(IDMParameters(**facts["people"]))
+        self.model.load_state_dict({n: t for n, t in tensors.items() if not n.startswith(DATA)})
+
+    def _know(self, people: IDMParameters) -> None:
+        self.scenario = replace(self.scenario, humans=people)
+
+    def _driver(self, network: Network) -> ResidualDriver:
+        scenario, policy = self.scenario, self._policy
+        hold = policy.decisions_held(scenario.decision_step)
+        return ResidualDriver(self._expert, network, scenario.action_limit, policy.observe, hold)
+
+    def _looks(self) -> NDArray[np.int64]:
+        looks = self.data.looks()
+        return looks[np.isin(looks[:, 0], self._newest)]
+
+    def _compared(self, rollouts: Rollouts, driven: int) -> dict[str, Any]:
+        """Return how virtual returns compare with what was earned from the same rows, and what went wrong."""
+        virtual, actual = [], []
+        for earned, (place, at) in zip(rollouts.rewards.sum(1).tolist(), rollouts.start, strict=True):
+            reward = self.data.recordings[place].reward
+            if at + driven <= len(reward):
+                virtual.append(earned)
+                actual.append(float(reward[at : at + driven].sum()))
+        return {
+            "return_virtual": float(np.mean(virtual)) if virtual else None,
+            "return_actual": float(np.mean(actual)) if actual else None,
+            "crash_share": float(rollouts.terminated.double().mean()),
+            "bounded": rollouts.bounded,
+        }
+
+
+def virtual_rows(rollouts: Rollouts, critic_sees_road: bool) -> Rows:
+    """Return virtual rollouts in the form in which learners take them; the cut at k* is no termination."""
+    made = rollouts.made.cpu().numpy()
+    seen = rollouts.observations.cpu().numpy()
+    if critic_sees_road:
+        drawn = rollouts.drawn.cpu().numpy()[:, None, :]
+        seen = np.concatenate([seen, np.broadcast_to(drawn, (*seen.shape[:2], drawn.shape[2]))], axis=2)
+    counted = np.arange(seen.shape[1] - 1) < made[:, None]
+    return Rows(
+        observations=seen[:, :-1][counted].astype(np.float32),
+        actions=rollouts.actions.cpu().numpy()[counted].astype(np.float32),
+        rewards=rollouts.rewards.cpu().numpy()[counted].astype(np.float64),
+        starts=np.concatenate([[0], made.cumsum()[:-1]]).astype(np.intp),
+        last_observations=seen[np.arange(len(made)), made].astype(np.float32),
+        terminated=rollouts.terminated.cpu().numpy(),
+    )

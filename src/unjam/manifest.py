@@ -1,0 +1,57 @@
+"""Where a result comes from: versions, machine, commit, command."""
+
+import os
+import platform
+import subprocess
+import sys
+from datetime import UTC, datetime
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+from unjam import __version__
+
+PACKAGES = ("libsumo", "eclipse-sumo", "numpy", "torch", "stable-baselines3", "sb3-contrib", "gymnasium")
+
+
+def manifest() -> dict[str, Any]:
+    """Return what is needed to repeat a result made now, by this process."""
+    return {
+        "unjam": __version__,
+        "commit": _commit(),
+        "python": platform.python_version(),
+        "packages": package_versions(),
+        "machine": {"system": platform.platform(), "processor": platform.machine(), "cores": os.cpu_count()},
+        "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
+        "started": datetime.now(UTC).isoformat(timespec="seconds"),
+    }
+
+
+def package_versions() -> dict[str, str | None]:
+    """Return the installed versions of what results depend on; None of what is not there."""
+    return {name: _version(name) for name in PACKAGES}
+
+
+def _version(package: str) -> str | None:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None
+
+
+def _commit() -> str | None:
+    """Return the commit of the source tree that this runs from, `+` where it was changed; None elsewhere."""
+    here = Path(__file__).parent
+    try:
+        found = subprocess.run(
+            ["git", "describe", "--always", "--abbrev=12", "--dirty=+"],
+            cwd=here,
+            capture_output=True,
+            text=True,
+            timeout=10,
+            check=True,
+        )
+    except (OSError, subprocess.SubprocessError):
+        return None
+    tracked = subprocess.run(["git", "ls-files", "--error-unmatch", __file__], cwd=here, capture_output=True)
+    return found.stdout.strip() if tracked.returncode == 0 else None

@@ -1,0 +1,269 @@
+"""What is measured of an episode. Each metric is defined here, once, with its unit and source."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from unjam.worlds.record import Episode, Floats, outcome_of
+from unjam.worlds.reward import eq16
+
+STEADY_STEPS = 1000
+"""decisions at the end of an episode that count as steady state; of one that is no longer, its second half"""
+STANDING_SPEED = 0.1
+"""[m/s]; SUMO's own threshold for a halting vehicle"""
+CALM_STD = 0.3
+"""std of speed across vehicles below which traffic is calm [m/s]"""
+CALM_SECONDS = 60.0
+"""how long traffic must stay calm before its wave counts as dissolved"""
+PETROL_DENSITY = 742.0
+"""[mg/ml], as in SUMO's PollutantsInterface"""
+MOVING_SPEED = 1.0
+"""speed above which a time headway is a matter of safety [m/s]"""
+
+
+def _steady(values: Floats) -> Floats:
+    return values[-STEADY_STEPS:] if len(values) > STEADY_STEPS else values[len(values) // 2 :]
+
+
+def _over_cavs(values: Sequence[Any]) -> float:
+    """Return the mean over CAVs; NaN where there were none."""
+    return float(np.mean(values)) if len(values) else float("nan")
+
+
+def _mean_there(speeds: Floats) -> float:
+    """Return the mean over all that are on the road; NaN where nobody ever was."""
+    there = speeds[~np.isnan(speeds)]
+    return float(there.mean()) if there.size else float("nan")
+
+
+def _std_across(speeds: Floats) -> float:
+    """Return the std across vehicles at one moment, averaged over the moments with at least one."""
+    there = ~np.isnan(speeds).all(axis=1)
+    return float(np.nanstd(speeds[there], axis=1).mean()) if there.any() else float("nan")
+
+
+def mean_speed(episode: Episode) -> float:
+    """Mean over all vehicles and all steps of the episode, start-up included [m/s]. The honest convention."""
+    return _mean_there(episode.speeds[1:])
+
+
+def mean_speed_of_moments(episode: Episode) -> float:
+    """Mean over the moments of the mean over the vehicles then on the road [m/s]: Flow's convention.
+
+    Where vehicles come and go it counts a moment with few vehicles as much as one in a jam.
+    """
+    moments = episode.speeds[1:]
+    return _mean_there(np.nanmean(moments[~np.isnan(moments).all(axis=1)], axis=1))
+
+
+def mean_speed_steady(episode: Episode) -> float:
+    """Mean over all vehicles in the last 1,000 steps [m/s]; of a shorter episode, in its second half."""
+    return _mean_there(_steady(episode.speeds[1:]))
+
+
+def speed_std_fleet(episode: Episode) -> float:
+    """Standard deviation of speed across vehicles at one moment, averaged over the episode [m/s].
+
+    The size of the waves: zero when all drive alike. Stern et al. 2018, section 4.
+    """
+    return _std_across(episode.speeds[1:])
+
+
+def speed_std_fleet_steady(episode: Episode) -> float:
+    """Standard deviation of speed across vehicles, averaged over the steady state [m/s]."""
+    return _std_across(_steady(episode.speeds[1:]))
+
+
+def speed_std_cav(episode: Episode) -> float:
+    """Standard deviation over time of the CAV's own speed [m/s]: the paper's `speed std` (Table 1)."""
+    return _over_cavs([np.std(trajectory.states.speed[1:]) for trajectory in episode.trajectories])
+
+
+def cav_mean_speed(episode: Episode) -> float:
+    """Mean over time of the CAV's own speed [m/s]: the paper's `average speed` (Table 1)."""
+    return _over_cavs([np.mean(trajectory.states.speed[1:]) for trajectory in episode.trajectories])
+
+
+def speed_limit_ratio(episode: Episode) -> float:
+    """Mean speed over the scenario's own limit; on the ring the IDM equilibrium speed of its length."""
+    return mean_speed(episode) / episode.limit_speed
+
+
+def speed_limit_ratio_steady(episode: Episode) -> float:
+    """Mean speed in the steady state over the scenario's own limit."""
+    return mean_speed_steady(episode) / episode.limit_speed
+
+
+def episode_return(episode: Episode) -> float:
+    """Sum of the reward that the episode was run with, not discounted; all CAVs share it."""
+    return float(episode.reward.sum())
+
+
+def return_eq16(episode: Episode) -> float:
+    """Sum of the paper's reward, Eq. 16 with its sign mended, not discounted."""
+    outcome = outcome_of(episode.speeds, episode.trajectories, episode.status == "collision")
+    return float(sum(term.sum() for term in eq16(outcome).values()))
+
+
+def mean_abs_accel(episode: Episode) -> float:
+    """Mean absolute acceleration that the CAV was told [m/s2]; of a human driver, what it did."""
+    return _over_cavs([np.abs(trajectory.applied).mean() for trajectory in episode.trajectories])
+
+
+def mean_abs_jerk(episode: Episode) -> float:
+    """Mean absolute change of the CAV's actual acceleration per second [m/s3]."""
+    speeds = [trajectory.states.speed for trajectory in episode.trajectories]
+    jerks = [np.abs(np.diff(speed, 2)).mean() for speed in speeds if len(speed) > 2]
+    return float(np.mean(jerks) / episode.step**2) if jerks else float("nan")
+
+
+def share_standing(episode: Episode) -> float:
+    """Share of vehicle-seconds spent below 0.1 m/s."""
+    there = ~np.isnan(episode.speeds[1:])
+    return _mean_there(np.where(there, episode.speeds[1:] < STANDING_SPEED, np.nan))
+
+
+def time_to_dissolve(episode: Episode) -> float:
+    """Time until the wave that an episode starts with is dissolved [s]; NaN if there is none or it stays.
+
+    From the first decision to the first moment from which on the std of speed across vehicles stays below
+    0.3 m/s for 60 s on end.
+    """
+    anybody = ~np.isnan(episode.speeds).all(axis=1)
+    calm = np.ones(len(episode.speeds), bool)
+    calm[anybody] = np.nanstd(episode.speeds[anybody], axis=1) < CALM_STD
+    needed = round(CALM_SECONDS / episode.step)
+    if calm[0] or len(calm) < needed:
+        return float("nan")
+    runs = np.convolve(calm, np.ones(needed), "valid")
+    found = np.flatnonzero(runs > needed - 0.5)
+    return float(found[0] * episode.step) if len(found) else float("nan")
+
+
+def min_ttc(episode: Episode) -> float:
+    """Smallest time to collision [s], gap over closing speed, of the CAV and of the vehicle behind it.
+
+    Infinite where nobody ever closed in. Hayward 1972.
+    """
+    smallest = np.inf
+    for trajectory in episode.trajectories:
+        own, leader, gap, follower, gap_behind, *_ = trajectory.states
+        for distance, closing in ((gap, own - leader), (gap_behind, follower - own)):
+            near = closing > 0
+            if near.any():
+                smallest = min(smallest, float((distance[near] / closing[near]).min()))
+    return smallest
+
+
+def min_headway(episode: Episode) -> float:
+    """Smallest time headway of the CAV, gap over speed, while it drives faster than 1 m/s [s]."""
+    smallest = np.inf
+    for trajectory in episode.trajectories:
+        moving = trajectory.states.speed > MOVING_SPEED
+        headway = trajectory.states.leader_gap[moving] / trajectory.states.speed[moving]
+        smallest = min(smallest, float(headway.min(initial=np.inf)))
+    return smallest
+
+
+def collisions(episode: Episode) -> float:
+    """Vehicles that touched another; the episode ends there."""
+    return float(episode.collisions)
+
+
+def shield_override_share(episode: Episode) -> float:
+    """Share of the CAV's commands that SUMO's safety check did not let pass (by more than 1e-6 m/s)."""
+    tolerance = 1e-6 / episode.step
+    return _over_cavs([(trajectory.shield > tolerance).mean() for trajectory in episode.trajectories])
+
+
+def shield_max_braking(episode: Episode) -> float:
+    """Hardest braking that the safety check added to a command [m/s2]."""
+    return float(max((trajectory.shield.max() for trajectory in episode.trajectories), default=np.nan))
+
+
+def fuel_ml_per_km(episode: Episode) -> float:
+    """Fuel of all vehicles per kilometre [ml/km], by the scenario's emission class.
+
+    NaN if it was not recorded, or nobody drove.
+
+    SUMO's emission model: https://sumo.dlr.de/docs/Models/Emissions.html
+    """
+    if episode.fuel.size == 0:
+        return float("nan")
+    driven = float(np.nansum(episode.speeds[1:])) * episode.step
+    if driven == 0:
+        return float("nan")
+    return float(np.nansum(episode.fuel)) * episode.step / PETROL_DENSITY / (driven / 1000.0)
+
+
+def throughput_veh_per_h(episode: Episode) -> float:
+    """Flow [veh/h]: on a closed road distance driven by all vehicles over length and time (Edie 1963); of a
+    road with ends, the vehicles that left it over time.
+    """
+    hours = episode.steps * episode.step / 3600.0
+    if np.isnan(episode.loop_length):
+        return episode.arrived / hours
+    driven = np.nansum(episode.positions[-1] - episode.positions[0])
+    return float(driven / episode.loop_length / hours)
+
+
+def backlog_veh(episode: Episode) -> float:
+    """Vehicles that wait to enter at the end; on a closed road nobody does."""
+    return float(episode.waiting[-1]) if len(episode.waiting) else 0.0
+
+
+@dataclass(frozen=True)
+class Metric:
+    """A metric as tables show it."""
+
+    function: Callable[[Episode], float]
+    label: str
+    unit: str
+    digits: int = 2
+
+
+METRICS: dict[str, Metric] = {
+    "mean_speed": Metric(mean_speed, "mean speed", "m/s"),
+    "mean_speed_of_moments": Metric(mean_speed_of_moments, "mean speed, moments alike", "m/s"),
+    "mean_speed_steady": Metric(mean_speed_steady, "mean speed, steady", "m/s"),
+    "speed_limit_ratio": Metric(speed_limit_ratio, "mean speed / limit", "", 3),
+    "speed_limit_ratio_steady": Metric(speed_limit_ratio_steady, "mean speed / limit, steady", "", 3),
+    "speed_std_fleet": Metric(speed_std_fleet, "speed std across vehicles", "m/s"),
+    "speed_std_fleet_steady": Metric(speed_std_fleet_steady, "speed std across vehicles, steady", "m/s"),
+    "share_standing": Metric(share_standing, "share of time standing", "", 3),
+    "time_to_dissolve": Metric(time_to_dissolve, "time until the wave is dissolved", "s", 0),
+    "cav_mean_speed": Metric(cav_mean_speed, "CAV's mean speed", "m/s"),
+    "speed_std_cav": Metric(speed_std_cav, "CAV's speed std over time", "m/s"),
+    "return": Metric(episode_return, "return", "", 0),
+    "return_eq16": Metric(return_eq16, "return, Eq. 16", "", 0),
+    "mean_abs_accel": Metric(mean_abs_accel, "CAV's mean |acceleration|", "m/s2", 3),
+    "mean_abs_jerk": Metric(mean_abs_jerk, "CAV's mean |jerk|", "m/s3", 3),
+    "min_ttc": Metric(min_ttc, "smallest time to collision", "s"),
+    "min_headway": Metric(min_headway, "smallest time headway", "s"),
+    "collisions": Metric(collisions, "vehicles in collisions", "", 0),
+    "shield_override_share": Metric(shield_override_share, "commands overridden", "", 4),
+    "shield_max_braking": Metric(shield_max_braking, "hardest braking added", "m/s2"),
+    "fuel_ml_per_km": Metric(fuel_ml_per_km, "fuel", "ml/km", 1),
+    "throughput_veh_per_h": Metric(throughput_veh_per_h, "flow", "veh/h", 0),
+    "backlog_veh": Metric(backlog_veh, "vehicles waiting to enter", "", 0),
+}
+
+
+def measure(episode: Episode) -> dict[str, Any]:
+    """Return the row of an episode: seed, status, steps, what was drawn, and every metric by name.
+
+    The metrics of a failed episode are NaN, and its row has the reason.
+    """
+    row: dict[str, Any] = {
+        "seed": episode.seed[0] if len(episode.seed) == 1 else list(episode.seed),
+        "status": episode.status,
+        "reason": episode.reason,
+        "error": episode.error,
+        "steps": episode.steps,
+        **episode.drawn,
+    }
+    for name, metric in METRICS.items():
+        row[name] = metric.function(episode) if episode.ok else float("nan")
+    return row

@@ -1,0 +1,86 @@
+"""Means over seeds, and how far to trust them."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.stats import bootstrap, trim_mean
+
+from unjam.measures.metrics import METRICS
+
+CONFIDENCE = 0.95
+RESAMPLES = 2000
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A mean over seeds with its bootstrap interval; NaN where there is nothing to average."""
+
+    mean: float
+    low: float
+    high: float
+    count: int
+    """values that it is the mean of"""
+
+
+def estimate(values: Sequence[float], statistic: Callable[..., Any] = np.mean) -> Estimate:
+    """Return the mean of `values` and its 95 % percentile bootstrap interval; NaN values are left out.
+
+    The interval is deterministic: its resamples come from a fixed seed. Of one value it is NaN. Another
+    `statistic` than the mean takes the values and an axis, like NumPy's.
+    """
+    finite = np.array([value for value in values if np.isfinite(value)], float)
+    if len(finite) == 0:
+        return Estimate(float("nan"), float("nan"), float("nan"), 0)
+    mean = float(statistic(finite, axis=0))
+    if len(finite) == 1:
+        return Estimate(mean, float("nan"), float("nan"), 1)
+    if np.ptp(finite) == 0:
+        return Estimate(mean, mean, mean, len(finite))
+    found = bootstrap(
+        (finite,), statistic, confidence_level=CONFIDENCE, n_resamples=RESAMPLES, method="percentile", rng=0
+    )
+    low, high = found.confidence_interval
+    return Estimate(mean, float(low), float(high), len(finite))
+
+
+def summarise(rows: Sequence[dict[str, Any]]) -> dict[str, Estimate]:
+    """Return the estimate of every metric over the rows of `measure`."""
+    return {name: estimate([row[name] for row in rows]) for name in METRICS}
+
+
+def paired_difference(
+    rows: Sequence[dict[str, Any]], others: Sequence[dict[str, Any]], name: str
+) -> Estimate:
+    """Return the estimate of the difference, same seeds paired, of a metric between two sets of rows."""
+    other = {str(row["seed"]): row[name] for row in others}
+    return estimate([row[name] - other[str(row["seed"])] for row in rows if str(row["seed"]) in other])
+
+
+def interquartile_mean(values: Any, axis: int = -1) -> Any:
+    """Return the mean of the middle half of values; Agarwal et al. 2021, `Deep RL at the edge of the
+    statistical precipice`.
+    """
+    return trim_mean(values, 0.25, axis=axis)
+
+
+def probability_of_improvement(
+    runs: Sequence[Sequence[dict[str, Any]]], others: Sequence[dict[str, Any]], name: str
+) -> Estimate:
+    """Return how often a trained controller is better than another driver on the same seed.
+
+    Args:
+        runs: rows of metrics of each training, on the same held-out seeds.
+        others: rows of the other driver.
+        name: of the metric; larger is better, and a tie counts half.
+
+    Returns:
+        The mean over trainings of the share of episodes, with its bootstrap interval over trainings.
+    """
+    other = {str(row["seed"]): row[name] for row in others}
+    shares = []
+    for rows in runs:
+        differences = np.array([row[name] - other[str(row["seed"])] for row in rows])
+        shares.append(float(np.mean((differences > 0) + 0.5 * (differences == 0))))
+    return estimate(shares)

@@ -1,0 +1,156 @@
+"""The paper's theorems, each with what can be measured of it.
+
+A1 is about untrained policies, A2 about convergence, A3 about the model and the bound.
+"""
+
+from collections.abc import Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib import rc_context
+from matplotlib.figure import Figure
+
+from unjam.drivers.constant import Constant
+from unjam.drivers.network import Network
+from unjam.drivers.residual import ResidualDriver, observation_size
+from unjam.files import to_json, write_whole
+from unjam.measures.statistics import estimate
+from unjam.reports.figures import INK, LINES, STYLE
+from unjam.studies.plan import PAPERS_ROADS, VARIANTS, PlannedRun, planned
+from unjam.studies.pool import Pool
+from unjam.studies.study import Study
+from unjam.studies.table import entries
+from unjam.training.evaluate import evaluate, held_out_seeds
+from unjam.worlds.workers import Workers
+
+ROAD = "ring"
+WITH_MODEL = ("proposed", "no-initial-policy", "mb-trpo", "ours")
+COMPARED = ("trpo", "ppo", "sac", "proposed", "ours")
+RANDOM_POLICIES = 10
+TOLERANCE = 0.05
+"""share of the best known return within which a training counts as converged (A2)"""
+
+
+def random_network(inputs: int, authority: float, seed: int, hidden: int = 64) -> Network:
+    """Return a policy network whose weights nobody has trained, drawn like those of torch's linear layers."""
+    generator = np.random.default_rng(np.random.SeedSequence([seed]))
+    sizes = (inputs, hidden, hidden, 1)
+    layers = []
+    for rows, columns in pairwise(sizes):
+        width = rows**-0.5
+        weight, bias = (
+            generator.uniform(-width, width, (rows, columns)),
+            generator.uniform(-width, width, columns),
+        )
+        layers.append((weight, bias))
+    return Network(tuple(layers), authority)
+
+
+def untrained(
+    roads: Sequence[str] = PAPERS_ROADS, policies: int = RANDOM_POLICIES, processes: int = 2
+) -> list[dict[str, Any]]:
+    """A1: return of the expert plus a random residual beside a random network alone, on the same seeds."""
+    rows = []
+    with Workers(processes) as workers:
+        for road in roads:
+            config = PlannedRun(road, "proposed", 0).config
+            scenario, expert, parts = config.make_scenario(), config.make_expert(), config.policy.observe
+            limit = scenario.action_limit
+            drivers = {"expert alone": expert}
+            for number in range(policies):
+                for kind, base in (("expert + random", expert), ("random", Constant())):
+                    network = random_network(observation_size(parts, base), limit, number)
+                    drivers[f"{kind} {number}"] = ResidualDriver(base, network, limit, parts)
+            found = evaluate(scenario, drivers, held_out_seeds(4), workers)
+            returns = {label: means["return"] for label, means in found.means().items()}
+            for kind in ("expert + random", "random"):
+                values = [mean for label, mean in returns.items() if label.startswith(f"{kind} ")]
+                rows.append({"road": road, "policy": kind, "returns": values, **entries(estimate(values))})
+            rows.append({"road": road, "policy": "expert alone", "mean": returns["expert alone"]})
+    return rows
+
+
+def convergence(pool: Pool, seeds: int) -> list[dict[str, Any]]:
+    """A2: which trainings come to within a share of the best return that is known, and when."""
+    runs = {
+        variant: pool.trained([PlannedRun(ROAD, variant, seed) for seed in range(seeds)])
+        for variant in COMPARED
+    }
+    best = max(row["return_mean"] for found in runs.values() for run in found for row in run.progress)
+    enough = best - TOLERANCE * abs(best)
+    rows = []
+    for variant, found in runs.items():
+        arrivals = []
+        for run in found:
+            near = [row for row in run.progress if row["return_mean"] >= enough]
+            arrivals.append(near[0]["actual_steps"] if near else None)
+        last = [run.in_training("return_mean") for run in found]
+        rows.append(
+            {
+                "variant": variant,
+                "name": VARIANTS[variant].label,
+                "best_known": best,
+                "arrivals": arrivals,
+                "stayed": sum(value >= enough for value in last),
+                "trainings": len(found),
+                "last": entries(estimate(last)),
+            }
+        )
+    return rows
+
+
+def model_over_training(pool: Pool, seeds: int) -> dict[str, list[list[dict[str, Any]]]]:
+    """A3: eps_m, k*, the bound, and how far virtual returns are from actual ones; by variant and seed."""
+    found = {}
+    for variant in WITH_MODEL:
+        runs = pool.trained([PlannedRun(ROAD, variant, seed) for seed in range(seeds)])
+        found[variant] = [[_model_facts(row) for row in run.progress] for run in runs]
+    return found
+
+
+def _model_facts(row: dict[str, Any]) -> dict[str, Any]:
+    virtual = row["virtual"]
+    pair = virtual.get("return_virtual"), virtual.get("return_actual")
+    gap = None if None in pair else abs(pair[0] - pair[1])
+    names = ("k_star", "eps_m", "eps_m_by_estimator", "bound")
+    return {"steps": row["actual_steps"], "gap": gap, **{name: virtual.get(name) for name in names}}
+
+
+def draw(by_variant: dict[str, list[list[dict[str, Any]]]]) -> Figure:
+    """Draw the model error and the rollout length over training, a line per training."""
+    with rc_context(STYLE):
+        figure = Figure(figsize=(10.5, 3.4), layout="constrained", dpi=130)
+        panels = figure.subplots(1, 2)
+        labels = {"eps_m": "model error eps_m (unexplained)", "k_star": "rollout length k* [decisions]"}
+        for (name, label), axes in zip(labels.items(), panels, strict=True):
+            for (variant, runs), colour in zip(by_variant.items(), LINES[1:], strict=False):
+                for number, run in enumerate(runs):
+                    steps = [row["steps"] / 1000.0 for row in run]
+                    words = VARIANTS[variant].label if number == 0 else None
+                    axes.plot(steps, [row[name] for row in run], color=colour, lw=1.2, label=words)
+            axes.set_title(label, loc="left", fontsize=9, color=INK)
+            axes.set_xlabel("actual simulator steps [thousands]")
+        panels[1].set_yscale("log")  # from 2 to 500
+        figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper left", ncols=5)
+        return figure
+
+
+def _write(pool: Pool, seeds: int, folder: Path, workers: int) -> None:
+    by_variant = model_over_training(pool, seeds)
+    found = {
+        "untrained": untrained(processes=workers),
+        "convergence": convergence(pool, seeds),
+        "model": by_variant,
+    }
+    write_whole(folder / "theory.json", to_json(found, indent=1))
+    draw(by_variant).savefig(folder / "model.png")
+
+
+THEORY = Study(
+    "what can be measured of the theorems A1, A2 and A3",
+    lambda seeds: planned([ROAD], tuple(dict.fromkeys((*COMPARED, *WITH_MODEL))), seeds),
+    _write,
+    minutes=8.0,
+)

@@ -1,0 +1,234 @@
+"""Reads the user's own SUMO files: a program of its own, so that no file can harm who asks.
+
+Started by `unjam.sumo_files` with limits on memory and time; answers one JSON document. It uses
+Python's own library alone, and starts in a twentieth of a second.
+"""
+
+import gzip
+import json
+import sys
+import zlib
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from math import isfinite, nan
+from pathlib import Path
+from typing import IO, Any, Literal, NamedTuple
+from xml.etree import ElementTree
+from xml.parsers import expat
+
+DEFAULT_TYPE = "DEFAULT_VEHTYPE"
+"""SUMO's type of vehicles that name none"""
+OTHER_DEFAULT_TYPES = {
+    "DEFAULT_BIKETYPE": "bicycle",
+    "DEFAULT_TAXITYPE": "taxi",
+    "DEFAULT_RAILTYPE": "rail",
+}
+"""vehicle classes of SUMO's other types that no file need define"""
+DEMAND = ("vehicle", "trip", "flow")
+UNITS = (1.0, 60.0, 3600.0, 86400.0)
+"""seconds, minutes, hours and days [s]: SUMO's times may be 1:30:00"""
+CHUNK = 65_536
+"""bytes read at once"""
+SYNONYMS = {"net": "net-file", "routes": "route-files", "additional": "additional-files"}
+
+
+class Broken(Exception):
+    """What is wrong with a file, in one line."""
+
+
+def read_configuration(path: Path) -> dict[str, Any]:
+    """Return what a .sumocfg file and the files that it names say, as JSON; the fields of `SumoFiles`.
+
+    Raises:
+        Broken: one is missing or broken, the network has no version, or there are no vehicles.
+    """
+    options, network, additional, routes = _named(path)
+    files = [path, network, *additional, *routes]
+    for file in files:
+        if not file.is_file():
+            raise Broken(f"{str(file)!r}: there is no such file")
+    stamps = [list(stamp(file)) for file in files]
+    _check_network(network)
+    demand = _Demand({}, {}, set())
+    for file in [*additional, *routes]:
+        _read_demand(file, demand)
+    if not demand.wanted:
+        raise Broken(f"{path.name}: its route and additional files have no vehicle, trip or flow")
+    used = set().union(*(demand.mixtures.get(name, {name}) for name in demand.wanted))
+    demand.types.setdefault(DEFAULT_TYPE, {})
+    for name, kind in OTHER_DEFAULT_TYPES.items():
+        if name in used:
+            demand.types.setdefault(name, {"vClass": kind})
+    begin = _seconds(path, options, "begin", 0.0) or 0.0
+    end = _seconds(path, options, "end", None)
+    if end is not None and end <= begin:
+        raise Broken(f"{path.name}: end: {end:g} s is not allowed; allowed: after begin, {begin:g} s")
+    return {
+        "network": str(network),
+        "additional_files": [str(file) for file in additional],
+        "begin": begin,
+        "end": end,
+        "step": _seconds(path, options, "step-length", 1.0) or 1.0,
+        "types": demand.types,
+        "used_types": sorted(used),
+        "files": [str(file) for file in files],
+        "stamps": stamps,
+    }
+
+
+def read_lanes(path: Path) -> list[list[str]]:
+    """Return edge, length [m] and centre line of each lane of a network file, as they are written there."""
+    lanes = []
+    for element in _elements(path, "end"):
+        if element.tag == "lane":
+            lane = [element.get(name, "") for name in ("id", "length", "shape")]
+            lanes.append([lane[0].rpartition("_")[0], *lane[1:]])
+        if element.tag == "edge":
+            element.clear()
+    return lanes
+
+
+def stamp(file: Path) -> tuple[int, int]:
+    """Return time of change and size of a file: another content has another stamp."""
+    found = file.stat()
+    return found.st_mtime_ns, found.st_size
+
+
+class _Named(NamedTuple):
+    """What a .sumocfg file says, and the files that it names."""
+
+    options: dict[str, str]
+    network: Path
+    additional: tuple[Path, ...]
+    routes: tuple[Path, ...]
+
+
+def _named(path: Path) -> _Named:
+    if not path.is_file():
+        raise Broken(f"{str(path)!r}: there is no such file")
+    options = {
+        SYNONYMS.get(element.tag, element.tag): element.get("value", "")
+        for element in _elements(path, "end")
+        if element.get("value") is not None
+    }
+    if not options.get("net-file"):
+        raise Broken(f"{path.name}: names no net-file")
+    additional, routes = (
+        tuple(path.parent / name for name in options.get(files, "").replace(",", " ").split())
+        for files in ("additional-files", "route-files")
+    )
+    return _Named(options, path.parent / options["net-file"], additional, routes)
+
+
+def _seconds(path: Path, options: dict[str, str], name: str, otherwise: float | None) -> float | None:
+    """Return a time option [s]; SUMO writes -1 for no end."""
+    text = options.get(name)
+    if text is None or (name == "end" and text.strip() in ("-1", "-1.00")):
+        return otherwise
+    parts = text.split(":")
+    try:
+        value = sum(float(part) * unit for part, unit in zip(reversed(parts), UNITS, strict=False))
+    except ValueError:
+        value = nan
+    if (
+        not isfinite(value)
+        or value < 0
+        or len(parts) not in (1, 3, 4)
+        or (name == "step-length" and not value)
+    ):
+        allowed = "seconds > 0" if name == "step-length" else "seconds, hours:minutes:seconds"
+        raise Broken(f"{path.name}: {name}: {text!r} is not allowed; allowed: {allowed}")
+    return value
+
+
+def _check_network(path: Path) -> None:
+    """Raise `Broken` unless it is whole, and a network with a version.
+
+    SUMO itself would crash without a version, and says nothing of a file that is torn off.
+    """
+    elements = _elements(path, "start")
+    root = next(elements)
+    version = root.get("version")
+    for _ in elements:
+        root.clear()
+    if root.tag != "net":
+        raise Broken(f"{path.name}: is not a SUMO network: it begins with <{root.tag}>")
+    if not version:
+        raise Broken(f"{path.name}: the network has no version; make it anew: netconvert -s {path.name} -o")
+
+
+class _Demand(NamedTuple):
+    """What files of routes hold."""
+
+    types: dict[str, dict[str, str]]
+    mixtures: dict[str, set[str]]
+    """types of each distribution; it may be used in another file than the one that defines it"""
+    wanted: set[str]
+    """types and distributions that vehicles have"""
+
+
+def _read_demand(path: Path, demand: _Demand) -> None:
+    """Add what a file defines, and what its vehicles have."""
+    for element in _elements(path, "end"):
+        name = element.get("id", "")
+        if element.tag == "vType":
+            demand.types[name] = dict(element.attrib)
+        elif element.tag == "vTypeDistribution":
+            inside = [child.get("id", "") for child in element if child.tag == "vType"]
+            demand.mixtures[name] = {*inside, *element.get("vTypes", "").split()}
+        elif element.tag in DEMAND:
+            demand.wanted.add(element.get("type", DEFAULT_TYPE))
+
+
+def _elements(path: Path, event: Literal["start", "end"]) -> Iterator[ElementTree.Element]:
+    """Yield the elements of an XML file, also of a compressed one, as they end (or start)."""
+    try:
+        _refuse_definitions(path)
+        with _open(path) as file:
+            for _, element in ElementTree.iterparse(file, (event,)):
+                yield element
+    except (ElementTree.ParseError, OSError, EOFError, zlib.error, LookupError, ValueError) as error:
+        raise Broken(f"{path.name}: cannot be read: {' '.join(str(error).split())}") from None
+
+
+def _refuse_definitions(path: Path) -> None:
+    """Raise `Broken` where a file has a document type: it can name other files, or grow without end.
+
+    SUMO's own files have none, and SUMO itself would follow what it names.
+    """
+    seen = []
+    parser = expat.ParserCreate()
+    parser.StartDoctypeDeclHandler = lambda *_: seen.append("doctype")
+    parser.StartElementHandler = lambda *_: seen.append("root")
+    with _open(path) as file, suppress(expat.ExpatError):  # what is broken is told when it is read
+        while not seen and (chunk := file.read(CHUNK)):
+            parser.Parse(chunk)
+    if seen[:1] == ["doctype"]:
+        raise Broken(f"{path.name}: a document type (<!DOCTYPE ...>) is not allowed")
+
+
+def _open(path: Path) -> IO[bytes]:
+    return gzip.open(path) if path.suffix == ".gz" else path.open("rb")  # type: ignore[return-value]
+
+
+COMMANDS: dict[str, Callable[[Path], Any]] = {"configuration": read_configuration, "lanes": read_lanes}
+
+
+def main(command: str, path: str, memory: str, seconds: str) -> None:
+    """Print what a file says, or what is wrong with it, under limits on memory [bytes] and time [s]."""
+    with suppress(ImportError):  # not on Windows
+        import resource
+
+        resource.setrlimit(resource.RLIMIT_AS, (int(memory), int(memory)))
+        resource.setrlimit(resource.RLIMIT_CPU, (int(seconds), int(seconds)))
+    try:
+        found = {"found": COMMANDS[command](Path(path))}
+    except Broken as error:
+        found = {"broken": str(error)}
+    except (MemoryError, RecursionError):
+        found = {"broken": f"{Path(path).name}: its files are too large to be read"}
+    sys.stdout.write(json.dumps(found))
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

@@ -1,0 +1,135 @@
+"""A controller as a file that can be shipped: the run's, or any driver's. `unjam export`."""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from unjam.controller import SUFFIX, controller_bytes, make_driver
+from unjam.controller.archive import GRAPH, SAMPLE
+from unjam.controller.file import read_controller
+from unjam.controller.sample import sample_bytes
+from unjam.controller.verify import verify_controller
+from unjam.drivers.driver import Driver
+from unjam.drivers.local_state import LocalState
+from unjam.drivers.registry import describe, files_of, recipe_of
+from unjam.drivers.residual import ResidualDriver
+from unjam.errors import InputError, wrong
+from unjam.files import check_folder, write_whole
+from unjam.measures.metrics import measure
+from unjam.measures.statistics import summarise
+from unjam.reports.results import EVALUATION_FILE, rows_by_driver
+from unjam.scenarios.registry import make_scenario
+from unjam.scenarios.scenario import Scenario
+from unjam.training.evaluate import held_out_seeds, raise_failure
+from unjam.training.folder import origin, read_config
+from unjam.training.judge import TRAINED
+from unjam.worlds.workers import EpisodeTask, Workers
+
+SAMPLED = 1000
+"""most decisions of the recorded sample"""
+
+
+@dataclass(frozen=True)
+class Exported:
+    """A controller that was exported."""
+
+    file: Path
+    graph: Path | None
+    """the ONNX graph beside it; it is also in the file"""
+    driver: str
+    decisions: int
+    """of the recorded sample"""
+
+
+def export_controller(source: str | Path, to: str | Path, onnx: bool = False, scenario: str = "") -> Exported:
+    """Write a controller into a file that needs nothing else: `.unjam`, and on demand an ONNX graph.
+
+    One held-out episode is driven for its recorded sample.
+
+    Args:
+        source: a run folder, or any driver as `unjam.drive` takes it.
+        to: the file, ending in `.unjam`; the graph goes beside it, with `.onnx`.
+        onnx: whether to draw the graph of the whole controller.
+        scenario: whose time step and bounds a driver gets; a run has its own.
+
+    Raises:
+        InputError: there is no such controller, or it is Python code, or, with `onnx`, cannot be drawn.
+        MissingPartError: with `onnx`, it is not installed.
+    """
+    source, to = Path(source), Path(to)
+    if to.suffix != SUFFIX:
+        raise wrong("to", str(to), f"a file that ends in {SUFFIX}")
+    check_folder(to)
+    road, driver, about = _of_run(source, scenario) if source.is_dir() else _of_driver(str(source), scenario)
+    code = files_of(recipe_of(driver)[0])
+    if driver.native or code:
+        why = f"{Path(code[0]['path']).name} is Python code" if code else "human is the simulator itself"
+        raise InputError(f"export: {describe(driver)} is not allowed: {why}; allowed: drivers that are data")
+    limit = driver.action_limit if isinstance(driver, ResidualDriver) else road.action_limit
+    graph = _graph(driver, limit) if onnx else None
+    states = _perceived(road, driver)
+    parts = {SAMPLE: sample_bytes(driver, states, limit)}
+    if graph is not None:
+        parts[GRAPH] = graph
+    write_whole(to, controller_bytes(driver, about, parts))
+    verify_controller(to)
+    beside = to.with_suffix(".onnx") if graph is not None else None
+    if beside is not None and graph is not None:
+        write_whole(beside, graph)
+    return Exported(to, beside, describe(driver), len(states.speed))
+
+
+def _of_run(folder: Path, scenario: str) -> tuple[Scenario, Driver, dict[str, Any]]:
+    """Return the road, controller and origin of a run."""
+    if scenario:
+        raise wrong("scenario", scenario, "none beside a run, which has its own")
+    config = read_config(folder)
+    road, found = config.make_scenario(), read_controller(folder)
+    counted = {key: found.manifest.get(key) for key in ("iteration", "actual_steps")}
+    about = {
+        **origin(road, config.make_expert()),
+        "run": {"scenario": config.scenario, "agent": config.agent, "seed": config.seed},
+        **counted,
+        "metrics": _held_out(folder),
+    }
+    return road, found.driver, about
+
+
+def _of_driver(text: str, scenario: str) -> tuple[Scenario, Driver, dict[str, Any]]:
+    """Return the road, driver and origin of a driver by itself."""
+    road = make_scenario(scenario or "ring")
+    driver = make_driver(text, road.decision_step)
+    expert = driver.expert if isinstance(driver, ResidualDriver) else driver
+    return road, driver, origin(road, expert)
+
+
+def _held_out(folder: Path) -> dict[str, Any] | None:
+    """Return what the run's evaluation measured of the controller and of its expert; None before its end."""
+    path = folder / EVALUATION_FILE
+    if not path.is_file():
+        return None
+    found = json.loads(path.read_text())
+    rows_of = rows_by_driver(found["rows"])
+    measured: dict[str, Any] = {"reward": found["reward"]}
+    for label in (TRAINED, found["expert"]):
+        if rows := rows_of.get(label):
+            estimates = {name: each.__dict__ for name, each in summarise(rows).items() if each.count}
+            measured[label] = {"episodes": len(rows), **estimates}
+    return measured
+
+
+def _graph(driver: Driver, limit: float) -> bytes:
+    from unjam.controller.onnx_graph import onnx_graph  # torch.onnx takes its time, and not all want it
+
+    return onnx_graph(driver, limit)
+
+
+def _perceived(road: Scenario, driver: Driver) -> LocalState:
+    """Return what the CAV that stays longest perceives in a held-out episode, arrays of shape (T,)."""
+    with Workers(1) as workers:
+        (episode,) = workers.run([EpisodeTask(road, driver, held_out_seeds(1)[0])])
+    raise_failure([measure(episode)] if not episode.ok else [])
+    longest = max(episode.trajectories, key=lambda trajectory: len(trajectory.applied))
+    decisions = min(len(longest.applied), SAMPLED)
+    return LocalState(*(values[:decisions] for values in longest.states))

@@ -1,0 +1,231 @@
+"""What there is to see of a run's virtual environment: where it agrees with the actual one, and where not.
+
+All of it is measured on episodes that no network learned from, and kept in the run folder as `model.json`.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from unjam.errors import InputError
+from unjam.files import to_json, write_whole
+from unjam.learners.imagination import Imagination
+from unjam.learners.state import restore_imagination
+from unjam.reports.results import MODEL_FILE, read_model, read_progress
+from unjam.scenarios.scenario import Scenario
+from unjam.training.checkpoint import load_checkpoint
+from unjam.training.config import RunConfig
+from unjam.virtual.comparison import OneStepErrors, one_step_errors, open_loop, recorded, replay
+from unjam.virtual.data import ActualData
+from unjam.virtual.model import NUMBERS, TARGETS, EnvironmentModel
+from unjam.virtual.model_error import root_mean_square
+from unjam.worlds.record import Floats
+
+LONGEST = 500
+"""decisions that virtual and actual are compared over, where the stays are long enough"""
+ROWS = 20_000
+"""at most so many decisions tell the errors one step ahead"""
+STARTS = 200
+"""from which recorded accelerations are replayed"""
+EXAMPLES = 3
+"""of them, shown one by one"""
+MOMENTS = 100
+"""at most so many moments of a replay are kept"""
+BINS = 10
+"""of equally many decisions, by gap and by speed"""
+BINNED = ("leader_gap", "speed")
+LENGTHS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000)
+"""of rollouts, for which the bound is computed [decisions]"""
+SHOWN = ("leader_gap", "leader_speed")
+"""numbers of the examples"""
+
+
+def newest_model_facts(folder: Path, config: RunConfig) -> dict[str, Any]:
+    """Return the facts about a run's virtual environment, measured anew if they are missing or old.
+
+    Raises:
+        InputError: the run has no virtual environment, or no checkpoint yet.
+    """
+    _check_virtual(folder, config)
+    kept, progress = read_model(folder), read_progress(folder)
+    if kept is None or not progress or kept.get("iteration") != progress[-1]["iteration"]:
+        write_model_facts(folder, config)
+        kept = read_model(folder)
+    assert kept is not None
+    return kept
+
+
+def write_model_facts(folder: Path, config: RunConfig) -> None:
+    """Measure the virtual environment of a run as its newest checkpoint has it, and write `model.json`.
+
+    Raises:
+        InputError: the run has no virtual environment, or no checkpoint yet.
+        DiskError: the disk is full.
+    """
+    facts = measure_model(folder, config)
+    write_whole(folder / MODEL_FILE, to_json(facts))
+
+
+def measure_model(folder: Path, config: RunConfig) -> dict[str, Any]:
+    """Return the facts about the virtual environment in a run's newest checkpoint, to four digits.
+
+    Raises:
+        InputError: the run has no virtual environment, or no checkpoint yet.
+    """
+    _check_virtual(folder, config)
+    checkpoint = load_checkpoint(folder / "checkpoint")
+    if checkpoint is None:
+        raise InputError(
+            f"run: {str(folder)!r} has no checkpoint yet; go on with: unjam train --resume {folder}"
+        )
+    torch.set_num_threads(1)  # for small networks more are slower
+    state, tensors = checkpoint
+    settings = replace(config.virtual, device="cpu")
+    imagination = Imagination(
+        settings, config.make_scenario(), config.reward, config.make_expert(), config.policy, config.seed
+    )
+    restore_imagination(imagination, state, tensors)
+    scenario = imagination.scenario
+    data, model = imagination.data, imagination.model
+    generator = np.random.default_rng(config.seed)
+    newest = read_progress(folder)[-1]
+    actual = data.transitions(settings.holdout)
+    held_out = actual.chosen(generator.permutation(np.flatnonzero(actual.held_out))[:ROWS])
+    errors = one_step_errors(model, held_out, scenario, config.reward)
+    return _rounded(
+        {
+            "iteration": state["iteration"],
+            "base": settings.base,
+            "members": settings.members,
+            "decision_step": scenario.decision_step,
+            "k_star": newest["k_star"],
+            "held_out": int(actual.held_out.sum()),
+            "one_step": {name: found._asdict() for name, found in errors.by_number().items()},
+            "where": {name: _by_bins(getattr(held_out.states, name), errors) for name in BINNED},
+            "replay": _replayed(imagination, scenario, generator),
+            "bound": _bounds(imagination, newest, config.learner.gamma),
+        }
+    )
+
+
+def _check_virtual(folder: Path, config: RunConfig) -> None:
+    if config.virtual.virtual_ratio == 0:
+        raise InputError(
+            f"run: {str(folder)!r} has no virtual environment: its virtual.virtual_ratio is 0; allowed: > 0"
+        )
+
+
+def _by_bins(values: Floats, errors: OneStepErrors) -> dict[str, Any]:
+    """Return the errors one step ahead by what `values`, shape (R,), were, in bins of equally many rows."""
+    edges = np.unique(np.quantile(values, np.linspace(0, 1, BINS + 1)))
+    places = np.searchsorted(edges[1:-1], values, side="right")
+    bins = [places == place for place in np.unique(places)]
+    model = errors.model
+    return {
+        "at": [values[rows].mean() for rows in bins],
+        "decisions": [int(rows.sum()) for rows in bins],
+        "base": {
+            name: [root_mean_square(errors.base[rows, i]) for rows in bins] for i, name in enumerate(TARGETS)
+        },
+        "model": {
+            name: [root_mean_square(model[:, rows, i]) for rows in bins] for i, name in enumerate(TARGETS)
+        },
+    }
+
+
+def decisions_ahead(stays: Sequence[int]) -> int:
+    """Return over how many decisions to replay stays on the road that were so long [decisions].
+
+    Over half of a usual one, so that at least half of the stays have places to start from.
+    """
+    return min(LONGEST, max(1, int(np.median(stays)) // 2))
+
+
+def _replayed(imagination: Imagination, scenario: Scenario, generator: np.random.Generator) -> dict[str, Any]:
+    """Return how recorded accelerations end in the virtual environment, without noise, and some examples."""
+    data, model = imagination.data, imagination.model
+    held_out = data.held_out(imagination.settings.holdout)
+    decisions = decisions_ahead([int(rows.sum()) for rows in held_out if rows.any()])
+    looks = data.looks(decisions)
+    looks = looks[[held_out[place][at] for place, at in looks]]
+    looks = looks[np.sort(generator.permutation(len(looks))[:STARTS])]
+    single = replace(imagination.settings, members=1, error="unexplained")
+    alone = EnvironmentModel(single, len(scenario.drawn_ranges), (0,))
+    moments = np.unique(np.linspace(0, decisions - 1, MOMENTS).round().astype(int))
+    found = open_loop(model, data, looks, decisions, scenario)
+    base = open_loop(alone, data, looks, decisions, scenario)
+    return {
+        "seconds": (moments + 1) * scenario.decision_step,
+        "starts": len(looks),
+        "numbers": {
+            name: {
+                "model": found.error[name][moments],
+                "spread": found.spread[name][moments],
+                "base": base.error[name][moments],
+                "change": found.change[name][moments],
+            }
+            for name in NUMBERS
+        },
+        "examples": _examples(
+            data, looks[generator.permutation(len(looks))[:EXAMPLES]], moments, (model, alone), scenario
+        ),
+    }
+
+
+def _examples(
+    data: ActualData,
+    looks: NDArray[np.int64],
+    moments: NDArray[np.int64],
+    models: tuple[EnvironmentModel, EnvironmentModel],
+    scenario: Scenario,
+) -> list[dict[str, Any]]:
+    """Return what happened from `looks` on, what each member of the model says, and what the base says."""
+    decisions = int(moments[-1]) + 1
+    actual = recorded(data, looks, decisions)
+    model, base = (replay(each, data, looks, decisions, scenario) for each in models)
+    return [
+        {
+            "begins": at * scenario.decision_step,
+            "drawn": data.recordings[place].drawn,
+            "numbers": {
+                name: {
+                    "actual": actual[name][example, 1:][moments],
+                    "members": model[name][:, example, moments],
+                    "base": base[name][0, example, moments],
+                }
+                for name in SHOWN
+            },
+        }
+        for example, (place, at) in enumerate(looks)
+    ]
+
+
+def _bounds(imagination: Imagination, newest: dict[str, Any], gamma: float) -> dict[str, Any] | None:
+    """Return the bound C by the length of rollouts for the newest row of progress; None without an eps_m."""
+    eps_m = newest["virtual"]["eps_m_by_estimator"]["total_variation"]
+    if eps_m is None:
+        return None
+    eps_pi = newest["learner"]["eps_pi_max"]
+    discount = imagination.decision_discount(gamma)
+    return {
+        "eps_pi": eps_pi,
+        "eps_m": eps_m,
+        "largest_reward": imagination.largest_reward,
+        "largest_return": imagination.largest_reward / (1.0 - discount),
+        "k": LENGTHS,
+        "C": [imagination.bound_at(k, eps_pi, eps_m, gamma) for k in LENGTHS],
+    }
+
+
+def _rounded(value: Any) -> Any:
+    """Return plain lists and numbers, these to four digits."""
+    if isinstance(value, dict):
+        return {key: _rounded(entry) for key, entry in value.items()}
+    if isinstance(value, (list, tuple, np.ndarray)):
+        return [_rounded(entry) for entry in value]
+    return float(f"{value:.4g}") if isinstance(value, (float, np.floating)) else value

@@ -1,0 +1,204 @@
+"""Search: which settings learn best. `unjam search`, with Optuna.
+
+Each trial is a training like any other, in a folder of its own. It is judged by the validation seeds, which
+choose a training's controller anyway; the held-out ones stay unseen.
+"""
+
+import math
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from unjam.errors import InputError, MissingPartError, UnjamError
+from unjam.files import make_folder, to_json, write_whole
+from unjam.manifest import manifest
+from unjam.reports.results import read_progress
+from unjam.training.config import RunConfig, load_config, to_toml
+from unjam.training.executors import Command, Executor, Told, running
+from unjam.training.search_space import Choice, Space, trial_config
+from unjam.training.trainings import training_command
+
+if TYPE_CHECKING:
+    from optuna import Study
+    from optuna.trial import FrozenTrial
+
+CONFIG, FOUND, BEST = "config.toml", "search.json", "best.toml"
+JOURNAL = "journal.log"
+"""what Optuna remembers: which trials there were, and what became of them"""
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A training of a search."""
+
+    number: int
+    values: dict[str, Any]
+    folder: Path
+    gain: float | None
+    """return beyond the expert's on the validation seeds, of the best controller; None where it failed"""
+
+
+def search(
+    base: RunConfig,
+    space: Space,
+    trials: int,
+    folder: Path,
+    workers: int,
+    executor: Executor = "local",
+    told: Told = lambda line: None,
+) -> list[Trial]:
+    """Train with settings that Optuna proposes, and return all trials, the best first.
+
+    The folder gets `search.json`, and `best.toml` for `unjam train --config`. A search that was stopped goes
+    on where it was, and one that has ended goes on if `trials` is larger.
+
+    Args:
+        base: what all trials share; checked with `check_space`.
+        space: what is varied.
+        trials: trainings in all, those of an earlier call included.
+        folder: new, or that of a search with the same base and space.
+        workers: trainings at once.
+        executor: where they run.
+        told: told a line when one has ended.
+
+    Raises:
+        InputError: the folder holds another search.
+        MissingPartError: Optuna is not installed.
+        UnjamError: all trainings failed.
+    """
+    study = _study(base, space, folder)
+    commands = _Commands(base, folder)
+    waiting = [trial for trial in study.get_trials() if trial.state.name == "RUNNING"]
+    with ThreadPoolExecutor(workers) as threads, running(executor, workers) as run:
+        jobs: dict[Future[int], int] = {}
+        try:
+            while True:
+                while len(jobs) < workers and (trial := _next(study, space, trials, waiting)) is not None:
+                    number, values = trial
+                    jobs[threads.submit(run, commands.of(number, values))] = number
+                if not jobs:
+                    break
+                for done in wait(jobs, return_when=FIRST_COMPLETED).done:
+                    number = jobs.pop(done)
+                    _tell(study, number, commands.folder_of(number), done.result())
+                    told(_words(study, number, trials))
+        except BaseException:
+            threads.shutdown(wait=False, cancel_futures=True)
+            raise
+    found = [_found(trial, commands) for trial in study.get_trials()]
+    found.sort(key=lambda trial: -math.inf if trial.gain is None else trial.gain, reverse=True)
+    _write(base, found, folder)
+    return found
+
+
+class _Commands:
+    """Command lines of trials."""
+
+    def __init__(self, base: RunConfig, folder: Path) -> None:
+        self._base, self._folder = base, folder
+
+    def folder_of(self, number: int) -> Path:
+        return self._folder / "trials" / f"{number:04d}"
+
+    def of(self, number: int, values: dict[str, Any]) -> Command:
+        config = trial_config(self._base, values)
+        few = replace(config.evaluation, baselines=(), episodes=1)  # the held-out seeds decide nothing here
+        plan, log = (self._folder / "plans" / f"{number:04d}{suffix}" for suffix in (".toml", ".log"))
+        config = replace(config, workers=1, evaluation=few)
+        return training_command(config, self.folder_of(number), plan, log)
+
+
+def _study(base: RunConfig, space: Space, folder: Path) -> "Study":
+    try:
+        import optuna
+        from optuna.storages import JournalStorage
+        from optuna.storages.journal import JournalFileBackend
+    except ImportError:
+        raise MissingPartError("search: optuna is not installed: pip install 'unjam[search]'") from None
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    known = (folder / CONFIG).is_file()
+    if folder.exists() and any(folder.iterdir()) and not known:
+        raise InputError(f"out: {str(folder)!r} is not empty and no search; allowed: a new folder")
+    if known and load_config(folder / CONFIG) != base:
+        raise InputError(f"out: {str(folder)!r} is of another configuration; allowed: a new folder")
+    make_folder(folder)
+    write_whole(folder / CONFIG, to_toml(base))
+    storage = JournalStorage(JournalFileBackend(str(folder / JOURNAL)))
+    study = optuna.create_study(
+        storage=storage, study_name="search", direction="maximize", load_if_exists=True
+    )
+    # Who begins anew with the same seed would propose again what it has proposed before.
+    study.sampler = optuna.samplers.TPESampler(seed=base.seed + 1_000_003 * len(study.get_trials()))
+    before = study.user_attrs.get("space")
+    if before is not None and before != repr(space):
+        raise InputError(f"vary: {str(folder)!r} is of other ranges; allowed: a new folder")
+    study.set_user_attr("space", repr(space))
+    return study
+
+
+def _next(
+    study: "Study", space: Space, trials: int, waiting: list["FrozenTrial"]
+) -> tuple[int, dict[str, Any]] | None:
+    """Return number and values of the next trial: one that was stopped, or a new one; None after the last."""
+    while waiting:
+        stopped = waiting.pop(0)
+        if stopped.params.keys() == space.keys():
+            return stopped.number, stopped.params
+        study.tell(stopped.number, state=_state("FAIL"))  # it was stopped before it had all its values
+    if len(study.get_trials(deepcopy=False)) >= trials:
+        return None
+    trial = study.ask()
+    for key, values in space.items():
+        if isinstance(values, Choice):
+            trial.suggest_categorical(key, values.ends)
+        elif values.whole:
+            trial.suggest_int(key, int(values.low), int(values.high), log=values.log)
+        else:
+            trial.suggest_float(key, values.low, values.high, log=values.log)
+    return trial.number, trial.params
+
+
+def _tell(study: "Study", number: int, folder: Path, code: int) -> None:
+    gain = None if code else gain_of(folder)
+    if gain is None or not math.isfinite(gain):
+        study.tell(number, state=_state("FAIL"))
+    else:
+        study.tell(number, gain)
+
+
+def _state(name: str) -> Any:
+    from optuna.trial import TrialState
+
+    return TrialState[name]
+
+
+def gain_of(folder: Path) -> float | None:
+    """Return a training's best validation beyond its expert's; None where there was no validation."""
+    rows = read_progress(folder)
+    validated = [row["return_validation"] for row in rows if row["return_validation"] is not None]
+    return max(validated) - (rows[0]["return_expert"] or 0.0) if validated else None
+
+
+def _words(study: "Study", number: int, trials: int) -> str:
+    trial = study.get_trials(deepcopy=False)[number]
+    ended = sum(one.state.is_finished() for one in study.get_trials(deepcopy=False))
+    values = ", ".join(f"{key} {_short(value)}" for key, value in trial.params.items())
+    result = "failed" if trial.value is None else f"{trial.value:+.1f}"
+    return f"{ended} of {trials}: trial {number}: {values}: {result}"
+
+
+def _short(value: Any) -> str:
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def _found(trial: "FrozenTrial", commands: _Commands) -> Trial:
+    return Trial(trial.number, trial.params, commands.folder_of(trial.number), trial.value)
+
+
+def _write(base: RunConfig, found: list[Trial], folder: Path) -> None:
+    rows = [{"trial": one.number, "gain": one.gain, "folder": str(one.folder), **one.values} for one in found]
+    write_whole(folder / FOUND, to_json({"manifest": manifest(), "trials": rows}, indent=1))
+    if found[0].gain is None:
+        raise UnjamError(f"all {len(found)} trainings failed; what they said is in {folder / 'plans'}")
+    write_whole(folder / BEST, to_toml(trial_config(base, found[0].values)))

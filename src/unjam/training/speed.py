@@ -1,0 +1,196 @@
+"""How fast episodes run on this machine, beside what bounds them: bare SUMO, and the same over TraCI.
+
+Machines differ, and one machine differs from minute to minute: what counts are ratios within one run, with
+their parts measured in turn.
+"""
+
+import itertools
+import os
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from statistics import median
+from typing import Any
+
+import numpy as np
+import torch
+
+from unjam.drivers.network import Network
+from unjam.drivers.pi_saturation import PISaturation
+from unjam.drivers.residual import ResidualDriver
+from unjam.learners.settings import PolicySettings
+from unjam.scenarios.registry import SCENARIOS
+from unjam.scenarios.ring import Ring
+from unjam.scenarios.scenario import Scenario
+from unjam.virtual.data import ActualData
+from unjam.virtual.model import EnvironmentModel, torch_generator
+from unjam.virtual.rollout import begin, draw_starts, imagine
+from unjam.virtual.settings import VirtualSettings
+from unjam.virtual.world import VirtualWorld
+from unjam.worlds.drive import drive_traffic, run_episode
+from unjam.worlds.record import Episode
+from unjam.worlds.sumo.simulation import Simulation
+from unjam.worlds.sumo.stepping import make_traffic
+
+ROUNDS = 7
+TRACI_STEPS = 200
+SIZES = {22: 3000, 220: 800, 2200: 200}
+"""vehicles on the ring, one CAV in 22, and decisions driven"""
+VIRTUAL = {"long": (2000, 50), "short": (1200, 10)}
+"""virtual rows, and decisions of each: a model that is trusted for long; one that is not, as in an iteration
+of training on the ring"""
+METRES_PER_VEHICLE = 245 / 22
+OTHER_ROADS = ("figure-eight", "merge")
+"""roads beside the ring on which `run_episode` is compared with SUMO alone"""
+
+
+def neural_driver(hold: int) -> ResidualDriver:
+    """Return PI with a residual network of the paper's size that looks every `hold` decisions."""
+    generator = np.random.default_rng(0)
+    sizes = [5, 64, 64, 1]
+    layers = tuple(
+        (generator.normal(size=(inputs, outputs)) / 100, np.zeros(outputs))
+        for inputs, outputs in itertools.pairwise(sizes)
+    )
+    return ResidualDriver(PISaturation(), Network(layers, 1.0, 0.1), 1.0, hold=hold)
+
+
+def measure_speed(rounds: int = ROUNDS, told: Callable[[str], None] | None = None) -> dict[str, Any]:
+    """Return steps per second, ratios, and the cost of a vehicle-step by size; on one core.
+
+    `over_bare`: steps/s of `run_episode` (loading and recording included) over those of SUMO alone, with the
+    residual driver that training makes by default, whose network looks once a second.
+    `over_bare_every_step`: the same with a network that looks in every step.
+    `over_traci`: steps/s of the same driving loop with libsumo over those through TraCI.
+    `virtual`: decisions/s of virtual rollouts, with the default ensemble and beginning them included, over
+    those of `run_episode`.
+    `roads`: `over_bare` on other roads.
+    `growth`: the largest cost of a vehicle-step over that of the smallest road.
+    """
+    say = told or (lambda _: None)
+    if hasattr(os, "sched_setaffinity"):
+        cores = os.sched_getaffinity(0)
+        os.sched_setaffinity(0, {min(cores)})
+        try:
+            return _measure(rounds, say)
+        finally:
+            os.sched_setaffinity(0, cores)
+    return _measure(rounds, say)
+
+
+def _measure(rounds: int, say: Callable[[str], None]) -> dict[str, Any]:
+    ring = SCENARIOS["ring"]
+    driver = neural_driver(PolicySettings().decisions_held(ring.decision_step))
+    every_step = neural_driver(1)
+    found: dict[str, list[float]] = {"bare": [], "episode": [], "every_step": [], "loop": [], "traci": []}
+    others: dict[str, dict[str, list[float]]] = {name: {"bare": [], "episode": []} for name in OTHER_ROADS}
+    virtual: dict[str, list[float]] = {name: [] for name in VIRTUAL}
+    torch.set_num_threads(1)
+    with Simulation() as simulation:
+        for name in OTHER_ROADS:  # networks made, caches warm
+            run_episode(SCENARIOS[name], driver, (0,), explore=True, simulation=simulation)
+        driven = run_episode(ring, driver, (0,), explore=True, simulation=simulation)
+    for number in range(1, rounds + 1):
+        say(f"round {number} of {rounds}")
+        with Simulation() as simulation:
+            make_traffic(ring, (number,), simulation)
+            found["bare"].append(_rate(partial(_step, simulation, ring.horizon), ring.horizon))
+            for name, who in (("episode", driver), ("every_step", every_step)):
+                run = partial(run_episode, ring, who, (number,), explore=True, simulation=simulation)
+                found[name].append(_rate(run, ring.horizon))
+            for name, (rows, decisions) in VIRTUAL.items():
+                virtual[name].append(_virtual_rate(driven, ring, driver, rows, decisions))
+            found["loop"].append(_loop_rate(ring, driver, simulation))
+            for name, rates in others.items():
+                road = SCENARIOS[name]
+                make_traffic(road, (number,), simulation)
+                steps = road.horizon * road.steps_per_decision
+                rates["bare"].append(_rate(partial(_step, simulation, steps), road.horizon))
+                run = partial(run_episode, road, driver, (number,), explore=True, simulation=simulation)
+                rates["episode"].append(_rate(run, road.horizon))
+        with Simulation("traci") as simulation:
+            found["traci"].append(_loop_rate(replace(ring, horizon=TRACI_STEPS), driver, simulation))
+    say("larger roads")
+    scaling = _scaling(driver, max(1, rounds // 2))
+    costs = [entry["us_per_vehicle_step"] for entry in scaling]
+    return {
+        "bare_steps_per_s": median(found["bare"]),
+        "episode_steps_per_s": median(found["episode"]),
+        "traci_steps_per_s": median(found["traci"]),
+        "every_step_steps_per_s": median(found["every_step"]),
+        "over_bare": _median_ratio(found["episode"], found["bare"]),
+        "over_bare_every_step": _median_ratio(found["every_step"], found["bare"]),
+        "over_traci": _median_ratio(found["loop"], found["traci"]),
+        "virtual": {
+            name: {
+                "rows": VIRTUAL[name][0],
+                "decisions": VIRTUAL[name][1],
+                "steps_per_s": median(rates),
+                "over_actual": _median_ratio(rates, found["episode"]),
+            }
+            for name, rates in virtual.items()
+        },
+        "roads": {
+            name: {
+                "bare_steps_per_s": median(rates["bare"]),
+                "episode_steps_per_s": median(rates["episode"]),
+                "over_bare": _median_ratio(rates["episode"], rates["bare"]),
+            }
+            for name, rates in others.items()
+        },
+        "scaling": scaling,
+        "growth": max(costs) / costs[0],
+        "rounds": rounds,
+    }
+
+
+def _scaling(driver: ResidualDriver, rounds: int) -> list[dict[str, float]]:
+    """Return the cost of a vehicle-step on rings of the same density, measured in turn."""
+    costs: dict[int, list[float]] = {vehicles: [] for vehicles in SIZES}
+    for _ in range(rounds):
+        for vehicles, horizon in SIZES.items():
+            length = round(vehicles * METRES_PER_VEHICLE)
+            ring = Ring(length=(length, length), vehicles=vehicles, cavs=vehicles // 22, horizon=horizon)
+            with Simulation() as simulation:
+                costs[vehicles].append(1e6 / _loop_rate(ring, driver, simulation) / vehicles)
+    return [{"vehicles": vehicles, "us_per_vehicle_step": median(found)} for vehicles, found in costs.items()]
+
+
+def _rate(run: Callable[[], object], steps: int) -> float:
+    started = time.perf_counter()
+    run()
+    return steps / (time.perf_counter() - started)
+
+
+def _loop_rate(scenario: Ring | Any, driver: ResidualDriver, simulation: Simulation) -> float:
+    """Return decisions per second of the driving loop alone."""
+    traffic = make_traffic(scenario, (1,), simulation, driver.plain_numbers)
+    return _rate(lambda: drive_traffic(traffic, driver, explore=True), scenario.horizon)
+
+
+def _virtual_rate(
+    episode: Episode, scenario: Scenario, driver: ResidualDriver, rows: int, decisions: int
+) -> float:
+    """Return virtual decisions per second of rollouts from an actual episode."""
+    data = ActualData(episode.steps)
+    data.add([episode], scenario)
+    model = EnvironmentModel(VirtualSettings(), len(scenario.drawn_ranges), (0,))
+    generator = torch_generator((0,), "cpu")
+    world = VirtualWorld(model, scenario, "", generator)
+    looks = draw_starts(data, rows, 1, (0,))
+
+    def run() -> None:
+        imagine(driver, world, begin(data, looks, driver.expert, "cpu"), decisions, generator)
+
+    return _rate(run, rows * decisions)
+
+
+def _step(simulation: Simulation, steps: int) -> None:
+    step = simulation.step
+    for _ in range(steps):
+        step()
+
+
+def _median_ratio(above: list[float], below: list[float]) -> float:
+    return median(a / b for a, b in zip(above, below, strict=True))

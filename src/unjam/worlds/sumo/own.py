@@ -1,0 +1,117 @@
+"""Traffic of the user's own network: SUMO drives people, chooses lanes, and knows who is whose neighbour."""
+
+import hashlib
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import accumulate
+from typing import Any
+
+import numpy as np
+
+from unjam.drivers.local_state import LARGEST_GAP, LocalState
+from unjam.scenarios.own_network import CAV_TYPES
+from unjam.scenarios.road import OwnRoad
+from unjam.scenarios.scenario import Scenario
+from unjam.sumo_files import read_sumo_files
+from unjam.worlds.sumo.network_files import edge_lengths, network_lines
+from unjam.worlds.sumo.open import OpenTraffic
+from unjam.worlds.sumo.simulation import Simulation
+from unjam.worlds.sumo.traffic import Floats, TrafficLog
+
+
+class OwnTraffic(OpenTraffic[OwnRoad]):
+    """The actual environment of a network of the user's own."""
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        road: OwnRoad,
+        seeds: Sequence[np.random.SeedSequence],
+        simulation: Simulation,
+        full: bool,
+    ) -> None:
+        """Put the first vehicles on the road; nothing moves yet."""
+        super().__init__(scenario, road, seeds, simulation, full)
+        self._network = read_sumo_files(road.network.path).network
+        self._routes: Counter[tuple[str, ...]] = Counter()
+        self._log_edges: list[list[tuple[str, float]]] = []
+        self._allowed: list[float] = []
+
+    @property
+    def expects_cavs(self) -> bool:
+        """Whether a CAV may still enter: while anybody may, as SUMO alone knows who will."""
+        return not self.over
+
+    def _is_cav(self, name: str) -> bool:
+        """Whether a vehicle is a CAV: by its type, or by a draw that depends on its id and the seed alone.
+
+        So the same vehicles are CAVs whoever drives them, also where one enters later for it.
+        """
+        road, kind = self.road, self._simulation.type_of(name)
+        if kind in road.cav_types:
+            return True
+        if kind not in road.cars:
+            return False
+        digest = hashlib.sha256(f"{road.cav_seed} {name}".encode()).digest()
+        return int.from_bytes(digest[:8], "big") < road.cav_share * 2**64
+
+    def _moved(self, left: Sequence[str], entered: Sequence[str]) -> None:
+        self.over = not self._simulation.more_expected()
+        if self.full:
+            self._routes.update(self._simulation.route_of(name) for name in entered)
+
+    def _take_control(self, names: Sequence[str]) -> None:
+        scenario = self.scenario
+        types = "{}" if scenario.actuation == "flow" else CAV_TYPES
+        self._simulation.take_control(names, scenario.actuation, scenario.right_of_way, types)
+
+    def _legal(self, speeds: dict[str, float]) -> dict[str, float]:
+        allowed = self._simulation.allowed_speeds(list(speeds))
+        return {name: min(speed, most) for (name, speed), most in zip(speeds.items(), allowed, strict=True)}
+
+    def _ends_with(self, colliding: Sequence[str]) -> bool:
+        return any(name in self._cavs for name in colliding)
+
+    def _moment(self) -> tuple[Sequence[str], Sequence[float], Sequence[float], Sequence[float]]:
+        names = list(self._on_road)
+        if self.full:
+            self._log_edges.append(self._simulation.edge_places(names))
+            self._allowed += self._simulation.allowed_speeds(names)
+        unknown = [float("nan")] * len(names)
+        return names, self._simulation.speeds(names), unknown, unknown
+
+    def _states(self, names: Sequence[str]) -> LocalState:
+        found = [self._simulation.neighbours(name, LARGEST_GAP) for name in names]
+        leader_speed, leader_gap, follower_speed, follower_gap = np.array(found).reshape(-1, 4).T
+        unknown = np.full(len(names), np.nan)
+        speed = np.array(self._simulation.speeds(names), np.float64)
+        return LocalState(speed, leader_speed, leader_gap, follower_speed, follower_gap, unknown, unknown)
+
+    def log(self) -> TrafficLog:
+        """Return what happened since the start; positions are those along the route that is driven most."""
+        found = super().log()
+        if not self.full or not self._routes:
+            return found
+        lengths = edge_lengths(self._network)
+        planned: Counter[str] = Counter()  # not where they were: all drivers' pictures show the same route
+        for edges, count in self._routes.items():
+            planned.update(dict.fromkeys(edges, count))
+        route = max(self._routes, key=lambda edges: sum(planned[edge] for edge in set(edges)))
+        starts = accumulate((lengths[edge] for edge in route), initial=0.0)
+        begins = dict(reversed(list(zip(route, starts, strict=False))))
+        column = {name: index for index, name in enumerate(found.vehicle_ids)}
+        positions = np.full_like(found.positions, np.nan)
+        for time, ((names, *_), places) in enumerate(zip(self._log_moments, self._log_edges, strict=True)):
+            for name, (edge, along) in zip(names, places, strict=True):
+                positions[column[name], time] = begins.get(edge, np.nan) + along
+        return replace(found, positions=positions)
+
+    def _lines(self) -> Floats:
+        return network_lines(self._network)
+
+    def _pictured(self, vehicles: Sequence[str]) -> dict[str, Any]:
+        if not self.full:
+            return {}
+        allowed = float(np.mean(self._allowed)) if self._allowed else float("nan")
+        return {"lines": self._lines(), "limit_speed": allowed}

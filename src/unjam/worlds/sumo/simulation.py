@@ -1,0 +1,291 @@
+"""SUMO: start, read, command, step. The only module that imports libsumo or traci."""
+
+import importlib
+import io
+import tempfile
+from collections import deque
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import redirect_stdout, suppress
+from functools import partial
+from itertools import count, dropwhile
+from pathlib import Path
+from types import ModuleType, TracebackType
+from typing import Any, Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from unjam.errors import EpisodeError, MissingPartError, UnjamError
+from unjam.scenarios.road import PlainNetwork, Road
+from unjam.scenarios.scenario import Actuation
+from unjam.worlds.sumo.network_files import network_file, sumo_program
+
+Backend = Literal["libsumo", "traci", "gui"]
+"""`libsumo`: in this process; `traci`: SUMO as a child process; `gui`: the same, with its window."""
+
+SPEED_MODES = {"shielded": 31, "raw": 30, "flow": 25}
+"""SUMO's speed mode bits for each way of actuation: bit 0 is the check for a safe speed."""
+WITHOUT_RIGHT_OF_WAY = 1
+"""the bit that stays where vehicles need not obey the right of way: who is surprised on a junction then stops
+as fast as it must, and so must who follows"""
+
+_exhaust = deque(maxlen=0).extend
+"""runs through an iterator, in C: a loop would cost as much as the calls"""
+
+_open: "Simulation | None" = None
+"""the one simulation that libsumo runs in this process"""
+_labels = count()
+"""of connections over TraCI, of which a process may have many"""
+
+
+class Simulation:
+    """One SUMO simulation, loaded anew for each episode.
+
+    libsumo holds one simulation per process and silently replaces the first by a second, so this class
+    refuses to open another while one is open. Over TraCI there may be several, each a process of its own.
+    """
+
+    def __init__(self, backend: Backend = "libsumo", gui_options: Sequence[str] = ()) -> None:
+        """Open a simulation; nothing runs before `load`. `gui_options` go to SUMO's window."""
+        global _open
+        if backend == "libsumo":
+            if _open is not None:
+                raise UnjamError(
+                    "a simulation is already open in this process; close it, or use another process"
+                )
+            _open = self
+        self.backend = backend
+        self._gui_options = gui_options
+        self._sumo: Any = _import(backend)
+        self._folder = tempfile.TemporaryDirectory(prefix="unjam-")
+        self._running = False
+        if backend == "libsumo":
+            self._bind()
+
+    def _bind(self) -> None:
+        """Look up the functions that are called often."""
+        call = partial(_function, self._sumo)
+        self._get_speed = call("vehicle", "getSpeed")
+        self._get_distance = call("vehicle", "getDistance")
+        self._get_fuel = call("vehicle", "getFuelConsumption")
+        self._set_speed = call("vehicle", "setSpeed")
+        self._set_previous_speed = call("vehicle", "setPreviousSpeed")
+        self.vehicle_count: Callable[[], int] = call("vehicle", "getIDCount")
+        """how many vehicles are on the road"""
+        self.colliding_count: Callable[[], int] = call("simulation", "getCollidingVehiclesNumber")
+        """how many vehicles touched another in the last step"""
+        self.step: Callable[[], object] = call("simulation", "step")
+        """simulates one time step"""
+        self.departed: Callable[[], Sequence[str]] = call("simulation", "getDepartedIDList")
+        """who entered the road in the last step"""
+        self.arrived: Callable[[], Sequence[str]] = call("simulation", "getArrivedIDList")
+        """who left the road at the end of its route in the last step"""
+        self.colliding: Callable[[], Sequence[str]] = call("simulation", "getCollidingVehiclesIDList")
+        """who touched another in the last step"""
+        self.waiting: Callable[[], Sequence[str]] = call("simulation", "getPendingVehicles")
+        """who wants to enter and cannot"""
+
+    def load(self, road: Road, step: float, seed: int) -> None:
+        """Start an episode: load network and traffic, and put the vehicles on the road.
+
+        Raises:
+            EpisodeError: SUMO refuses the files; the message holds its reason.
+        """
+        traffic = Path(self._folder.name) / "traffic.rou.xml"
+        traffic.write_text(road.traffic)
+        options = self._options(road, traffic, step, seed)
+        try:
+            if self._running:
+                self._sumo.load(options)
+            else:
+                program = "sumo-gui" if self.backend == "gui" else "sumo"
+                self._start([sumo_program(program), *options, *self._gui_options])
+                self._running = True
+            self.step()  # the first step inserts the vehicles and moves none
+        except Exception as error:
+            self._end()  # only then are SUMO's words in its log, and can the next episode start afresh
+            words = self._reason() or " ".join(str(error).split())
+            raise EpisodeError(f"SUMO cannot start: {words}") from error
+
+    def _start(self, command: list[str]) -> None:
+        if self.backend == "libsumo":
+            self._sumo.start(command)
+            return
+        label = f"unjam-{next(_labels)}"
+        traci = _import("traci")
+        with redirect_stdout(io.StringIO()):  # traci announces each of its attempts to connect
+            traci.start(command, label=label)
+        self._sumo = traci.getConnection(label)
+        self._bind()
+
+    def _options(self, road: Road, traffic: Path, step: float, seed: int) -> list[str]:
+        if isinstance(road.network, PlainNetwork):
+            # Vehicles neither vanish from a jam nor give up waiting to enter.
+            patience = ["--time-to-teleport", "-1", "--max-depart-delay", "-1"]
+            files = ["--net-file", str(network_file(road.network)), "--route-files", str(traffic), *patience]
+        else:  # its own words about all that is not named below
+            additional = ",".join(str(path) for path in (*road.network.additional_files, traffic))
+            files = ["--configuration-file", str(road.network.path), "--additional-files", additional]
+            files += ["--verbose", "false"]
+        return [
+            *files,
+            *("--step-length", str(step), "--seed", str(seed)),
+            *("--no-step-log", "true", "--no-warnings", "true", "--duration-log.disable", "true"),
+            *("--error-log", str(self._error_log)),
+            # The only setting in which a collision is real contact and every one is reported.
+            *("--collision.action", "warn", "--collision.mingap-factor", "0"),
+            *("--collision.check-junctions", "true"),
+        ]
+
+    @property
+    def _error_log(self) -> Path:
+        return Path(self._folder.name) / "error.log"
+
+    def _reason(self) -> str:
+        """Return SUMO's own words about its last error: they are in its log, not in its exception."""
+        try:
+            lines = [line.strip() for line in self._error_log.read_text().splitlines() if line.strip()]
+        except OSError:
+            return ""
+        errors = dropwhile(lambda line: not line.startswith("Error"), lines)  # warnings may come before
+        return "; ".join(line for line in errors if line != "Quitting (on error).")
+
+    def speeds(self, ids: Sequence[str]) -> list[float]:
+        """Return the speeds of `ids` [m/s]."""
+        return list(map(self._get_speed, ids))
+
+    def left(self) -> list[str]:
+        """Return who left the road in the last step: at the end of its route, or moved away by SUMO."""
+        return [*self.arrived(), *self._sumo.simulation.getStartingTeleportIDList()]
+
+    def places(self, ids: Sequence[str]) -> NDArray[np.float64]:
+        """Return rows (x, y, heading) of front bumpers: [m], and [rad] against the x axis."""
+        vehicle = self._sumo.vehicle
+        rows = [(*vehicle.getPosition(name)[:2], vehicle.getAngle(name)) for name in ids]
+        places = np.array(rows, np.float64).reshape(-1, 3)
+        places[:, 2] = np.radians(90.0 - places[:, 2])  # SUMO counts clockwise from north, in degrees
+        return places
+
+    def more_expected(self) -> bool:
+        """Return whether anybody is on the road or will be."""
+        return self._sumo.simulation.getMinExpectedNumber() > 0
+
+    def type_of(self, name: str) -> str:
+        """Return a vehicle's type."""
+        return self._sumo.vehicle.getTypeID(name)
+
+    def route_of(self, name: str) -> tuple[str, ...]:
+        """Return the edges of a vehicle's route."""
+        return tuple(self._sumo.vehicle.getRoute(name))
+
+    def edge_places(self, ids: Sequence[str]) -> list[tuple[str, float]]:
+        """Return on which edge each of `ids` is, and where along it [m]."""
+        vehicle = self._sumo.vehicle
+        return [(vehicle.getRoadID(name), vehicle.getLanePosition(name)) for name in ids]
+
+    def allowed_speeds(self, ids: Sequence[str]) -> list[float]:
+        """Return how fast each of `ids` may drive where it is [m/s]."""
+        return [self._sumo.vehicle.getAllowedSpeed(name) for name in ids]
+
+    def neighbours(self, name: str, farthest: float) -> tuple[float, float, float, float] | None:
+        """Return speed and gap of the vehicle ahead and of the one behind, as SUMO sees them [m/s, m].
+
+        The gap is bumper to bumper. Who is farther than `farthest` is not there: as fast, and that far away.
+        """
+        vehicle = self._sumo.vehicle
+        speed = self._get_speed(name)
+        found = []
+        for other, gap, keeper in (
+            (*(vehicle.getLeader(name, farthest) or ("", 0.0)), name),
+            (*(follower := vehicle.getFollower(name, farthest)), follower[0]),
+        ):
+            if not other:
+                found += [speed, farthest]
+                continue
+            true_gap = gap + vehicle.getMinGap(keeper)  # SUMO's lacks the gap that the one behind keeps
+            there = true_gap < farthest
+            found += [self._get_speed(other) if there else speed, min(max(true_gap, 0.0), farthest)]
+        return tuple(found)
+
+    def distances(self, ids: Sequence[str]) -> list[float]:
+        """Return how far each of `ids` has driven since it entered [m]."""
+        return list(map(self._get_distance, ids))
+
+    def fuel(self, ids: Sequence[str]) -> list[float]:
+        """Return the fuel rates of `ids` in the last step [mg/s], by their emission class."""
+        return list(map(self._get_fuel, ids))
+
+    def command_speeds(self, ids: Iterable[str], speeds: Iterable[float]) -> None:
+        """Ask for the speeds that `ids` shall have after the next step [m/s]: plain floats."""
+        for name, speed in zip(ids, speeds, strict=True):
+            self._set_speed(name, speed)
+
+    def replace_speeds(self, ids: Iterable[str], speeds: Iterable[float]) -> None:
+        """Give `ids` other current speeds [m/s], plain floats: how noise enters."""
+        _exhaust(map(self._set_previous_speed, ids, speeds))
+
+    def command_people(self, ids: Iterable[str], right_of_way: bool) -> None:
+        """Let SUMO keep `ids` safe and to the right of way, but not to limits of acceleration."""
+        mode = SPEED_MODES["flow"] if right_of_way else SPEED_MODES["flow"] & WITHOUT_RIGHT_OF_WAY
+        for name in ids:
+            self._sumo.vehicle.setSpeedMode(name, mode)
+
+    def take_control(
+        self, ids: Iterable[str], actuation: Actuation, right_of_way: bool = True, types: str = "cav"
+    ) -> None:
+        """Make `ids` CAVs: from now on they obey `command_speeds`.
+
+        Their type becomes `types`, in which `{}` stands for the type that they had.
+        """
+        mode = SPEED_MODES[actuation] if right_of_way else SPEED_MODES[actuation] & WITHOUT_RIGHT_OF_WAY
+        for name in ids:
+            self._sumo.vehicle.setType(name, types.format(self._sumo.vehicle.getTypeID(name)))
+            self._sumo.vehicle.setSpeedMode(name, mode)
+
+    def close(self) -> None:
+        """End the simulation and remove its files; may be called twice."""
+        global _open
+        if self._running:
+            self._end()
+        self._folder.cleanup()
+        if _open is self:
+            _open = None
+
+    def _end(self) -> None:
+        """End SUMO; one that is gone already is no error."""
+        self._running = False
+        with suppress(Exception):
+            self._sumo.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+def libsumo_is_taken() -> bool:
+    """Return whether a simulation is open in this process."""
+    return _open is not None
+
+
+def _function(sumo: Any, domain: str, name: str) -> Callable[..., Any]:
+    """Return a function of libsumo or traci; of libsumo the compiled one, without its Python wrapper.
+
+    The wrapper only passes its arguments on, and is a third of the cost of a call.
+    """
+    compiled = getattr(getattr(sumo, "libsumo", None), "_libsumo", None)
+    wrapped = sumo.simulationStep if name == "step" else getattr(getattr(sumo, domain), name)
+    return getattr(compiled, f"{domain}_{name}", wrapped)
+
+
+def _import(backend: Backend) -> ModuleType:
+    name = "libsumo" if backend == "libsumo" else "traci"
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        raise MissingPartError(
+            f"{name} cannot be imported ({error}); install it: pip install {name}==1.28.0"
+        ) from None

@@ -1,0 +1,96 @@
+"""A worker process: runs the episodes that it is asked for, one after the other. Free of torch.
+
+Started by `unjam.worlds.workers` as `python -m unjam.worlds.worker`.
+"""
+
+import gc
+import os
+import sys
+import time
+from contextlib import suppress
+from typing import Any, BinaryIO
+
+from unjam.drivers.registry import driver_from_recipe
+from unjam.errors import DISK_ERRNOS, UnjamError, disk_error
+from unjam.scenarios.own_network import OwnNetwork
+from unjam.scenarios.registry import scenario_from_recipe
+from unjam.worlds.drive import run_episode
+from unjam.worlds.messages import Arrays, read_message, write_message
+from unjam.worlds.record import failed_episode, pack_episode
+from unjam.worlds.sumo.simulation import Simulation
+
+NETWORK_MEMORY = 16 * 2**30
+"""bytes that a worker may take once it drives on a network of the user's own, which may come from anywhere"""
+SIGN_OF_LIFE = 0.2
+"""seconds between two reports of progress"""
+
+
+def main() -> None:
+    """Answer requests from standard input until it is closed."""
+    answers = os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)  # SUMO and user code may print: not into the answers
+    gc.freeze()  # what the imports made stays; searching it for garbage would cost every episode
+    simulation = None
+    try:
+        while True:
+            facts, arrays = read_message(sys.stdin.buffer)
+            try:
+                simulation = simulation or Simulation()
+                episode = _run(facts, arrays, simulation, answers)
+            except Exception as error:  # every requested episode has a row, also one that failed
+                known = _known(error)
+                episode = failed_episode(tuple(facts["seed"]), str(known), type(known).__name__)
+            answer, answer_arrays = pack_episode(episode)
+            write_message(answers, {"episode": answer}, answer_arrays)
+    except (BrokenPipeError, EOFError):
+        pass  # the parent is gone, or wants no more
+    finally:
+        if simulation is not None:
+            simulation.close()
+
+
+def _limit_memory() -> None:
+    """Make a file that would fill the machine's memory end this process alone; not possible on Windows."""
+    with suppress(ImportError):
+        import resource
+
+        _, most = resource.getrlimit(resource.RLIMIT_AS)
+        resource.setrlimit(resource.RLIMIT_AS, (NETWORK_MEMORY, most))
+
+
+def _known(error: Exception) -> Exception:
+    """Return an error in the words of unjam."""
+    if isinstance(error, OSError) and error.errno in DISK_ERRNOS:
+        return disk_error(error, error.filename or "a temporary file")
+    return error if isinstance(error, UnjamError) else UnjamError(f"{type(error).__name__}: {error}")
+
+
+def _run(facts: dict[str, Any], arrays: Arrays, simulation: Simulation, answers: BinaryIO) -> Any:
+    last = time.monotonic()
+
+    def progress(steps: int) -> None:
+        nonlocal last
+        if time.monotonic() - last > SIGN_OF_LIFE:
+            last = time.monotonic()
+            try:
+                write_message(answers, {"progress": steps})
+            except BrokenPipeError:
+                sys.exit()  # the parent is gone
+
+    scenario = scenario_from_recipe(facts["scenario"])
+    if isinstance(scenario, OwnNetwork):
+        _limit_memory()
+    return run_episode(
+        scenario,
+        driver_from_recipe(facts["driver"], arrays),
+        facts["seed"],
+        facts["reward"],
+        facts["explore"],
+        facts["full"],
+        simulation,
+        progress,
+    )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,244 @@
+"""Many episodes at once, each in a worker process, with the same result whatever happens to a worker."""
+
+import os
+import queue
+import subprocess
+import sys
+import tempfile
+import threading
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Any, Self, TypeVar
+
+from unjam.drivers.driver import Driver
+from unjam.drivers.registry import recipe_of
+from unjam.errors import EpisodeError
+from unjam.scenarios.registry import scenario_recipe
+from unjam.scenarios.scenario import Scenario
+from unjam.worlds.messages import Arrays, read_message, write_message
+from unjam.worlds.record import Episode, failed_episode, unpack_episode
+
+ATTEMPTS = 3
+"""how often an episode is tried before its row says that it failed"""
+SILENCE = 30.0
+"""seconds without a sign of life after which a worker counts as hung"""
+
+Kept = TypeVar("Kept")
+Message = tuple[dict[str, Any], Arrays]
+
+
+@dataclass(frozen=True)
+class EpisodeTask:
+    """The arguments of one `run_episode`."""
+
+    scenario: Scenario
+    driver: Driver
+    seed: tuple[int, ...]
+    reward: str = ""
+    explore: bool = False
+    full: bool = False
+
+    def message(self) -> Message:
+        """Return the task as it travels to a worker."""
+        recipe, arrays = recipe_of(self.driver)
+        facts = {
+            "scenario": scenario_recipe(self.scenario),
+            "driver": recipe,
+            "seed": list(self.seed),
+            "reward": self.reward,
+            "explore": self.explore,
+            "full": self.full,
+        }
+        return facts, arrays
+
+
+class Workers:
+    """A fixed number of worker processes, started when first needed, replaced when they die or hang.
+
+    The episodes that come back depend on the tasks alone: not on the number of workers, on which of them
+    ran what, or on how often one had to be replaced.
+    """
+
+    def __init__(self, count: int = 1, silence: float = SILENCE, attempts: int = ATTEMPTS) -> None:
+        """Prepare `count` workers; nothing is started yet."""
+        self.count = count
+        self._silence = silence
+        self._attempts = attempts
+        # Of all workers, so that nothing stays behind of one that was killed.
+        self._temporary = tempfile.TemporaryDirectory(prefix="unjam-")
+        self._idle: queue.SimpleQueue[_Worker] = queue.SimpleQueue()
+        self._all: list[_Worker] = []
+        self._lock = threading.Lock()
+        self._threads = ThreadPoolExecutor(count, thread_name_prefix="unjam-worker")
+        for _ in range(count):
+            self._idle.put(self._new_worker())
+
+    def _new_worker(self) -> "_Worker":
+        worker = _Worker(self._silence, self._temporary.name)
+        with self._lock:
+            self._all.append(worker)
+        return worker
+
+    def run(
+        self, tasks: Sequence[EpisodeTask], progress: Callable[[int, int], None] | None = None
+    ) -> list[Episode]:
+        """Run all tasks and return their episodes, in the order of the tasks; one that failed says why.
+
+        `progress` is called with a task's index and its decisions so far, from several threads.
+        """
+        return self.run_each(tasks, lambda index, episode: episode, progress)
+
+    def run_each(
+        self,
+        tasks: Sequence[EpisodeTask],
+        keep: Callable[[int, Episode], Kept],
+        progress: Callable[[int, int], None] | None = None,
+    ) -> list[Kept]:
+        """Run all tasks and return what `keep` makes of each index and episode: many need much memory.
+
+        `keep` is called as an episode ends, from several threads.
+        """
+
+        def run_one(index: int, task: EpisodeTask) -> Kept:
+            return keep(index, self._run_one(index, task, progress))
+
+        futures = [self._threads.submit(run_one, index, task) for index, task in enumerate(tasks)]
+        try:
+            return [future.result() for future in futures]
+        except BaseException:
+            for future in futures:
+                future.cancel()
+            self.close()
+            raise
+
+    def _run_one(self, index: int, task: EpisodeTask, progress: Callable[[int, int], None] | None) -> Episode:
+        worker = self._idle.get()
+        problems = []
+        try:
+            for _ in range(self._attempts):
+                try:
+                    episode = worker.run(task.message(), lambda steps: progress and progress(index, steps))
+                    if progress is not None:
+                        progress(index, episode.steps)
+                    return episode
+                except _WorkerLost as lost:
+                    problems.append(str(lost))
+            reason = f"{self._attempts} workers were lost on it: {'; '.join(dict.fromkeys(problems))}"
+            return failed_episode(task.seed, reason, EpisodeError.__name__)
+        finally:
+            self._idle.put(worker)
+
+    def close(self) -> None:
+        """Stop all workers; may be called twice."""
+        with self._lock:
+            for worker in self._all:
+                worker.stop()
+        self._threads.shutdown(wait=True, cancel_futures=True)
+        self._temporary.cleanup()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+class _WorkerLost(Exception):
+    """The worker died or fell silent."""
+
+
+class _Worker:
+    """One worker process and the pipe to it."""
+
+    def __init__(self, silence: float, temporary: str) -> None:
+        self._silence = silence
+        self._temporary = temporary
+        self._process: subprocess.Popen[bytes] | None = None
+        self._stopped = False
+        self._starting = threading.Lock()
+
+    def _start(self) -> subprocess.Popen[bytes]:
+        # A BLAS with threads of its own would fight with the other workers for the cores.
+        single = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+        environment = {**os.environ, **single, "TMPDIR": self._temporary}
+        self._errors = tempfile.TemporaryFile()  # noqa: SIM115  (lives as long as the process)
+        process = subprocess.Popen(
+            [sys.executable, "-m", "unjam.worlds.worker"],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=self._errors,
+            env=environment,
+            start_new_session=True,  # an interrupt in the terminal is the parent's to handle
+        )
+        self._messages: queue.SimpleQueue[Message | None] = queue.SimpleQueue()
+        threading.Thread(target=_read_all, args=(process, self._messages), daemon=True).start()
+        return process
+
+    def run(self, task: Message, progress: Callable[[int], object]) -> Episode:
+        """Return the episode of a task; raise `_WorkerLost` where the process dies or falls silent."""
+        with self._starting:
+            if self._stopped:
+                raise _WorkerLost("stopped")
+            process = self._process = self._process or self._start()
+        try:
+            self._send(process, task)
+            while True:
+                message = self._messages.get(timeout=self._silence)
+                if message is None:
+                    raise _WorkerLost(self._why(process))
+                facts, arrays = message
+                if "episode" in facts:
+                    return unpack_episode(facts["episode"], arrays)
+                progress(facts["progress"])
+        except queue.Empty:
+            self._kill()
+            raise _WorkerLost(f"no sign of life for {self._silence:g} s") from None
+        except BrokenPipeError:
+            raise _WorkerLost(self._why(process)) from None
+
+    def _send(self, process: subprocess.Popen[bytes], task: Message) -> None:
+        assert process.stdin is not None
+        guard = threading.Timer(self._silence, process.kill)  # a full pipe that nobody reads blocks for ever
+        guard.start()
+        try:
+            write_message(process.stdin, *task)
+        finally:
+            guard.cancel()
+
+    def _why(self, process: subprocess.Popen[bytes]) -> str:
+        try:
+            code = process.wait(timeout=1.0)
+        except subprocess.TimeoutExpired:  # it lives, but what it says cannot be read
+            process.kill()
+            code = process.wait()
+        self._process = None
+        self._errors.seek(0)
+        last = self._errors.read().decode(errors="replace").strip().splitlines()[-1:]
+        how = f"killed by signal {-code}" if code < 0 else f"ended with code {code}"
+        return ": ".join([how, *last])
+
+    def _kill(self) -> None:
+        process, self._process = self._process, None
+        if process is not None:
+            process.kill()
+            process.wait()
+
+    def stop(self) -> None:
+        """End the process, now and for good."""
+        with self._starting:
+            self._stopped = True
+            self._kill()
+
+
+def _read_all(process: subprocess.Popen[bytes], messages: "queue.SimpleQueue[Message | None]") -> None:
+    """Pass on what the process says; None when it says no more."""
+    assert process.stdout is not None
+    try:
+        while True:
+            messages.put(read_message(process.stdout))
+    except Exception:  # end of file, or a frame cut short by the process's death
+        messages.put(None)

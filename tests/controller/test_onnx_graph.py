@@ -1,0 +1,163 @@
+"""The three forms of a controller agree: the policy that learned, the NumPy driver, the ONNX graph."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from tests.controller.test_file import residual
+from tests.controller.test_sample import perceived
+from tests.drivers.test_experts import EXPERTS
+from tests.learners.test_policy import make_policy, mean_of, shake
+from tests.learners.test_squashed_policy import make_policy as make_squashed_policy
+from unjam.controller.graph import check_graph, run_graph
+from unjam.controller.onnx_graph import onnx_graph
+from unjam.controller.sample import replay
+from unjam.drivers import (
+    ACC,
+    IDM,
+    LACC,
+    Driver,
+    FollowerStopper,
+    Human,
+    LocalState,
+    Pacer,
+    PISaturation,
+    ResidualDriver,
+)
+from unjam.drivers.from_file import FileDriver
+from unjam.drivers.mixed import Mixed
+from unjam.drivers.network import Network
+from unjam.drivers.registry import named_driver
+from unjam.drivers.residual import observation_size
+from unjam.errors import InputError, MissingPartError
+from unjam.learners.policy import ResidualPolicy
+from unjam.learners.settings import PolicySettings
+from unjam.learners.squashed_policy import SquashedResidualPolicy
+from unjam.scenarios import Ring
+from unjam.scenarios.registry import make_scenario
+from unjam.scenarios.scenario import Scenario
+from unjam.worlds.drive import run_episode
+from unjam.worlds.record import Trajectory
+from unjam.worlds.sumo.simulation import Simulation
+
+pytest.importorskip("onnxscript")
+onnxruntime = pytest.importorskip("onnxruntime")
+
+torch.set_num_threads(1)
+PARTS = PolicySettings().observe
+PARITY = 1e-6
+"""[m/s2]"""
+
+
+def driver_of(network: Network, expert: Driver, hold: int = 10) -> ResidualDriver:
+    return ResidualDriver(expert, network, 1.0, PARTS, hold)
+
+
+def longest_stay(scenario: Scenario, driver: Driver, simulation: Simulation) -> Trajectory:
+    episode = run_episode(scenario, driver, (3,), simulation=simulation)
+    return max(episode.trajectories, key=lambda trajectory: len(trajectory.applied))
+
+
+def agree(driver: Driver, stay: Trajectory) -> None:
+    """Driver and graph, given what was perceived, answer what was commanded on the road."""
+    states = LocalState(*(values[:-1] for values in stay.states))
+    np.testing.assert_allclose(replay(driver, states, 1.0), stay.applied, rtol=0, atol=1e-9)
+    part = onnx_graph(driver, 1.0)
+    check_graph(part, driver)
+    np.testing.assert_allclose(run_graph(part, driver, states), stay.applied, rtol=0, atol=PARITY)
+
+
+def test_policy_driver_and_graph_agree_on_a_whole_episode_of_the_ring(simulation: Simulation) -> None:
+    expert = PISaturation()
+    policy = make_policy(inputs=observation_size(PARTS, expert))
+    assert isinstance(policy, ResidualPolicy)
+    shake(policy, 1)
+    driver = driver_of(policy.network(), expert)
+    stay = longest_stay(Ring(), driver, simulation)
+    assert len(stay.applied) == 3000
+    chosen, _ = stay.looks
+    assert chosen.std() > 0.1
+    seen = stay.observations[:-1].astype(np.float32)
+    np.testing.assert_allclose(mean_of(policy, seen), chosen, rtol=0, atol=PARITY)
+    agree(driver, stay)
+
+
+@pytest.mark.slow
+def test_policy_driver_and_graph_of_sac_agree_where_vehicles_come_and_go(simulation: Simulation) -> None:
+    expert = FollowerStopper(time_step=1.0)
+    policy = make_squashed_policy(inputs=observation_size(PARTS, expert))
+    assert isinstance(policy, SquashedResidualPolicy)
+    shake(policy.actor, 2)
+    driver = driver_of(policy.network(), expert, hold=1)
+    stay = longest_stay(make_scenario("merge", {"horizon": 150}), driver, simulation)
+    seen = torch.as_tensor(stay.observations[:-1], dtype=torch.float32)
+    with torch.no_grad():
+        chosen = policy.authority * policy.actor(seen, deterministic=True)[:, 0].numpy()
+    assert stay.residual.std() > 0.01
+    np.testing.assert_allclose(chosen, stay.residual, rtol=0, atol=PARITY)
+    agree(driver, stay)
+
+
+@pytest.mark.slow
+def test_driver_and_graph_agree_where_the_place_on_the_road_counts(simulation: Simulation) -> None:
+    driver = residual(Pacer(harmonics=(7, -0.8, 0.7, -1.3, 0.7), gathering_gap=0.1), hold=3)
+    agree(driver, longest_stay(make_scenario("figure-eight", {"horizon": 400}), driver, simulation))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [name for name in EXPERTS if name != "human"])
+def test_the_graph_of_every_expert_answers_what_the_expert_answers(name: str) -> None:
+    same(named_driver(name, 0.1))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "driver",
+    [
+        residual(residual(PISaturation(), 1, hold=3), 2, hold=5),
+        Mixed((PISaturation(), IDM(), residual(ACC()))),
+        residual(Human()),
+    ],
+    ids=["nested", "mixed", "residual on human"],
+)
+def test_the_graph_of_drivers_put_together_answers_what_they_answer(driver: Driver) -> None:
+    same(driver)
+
+
+def same(driver: Driver) -> None:
+    states = perceived(900)
+    part = onnx_graph(driver, 1.0)
+    check_graph(part, driver)
+    np.testing.assert_allclose(run_graph(part, driver, states), replay(driver, states, 1.0), atol=PARITY)
+
+
+def test_the_graph_takes_any_number_of_vehicles_and_names_nothing_of_this_machine() -> None:
+    driver = LACC()
+    part = onnx_graph(driver, 0.5)
+    states = perceived(7)
+    fed = {**states._asdict(), "memory.acceleration": np.zeros(7)}
+    session = onnxruntime.InferenceSession(part, providers=["CPUExecutionProvider"])
+    found, after = session.run(None, fed)
+    expected, memory = driver.act(states, driver.initial_memory(7))
+    np.testing.assert_allclose(found, expected.clip(-0.5, 0.5), atol=1e-12)
+    np.testing.assert_allclose(after, memory["acceleration"], atol=1e-12)
+    assert b".py" not in part
+    assert b"unjam" not in part
+
+
+@pytest.mark.parametrize("name", ["human", "own", "mixed"])
+def test_a_driver_that_cannot_be_drawn_says_so_in_one_line(name: str, my_drivers: Path) -> None:
+    own = FileDriver(my_drivers, "gentle")
+    driver = {"human": Human(), "own": residual(own), "mixed": Mixed((own, IDM()))}[name]
+    with pytest.raises(InputError, match="is not allowed; allowed: drivers that run on tensors") as caught:
+        onnx_graph(driver, 1.0)
+    assert "\n" not in str(caught.value)
+
+
+def test_without_onnxscript_it_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "onnxscript", None)
+    with pytest.raises(MissingPartError, match=r"pip install 'unjam\[onnx\]'"):
+        onnx_graph(IDM(), 1.0)

@@ -1,0 +1,330 @@
+from dataclasses import fields
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from stable_baselines3.common.buffers import ReplayBuffer, RolloutBuffer
+
+from tests.learners.test_policy import make_policy, shake
+from unjam.drivers import LocalState
+from unjam.learners.policy import ResidualPolicy, policy_spaces
+from unjam.learners.rows import (
+    Rows,
+    add_to_replay_buffer,
+    discounted_returns,
+    fill_rollout_buffer,
+    join_rows,
+    rows_of,
+    shifted_rewards,
+)
+from unjam.worlds.record import Trajectory
+
+INPUTS = 3
+
+
+def make_trajectory(seed: int, decisions: int, hold: int = 1, terminated: bool = False) -> Trajectory:
+    """A trajectory of random numbers, its residual held as a driver holds it."""
+    generator = np.random.default_rng(seed)
+    looks = -(-decisions // hold)
+    nothing = np.zeros(decisions)
+    return Trajectory(
+        vehicle="cav_0",
+        start=0,
+        states=LocalState(*[np.zeros(decisions + 1)] * len(LocalState._fields)),
+        observations=generator.normal(size=(looks + 1, INPUTS)),
+        expert=nothing,
+        residual=np.repeat(generator.normal(size=looks), hold)[:decisions],
+        applied=nothing,
+        shield=nothing,
+        terms={"one": generator.normal(size=decisions), "other": generator.uniform(size=decisions)},
+        memory={},
+        hold=hold,
+        terminated=terminated,
+    )
+
+
+def random_policy(critic_inputs: int = 0, seed: int = 0) -> ResidualPolicy:
+    policy = make_policy(inputs=INPUTS, critic_inputs=critic_inputs)
+    shake(policy, seed)
+    policy.scale_value(3.0, 2.0)
+    return policy
+
+
+def fill(
+    policy: ResidualPolicy,
+    trajectories: list[Trajectory],
+    extra: list[tuple[float, ...]] | None = None,
+    gamma: float = 0.9,
+    gae_lambda: float = 0.8,
+) -> RolloutBuffer:
+    spaces = policy.observation_space, policy.action_space
+    buffer = RolloutBuffer(1, *spaces, device="cpu", gamma=gamma, gae_lambda=gae_lambda)
+    fill_rollout_buffer(buffer, policy, rows_of(trajectories, extra or [()] * len(trajectories)))
+    return buffer
+
+
+def value(policy: ResidualPolicy, row: np.ndarray) -> float:
+    with torch.no_grad():
+        return float(policy.predict_values(torch.as_tensor(row[None], dtype=torch.float32)))
+
+
+def looks_written_out(trajectory: Trajectory) -> list[float]:
+    """What was earned from one look of the network to the next."""
+    earned = [
+        float(trajectory.terms["one"][t] + trajectory.terms["other"][t])
+        for t in range(len(trajectory.residual))
+    ]
+    return [sum(earned[start : start + trajectory.hold]) for start in range(0, len(earned), trajectory.hold)]
+
+
+def advantages_written_out(
+    policy: ResidualPolicy, trajectory: Trajectory, gamma: float, gae_lambda: float
+) -> tuple[list[float], list[float]]:
+    """Generalised advantage estimation and its returns, from the definition: a sum over all later errors."""
+    earned = looks_written_out(trajectory)
+    values = [value(policy, row) for row in trajectory.observations]
+    if trajectory.terminated:
+        values[-1] = 0.0
+    errors = [earned[t] + gamma * values[t + 1] - values[t] for t in range(len(earned))]
+    advantages = [
+        sum((gamma * gae_lambda) ** (later - t) * errors[later] for later in range(t, len(errors)))
+        for t in range(len(errors))
+    ]
+    return advantages, [advantage + values[t] for t, advantage in enumerate(advantages)]
+
+
+@settings(max_examples=40)
+@given(
+    shapes=st.lists(st.tuples(st.integers(1, 23), st.booleans()), min_size=1, max_size=4),
+    hold=st.integers(1, 5),
+    gamma=st.floats(0.5, 0.999),
+    gae_lambda=st.floats(0.0, 1.0),
+)
+def test_advantages_and_returns_are_those_of_each_trajectory_alone(
+    shapes: list[tuple[int, bool]], hold: int, gamma: float, gae_lambda: float
+) -> None:
+    policy = random_policy()
+    trajectories = [
+        make_trajectory(seed, decisions, hold, terminated)
+        for seed, (decisions, terminated) in enumerate(shapes)
+    ]
+    buffer = fill(policy, trajectories, gamma=gamma, gae_lambda=gae_lambda)
+    written = [advantages_written_out(policy, entry, gamma, gae_lambda) for entry in trajectories]
+    advantages = [number for found, _ in written for number in found]
+    returns = [number for _, found in written for number in found]
+    np.testing.assert_allclose(buffer.advantages[:, 0], advantages, rtol=1e-4, atol=1e-4)
+    np.testing.assert_allclose(buffer.returns[:, 0], returns, rtol=1e-4, atol=1e-4)
+
+
+def test_only_a_trajectory_that_was_cut_is_worth_something_after_its_end() -> None:
+    policy = random_policy()
+    cut, ended = make_trajectory(0, 6), make_trajectory(0, 6, terminated=True)
+    last = {
+        name: fill(policy, [entry], gae_lambda=1.0).returns[-1, 0]
+        for name, entry in {"cut": cut, "ended": ended}.items()
+    }
+    beyond = 0.9 * value(policy, cut.observations[-1])
+    assert abs(beyond) > 0.5
+    assert last["cut"] - last["ended"] == pytest.approx(beyond, rel=1e-5)
+    assert last["ended"] == pytest.approx(looks_written_out(ended)[-1], rel=1e-5)
+
+
+def test_a_trajectory_does_not_change_its_neighbours() -> None:
+    policy = random_policy()
+    first, second = make_trajectory(0, 7), make_trajectory(1, 5)
+    both = fill(policy, [first, second]).advantages[:, 0]
+    np.testing.assert_allclose(both[:7], fill(policy, [first]).advantages[:, 0], atol=1e-5)
+    np.testing.assert_allclose(both[7:], fill(policy, [second]).advantages[:, 0], atol=1e-5)
+
+
+def test_episodes_start_where_trajectories_start() -> None:
+    buffer = fill(random_policy(), [make_trajectory(0, 4), make_trajectory(1, 1), make_trajectory(2, 3)])
+    assert buffer.episode_starts[:, 0].tolist() == [1, 0, 0, 0, 1, 1, 0, 0]
+
+
+def test_rows_are_the_looks_in_order() -> None:
+    first, second = make_trajectory(0, 7, hold=3), make_trajectory(1, 4, hold=3)
+    buffer = fill(random_policy(), [first, second])
+    observations = np.concatenate([first.observations[:3], second.observations[:2]])
+    np.testing.assert_array_equal(buffer.observations[:, 0], observations.astype(np.float32))
+    chosen = [*first.residual[[0, 3, 6]], *second.residual[[0, 3]]]
+    np.testing.assert_array_equal(buffer.actions[:, 0, 0], np.array(chosen, np.float32))
+
+
+def test_what_is_earned_while_a_residual_is_held_is_summed() -> None:
+    trajectory = make_trajectory(0, 8, hold=3, terminated=True)
+    buffer = fill(random_policy(), [trajectory])
+    np.testing.assert_allclose(buffer.rewards[:, 0], looks_written_out(trajectory), rtol=1e-6)
+    assert len(buffer.rewards) == 3
+    assert buffer.rewards.sum() == pytest.approx(trajectory.reward.sum(), rel=1e-6)
+
+
+def test_what_the_critic_alone_sees_follows_its_trajectory() -> None:
+    trajectories = [make_trajectory(0, 3), make_trajectory(1, 2)]
+    buffer = fill(random_policy(critic_inputs=1), trajectories, [(-1.0,), (0.5,)])
+    assert buffer.observations[:, 0, INPUTS].tolist() == [-1.0, -1.0, -1.0, 0.5, 0.5]
+
+
+def test_the_value_after_the_end_is_that_of_the_trajectorys_own_road() -> None:
+    policy = random_policy(critic_inputs=1)
+    trajectory = make_trajectory(0, 5)
+    buffer = fill(policy, [trajectory], [(0.7,)], gae_lambda=1.0)
+    expected = looks_written_out(trajectory)[-1] + 0.9 * value(
+        policy, np.append(trajectory.observations[-1], 0.7)
+    )
+    assert buffer.returns[-1, 0] == pytest.approx(expected, rel=1e-5)
+
+
+def test_parts_that_are_joined_are_the_rows_of_all_their_trajectories() -> None:
+    trajectories = [make_trajectory(seed, 3 + seed, hold=2, terminated=seed == 1) for seed in range(4)]
+    extra = [(float(seed),) for seed in range(4)]
+    parts = [rows_of(trajectories[:1], extra[:1]), rows_of(trajectories[1:], extra[1:])]
+    joined, expected = join_rows(parts), rows_of(trajectories, extra)
+    for field in fields(Rows):
+        np.testing.assert_array_equal(getattr(joined, field.name), getattr(expected, field.name))
+        assert getattr(joined, field.name).dtype == getattr(expected, field.name).dtype
+
+
+def test_after_each_row_comes_the_next_of_its_trajectory_or_where_that_ended() -> None:
+    trajectories = [make_trajectory(0, 5, hold=2), make_trajectory(1, 1), make_trajectory(2, 3)]
+    rows = rows_of(trajectories, [()] * 3)
+    expected = np.concatenate([trajectory.observations[1:] for trajectory in trajectories])
+    np.testing.assert_array_equal(rows.next_observations, expected.astype(np.float32))
+    assert rows.lasts.tolist() == [2, 3, 6]
+
+
+def test_refuses_another_number_of_trajectories_than_of_their_roads() -> None:
+    with pytest.raises(ValueError, match="shorter"):
+        fill(random_policy(critic_inputs=1), [make_trajectory(0, 3), make_trajectory(1, 3)], [(0.0,)])
+
+
+def test_the_ratio_before_the_first_update_is_exactly_one() -> None:
+    policy = random_policy()
+    buffer = fill(policy, [make_trajectory(seed, 997, hold=3) for seed in range(3)])
+    observations, actions, before = (
+        torch.as_tensor(rows[:, 0]) for rows in (buffer.observations, buffer.actions, buffer.log_probs)
+    )
+    with torch.no_grad():
+        _, log_probs, _ = policy.evaluate_actions(observations, actions)
+    assert len(log_probs) == 3 * 333
+    assert (torch.exp(log_probs - before) == 1.0).all()
+
+
+def test_the_ratio_is_one_in_the_shuffled_order_of_the_update_too() -> None:
+    policy = random_policy()
+    buffer = fill(policy, [make_trajectory(seed, 997, hold=3) for seed in range(3)])
+    (rows,) = buffer.get(batch_size=None)
+    with torch.no_grad():
+        _, log_probs, _ = policy.evaluate_actions(rows.observations, rows.actions)
+    # Rows at the edge of a block of the matrix product may differ in their last bit.
+    np.testing.assert_allclose(torch.exp(log_probs - rows.old_log_prob).numpy(), 1.0, rtol=0, atol=1e-6)
+    assert not torch.equal(rows.old_log_prob, torch.as_tensor(buffer.log_probs[:, 0]))
+
+
+def test_a_buffer_takes_the_size_of_each_iteration() -> None:
+    policy = random_policy()
+    buffer = fill(policy, [make_trajectory(0, 50)])
+    fill_rollout_buffer(buffer, policy, rows_of([make_trajectory(1, 20)], [()]))
+    assert len(buffer.rewards) == 20
+    assert sum(len(rows.returns) for rows in buffer.get(7)) == 20
+    np.testing.assert_array_equal(
+        fill(policy, [make_trajectory(1, 20)]).advantages, buffer.swap_and_flatten(buffer.advantages)
+    )
+
+
+@given(
+    shapes=st.lists(st.tuples(st.integers(1, 12), st.booleans()), min_size=1, max_size=3),
+    hold=st.integers(1, 4),
+    gamma=st.floats(0.1, 0.99),
+)
+def test_discounted_returns_are_the_sums_written_out(
+    shapes: list[tuple[int, bool]], hold: int, gamma: float
+) -> None:
+    trajectories = [
+        make_trajectory(seed, decisions, hold, terminated)
+        for seed, (decisions, terminated) in enumerate(shapes)
+    ]
+    expected = []
+    for trajectory in trajectories:
+        earned = looks_written_out(trajectory)
+        after = 0.0 if trajectory.terminated else sum(earned) / len(earned) / (1.0 - gamma)
+        for t in range(len(earned)):
+            within = sum(gamma ** (later - t) * earned[later] for later in range(t, len(earned)))
+            expected.append(within + gamma ** (len(earned) - t) * after)
+    np.testing.assert_allclose(
+        discounted_returns(rows_of(trajectories, [()] * len(trajectories)), gamma),
+        expected,
+        rtol=1e-9,
+        atol=1e-9,
+    )
+
+
+def test_a_cut_trajectory_that_always_earns_the_same_is_worth_the_same_everywhere() -> None:
+    trajectory = make_trajectory(0, 30)
+    trajectory.terms["one"][:], trajectory.terms["other"][:] = 1.5, 0.5
+    np.testing.assert_allclose(discounted_returns(rows_of([trajectory], [()]), 0.95), 2.0 / 0.05)
+
+
+def replay_buffer(size: int) -> ReplayBuffer:
+    spaces = policy_spaces(INPUTS, 1, 2.0)
+    return ReplayBuffer(size, *spaces, device="cpu", handle_timeout_termination=False)
+
+
+def test_the_replay_buffer_holds_what_sb3_would_have_put_there_row_by_row() -> None:
+    ours, theirs = replay_buffer(20), replay_buffer(20)
+    for iteration in range(4):
+        trajectories = [
+            make_trajectory(10 * iteration + seed, 7 + seed, hold=2, terminated=seed == 1)
+            for seed in range(2)
+        ]
+        extra = [(0.5,), (-0.5,)]
+        rows = rows_of(trajectories, extra)
+        add_to_replay_buffer(ours, rows, 2.0, rows.rewards)
+        for trajectory, more in zip(trajectories, extra, strict=True):
+            seen = [np.append(row, more).astype(np.float32) for row in trajectory.observations]
+            residuals, earned = trajectory.looks
+            for look, (residual, reward) in enumerate(zip(residuals, earned, strict=True)):
+                done = trajectory.terminated and look == len(earned) - 1
+                action = np.array([np.float32(residual) / np.float32(2.0)])
+                theirs.add(seen[look], seen[look + 1], action, reward, np.array(done), [{}])
+        assert (ours.pos, ours.full) == (theirs.pos, theirs.full)
+        for name in ("observations", "next_observations", "actions", "rewards", "dones"):
+            np.testing.assert_array_equal(getattr(ours, name), getattr(theirs, name))
+    assert ours.full
+
+
+def test_more_rows_than_a_replay_buffer_takes_leave_the_newest() -> None:
+    buffer = replay_buffer(5)
+    rows = rows_of([make_trajectory(0, 13)], [(0.0,)])
+    add_to_replay_buffer(buffer, rows, 2.0, rows.rewards)
+    assert sorted(buffer.rewards[:, 0]) == sorted(rows.rewards[-5:].astype(np.float32))
+
+
+@given(
+    shapes=st.lists(st.tuples(st.integers(1, 12), st.booleans()), min_size=1, max_size=3),
+    gamma=st.floats(0.1, 0.99),
+    offset=st.floats(-20.0, 20.0),
+    after=st.floats(-50.0, 50.0),
+)
+def test_shifted_rewards_shift_all_that_follows_by_the_same(
+    shapes: list[tuple[int, bool]], gamma: float, offset: float, after: float
+) -> None:
+    rows = rows_of(
+        [make_trajectory(seed, size, 1, terminated) for seed, (size, terminated) in enumerate(shapes)],
+        [()] * len(shapes),
+    )
+
+    def worth(rewards: np.ndarray, beyond: float) -> np.ndarray:
+        """What follows each row, where a trajectory that was cut is worth `beyond` after its end."""
+        found = np.empty(len(rewards))
+        for first, last, terminated in zip(rows.starts, rows.lasts, rows.terminated, strict=True):
+            later = 0.0 if terminated else beyond
+            for row in range(last, first - 1, -1):
+                later = found[row] = rewards[row] + gamma * later
+        return found
+
+    missing = offset / (1.0 - gamma)
+    shifted = worth(shifted_rewards(rows, offset, gamma), after - missing)
+    np.testing.assert_allclose(shifted, worth(rows.rewards, after) - missing, rtol=1e-9, atol=1e-6)

@@ -1,0 +1,95 @@
+from dataclasses import FrozenInstanceError
+from typing import Any
+
+import pytest
+
+from unjam.errors import InputError
+from unjam.learners.settings import PolicySettings, PPOSettings, SACSettings, TRPOSettings
+from unjam.parameters import build
+
+
+@pytest.mark.parametrize(
+    ("kind", "key", "value"),
+    [
+        (PolicySettings, "hidden", (64, 0)),
+        (PolicySettings, "hidden", ()),
+        (PolicySettings, "hidden", 64),
+        (PolicySettings, "observe", ()),
+        (PolicySettings, "observe", ("local", "stars")),
+        (PolicySettings, "authority", 0.0),
+        (PolicySettings, "authority", float("inf")),
+        (PolicySettings, "exploration_std", 0.0),
+        (PolicySettings, "exploration_std", float("nan")),
+        (PolicySettings, "hold", -1.0),
+        (PolicySettings, "learn_exploration", "perhaps"),
+        (TRPOSettings, "batch_steps", 0),
+        (TRPOSettings, "batch_steps", 10.5),
+        (TRPOSettings, "gamma", 1.0),
+        (TRPOSettings, "gamma", 0.0),
+        (TRPOSettings, "gae_lambda", 1.1),
+        (TRPOSettings, "gae_lambda", -0.1),
+        (TRPOSettings, "target_kl", 0.0),
+        (TRPOSettings, "cg_damping", -0.1),
+        (TRPOSettings, "critic_rate", 0.0),
+        (TRPOSettings, "critic_epochs", 0),
+        (TRPOSettings, "value_l2", -1e-3),
+        (TRPOSettings, "critic_batch", "many"),
+        (PPOSettings, "batch_steps", 0),
+        (PPOSettings, "clip", 0.0),
+        (PPOSettings, "clip", 1.0),
+        (PPOSettings, "epochs", 0),
+        (PPOSettings, "minibatches", 0),
+        (PPOSettings, "actor_rate", 0.0),
+        (SACSettings, "gamma", 1.0),
+        (SACSettings, "tau", 0.0),
+        (SACSettings, "tau", 1.5),
+        (SACSettings, "temperature", 0.0),
+        (SACSettings, "target_entropy", 1.0),
+        (SACSettings, "start", "slowly"),
+        (SACSettings, "start_steps", -1),
+        (SACSettings, "updates_per_step", 0.0),
+        (SACSettings, "buffer_rows", 0),
+    ],
+)
+def test_a_wrong_value_is_refused_in_one_line_that_names_it(kind: type, key: str, value: Any) -> None:
+    with pytest.raises(InputError) as caught:
+        build(kind, {key: value}, "settings")
+    line = str(caught.value)
+    assert line.startswith(f"settings.{key}")
+    assert "is not allowed; allowed: " in line
+    assert "\n" not in line
+
+
+@pytest.mark.parametrize("kind", [PolicySettings, TRPOSettings, PPOSettings, SACSettings])
+def test_an_unknown_name_is_refused(kind: type) -> None:
+    with pytest.raises(InputError, match=r"settings\.learning_speed: unknown name"):
+        build(kind, {"learning_speed": 1.0}, "settings")
+
+
+@pytest.mark.parametrize(
+    ("key", "value"), [("gae_lambda", 0.0), ("gae_lambda", 1.0), ("value_l2", 0.0), ("gamma", 0.999)]
+)
+def test_values_at_the_edge_of_what_is_allowed_are_taken(key: str, value: float) -> None:
+    assert getattr(build(TRPOSettings, {key: value}, ""), key) == value
+
+
+@pytest.mark.parametrize("made", [PolicySettings(), TRPOSettings(), PPOSettings(), SACSettings()])
+def test_settings_do_not_change_once_made(made: Any) -> None:
+    name = next(iter(vars(made)))
+    with pytest.raises(FrozenInstanceError):
+        setattr(made, name, getattr(made, name))
+
+
+def test_lists_of_a_toml_file_become_tuples() -> None:
+    made = build(PolicySettings, {"hidden": [32, 16], "observe": ["local", "loop_length"]}, "")
+    assert made == PolicySettings(hidden=(32, 16), observe=("local", "loop_length"))
+
+
+@pytest.mark.parametrize(
+    ("hold", "decision_step", "decisions"),
+    [(1.0, 0.1, 10), (1.0, 1.0, 1), (1.0, 0.2, 5), (0.0, 0.1, 1), (0.5, 1.0, 1), (0.3, 0.1, 3)],
+)
+def test_a_residual_is_held_for_so_many_seconds_whatever_a_decision_takes(
+    hold: float, decision_step: float, decisions: int
+) -> None:
+    assert PolicySettings(hold=hold).decisions_held(decision_step) == decisions

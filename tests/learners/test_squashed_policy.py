@@ -1,0 +1,130 @@
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tests.learners.test_policy import random_rows, shake
+from unjam.learners.policy import policy_spaces
+from unjam.learners.settings import PolicySettings
+from unjam.learners.squashed_policy import SquashedResidualPolicy, uniform_network
+
+torch.set_num_threads(1)  # more would fight for the cores over matrices of this size
+
+
+def make_policy(
+    settings: PolicySettings | None = None,
+    inputs: int = 5,
+    critic_inputs: int = 0,
+    action_limit: float = 1.0,
+) -> SquashedResidualPolicy:
+    settings = settings or PolicySettings()
+    return SquashedResidualPolicy(
+        *policy_spaces(inputs, critic_inputs, settings.authority * action_limit),
+        lambda _: 1e-3,
+        settings=settings,
+        inputs=inputs,
+        action_limit=action_limit,
+    )
+
+
+def residual_of(policy: SquashedResidualPolicy, rows: np.ndarray) -> np.ndarray:
+    """The deterministic residual [m/s2], as SB3 unscales it from [-1, 1]."""
+    with torch.no_grad():
+        return policy.unscale_action(policy._predict(torch.as_tensor(rows), deterministic=True).numpy())[:, 0]
+
+
+def values_of(policy: SquashedResidualPolicy, rows: np.ndarray) -> np.ndarray:
+    with torch.no_grad():
+        return torch.cat(policy.critic(torch.as_tensor(rows), torch.zeros(len(rows), 1)), dim=1).numpy()
+
+
+@pytest.mark.parametrize(("std", "authority"), [(0.1, 1.0), (0.3, 0.5)])
+def test_a_fresh_policy_adds_nothing_but_a_little_noise(std: float, authority: float) -> None:
+    policy = make_policy(PolicySettings(exploration_std=std, authority=authority), action_limit=2.0)
+    network, rows = policy.network(), random_rows(20_000, 5)
+    assert (residual_of(policy, rows) == 0.0).all()
+    assert (network(rows.astype(float)) == 0.0).all()
+    noise = np.random.default_rng(0).normal(size=len(rows))
+    explored = network.explore(rows.astype(float), noise)
+    bound = 2.0 * authority
+    np.testing.assert_allclose(explored, bound * np.tanh(2.0 * std / bound * noise), atol=1e-6)
+
+
+@given(
+    seed=st.integers(0, 2**31),
+    inputs=st.integers(1, 9),
+    hidden=st.lists(st.integers(1, 64), min_size=1, max_size=3),
+    authority=st.floats(0.1, 2.0),
+    rows=st.integers(1, 40),
+)
+def test_the_numpy_twin_gives_the_residual_and_the_noise_of_the_torch_policy(
+    seed: int, inputs: int, hidden: list[int], authority: float, rows: int
+) -> None:
+    policy = make_policy(PolicySettings(hidden=tuple(hidden), authority=authority), inputs, critic_inputs=2)
+    shake(policy.actor, seed)
+    seen = random_rows(rows, inputs + 2, seed)
+    network = policy.network()
+    found = network(seen[:, :inputs].astype(float))
+    np.testing.assert_allclose(found, residual_of(policy, seen), rtol=0, atol=2e-6)
+    noise = np.random.default_rng(seed).normal(size=rows)
+    with torch.no_grad():
+        mean, log_std, _ = policy.actor.get_action_dist_params(torch.as_tensor(seen))
+    drawn = authority * np.tanh((mean + log_std.exp() * torch.as_tensor(noise)[:, None]).numpy()[:, 0])
+    explored = network.explore(seen[:, :inputs].astype(float), noise)
+    np.testing.assert_allclose(explored, drawn, rtol=0, atol=2e-5)
+
+
+@pytest.mark.parametrize(("log_std", "clipped"), [(5.0, 2.0), (-30.0, -20.0)])
+def test_the_twins_noise_has_the_bounds_of_the_policys(log_std: float, clipped: float) -> None:
+    policy = make_policy()
+    with torch.no_grad():
+        policy.actor.get_parameter("log_std.bias").fill_(log_std)
+    found = policy.network().explore(np.zeros((1, 5)), np.array([1e-2]))
+    np.testing.assert_allclose(found, np.tanh(math.exp(clipped) * 1e-2), rtol=1e-6)
+
+
+def test_the_twin_keeps_its_weights_when_the_policy_learns_on() -> None:
+    policy = make_policy()
+    network, rows = policy.network(), random_rows(10, 5).astype(float)
+    shake(policy.actor, 2)
+    assert (network(rows) == 0.0).all()
+    assert np.abs(policy.network()(rows)).max() > 1e-3
+
+
+def test_what_the_critic_alone_sees_moves_the_value_and_not_the_residual() -> None:
+    policy = make_policy(critic_inputs=2)
+    shake(policy, 4)
+    rows = random_rows(50, 7)
+    other = rows.copy()
+    other[:, 5:] += 1.0
+    np.testing.assert_array_equal(residual_of(policy, other), residual_of(policy, rows))
+    assert np.abs(values_of(policy, other) - values_of(policy, rows)).min() > 1e-5
+
+
+def test_the_target_starts_as_the_critic() -> None:
+    policy = make_policy(critic_inputs=1)
+    rows = torch.as_tensor(random_rows(5, 6))
+    for found, target in zip(
+        policy.critic(rows, torch.ones(5, 1)), policy.critic_target(rows, torch.ones(5, 1)), strict=True
+    ):
+        assert torch.equal(found, target)
+
+
+def test_critics_promise_no_more_far_from_all_data() -> None:
+    policy = make_policy(critic_inputs=1)
+    rows = random_rows(200, 6)
+    near, far = values_of(policy, rows), values_of(policy, 1000.0 * rows)
+    assert np.abs(far).max() < 3.0 * np.abs(near).max()
+    assert np.ptp(far) > 0.01
+
+
+def test_uniform_residuals_cover_their_authority_evenly() -> None:
+    network = uniform_network(3, authority=2.0)
+    noise = np.random.default_rng(0).normal(size=200_000)
+    found = np.sort(network.explore(np.ones((len(noise), 3)), noise))
+    share = np.arange(len(found)) / len(found)
+    assert np.abs(share - (found + 2.0) / 4.0).max() < 0.015
+    assert (network(np.ones((4, 3))) == 0.0).all()

@@ -1,0 +1,69 @@
+"""Studies of a road so small that training takes a second."""
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from unjam.cli import app
+from unjam.studies import STUDIES, plan, pool
+from unjam.studies import reproduce as reproduction
+from unjam.studies.comparison import comparison
+from unjam.studies.plan import Variant
+from unjam.studies.reproduce import make_plan, reproduce
+from unjam.training.executors import Command
+
+SMALL: dict[str, Any] = {
+    "scenario": "ring",
+    "road.length": [60, 70],
+    "road.vehicles": 5,
+    "road.horizon": 80,
+    "trpo.batch_steps": 160,
+    "evaluation.validation_episodes": 1,
+    "evaluation.episodes": 2,
+    "virtual.epochs": 1,
+    "virtual.members": 2,
+}
+LITTLE = comparison("two ways to learn on a little ring", ("plain", "virtual"), ("little",))
+
+
+REFERENCES = {"human": "human", "PI": "pi", "ACC": "acc"}
+VARIANTS = {
+    "plain": Variant("plain", "", {"virtual.virtual_ratio": 0.0}, 320),
+    "virtual": Variant("with a model", "", {"virtual.virtual_ratio": 1.0}, 320),
+}
+
+
+@pytest.fixture(scope="module")
+def little() -> Iterator[pytest.MonkeyPatch]:
+    """Have the study `little` beside the others."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(STUDIES, "little", LITTLE)
+        patch.setitem(plan.ROADS, "little", SMALL)
+        for name, variant in VARIANTS.items():
+            patch.setitem(plan.VARIANTS, name, variant)
+        patch.setattr(reproduction, "REFERENCES", REFERENCES)
+        patch.setattr(pool, "EXPERTS", ("PI", "ACC"))
+        yield patch
+
+
+@pytest.fixture(scope="module")
+def reproduced(
+    tmp_path_factory: pytest.TempPathFactory, little: pytest.MonkeyPatch
+) -> tuple[Path, list[str]]:
+    """A study that was made, its trainings in this process and without reports: its folder, what was told."""
+    little.setattr(reproduction, "run_all", run_here)
+    little.setattr("unjam.training.train.write_report", lambda folders, path: path.touch())
+    folder, told = tmp_path_factory.mktemp("pool"), []
+    to_do = make_plan(["little"], 2, pool.Pool(folder))
+    assert len(to_do.runs) == 4
+    reproduce(to_do, 2, told=told.append)
+    return folder, told
+
+
+def run_here(commands: dict[str, Command], workers: int, executor: str, told: Callable[[str], None]) -> None:
+    """Run command lines of `unjam` in this process."""
+    for name, command in commands.items():
+        app(command.line()[3:], standalone_mode=False)
+        told(name)

@@ -1,0 +1,55 @@
+import json
+from pathlib import Path
+
+import pytest
+
+from unjam.studies.parts import Part, about_study, measure_parts, read_part
+
+
+def square(number: int) -> dict[str, int]:
+    return {"square": number * number}
+
+
+def refuse(number: int) -> None:
+    raise AssertionError(f"{number} is there already")
+
+
+def parts(count: int) -> dict[str, Part]:
+    return {f"of-{number}": (square, (number,)) for number in range(count)}
+
+
+def test_each_part_is_a_file(tmp_path: Path) -> None:
+    told: list[str] = []
+    measure_parts(tmp_path / "parts", parts(3), 1, told.append)
+    assert told == ["of-0", "of-1", "of-2"]
+    assert read_part(tmp_path / "parts", "of-2") == {"square": 4}
+
+
+def test_what_is_there_is_not_measured_again(tmp_path: Path) -> None:
+    measure_parts(tmp_path, parts(2), 1)
+    again: dict[str, Part] = {name: (refuse, (number,)) for number, name in enumerate(parts(2))}
+    measure_parts(tmp_path, {**again, **parts(3)} | again, 1)
+    assert read_part(tmp_path, "of-2") == {"square": 4}
+
+
+def test_a_part_that_fails_leaves_the_others(tmp_path: Path) -> None:
+    broken: dict[str, Part] = {**parts(1), "broken": (refuse, (1,))}
+    with pytest.raises(AssertionError):
+        measure_parts(tmp_path, broken, 1)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["of-0.json"]
+
+
+@pytest.mark.slow
+def test_processes_measure_the_same(tmp_path: Path) -> None:
+    measure_parts(tmp_path, parts(3), 2)
+    assert [read_part(tmp_path, f"of-{number}")["square"] for number in range(3)] == [0, 1, 4]
+
+
+def test_a_study_keeps_its_first_manifest_and_says_when_it_went_on(tmp_path: Path) -> None:
+    first = about_study(tmp_path)
+    assert "went_on" not in first
+    (tmp_path / "manifest.json").write_text(json.dumps({**first, "started": "long ago"}))
+    about_study(tmp_path)
+    found = about_study(tmp_path)
+    assert found["started"] == "long ago"
+    assert [later["commit"] for later in found["went_on"]] == [first["commit"]] * 2

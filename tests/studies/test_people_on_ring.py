@@ -1,0 +1,32 @@
+import json
+from pathlib import Path
+
+import pytest
+
+from unjam.controller import controller_bytes, make_driver
+from unjam.physics.idm import PAPER_IDM, IDMParameters
+from unjam.scenarios.population import Population, write_population
+from unjam.studies import people_on_ring
+
+
+def test_people_are_put_on_the_ring_with_and_without_a_cav(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    road = {"length": (80, 80), "vehicles": 8, "warmup": 300, "horizon": 200}
+    monkeypatch.setattr(people_on_ring, "ROAD", road)
+    monkeypatch.setattr(people_on_ring, "EPISODES", 1)
+    drivers = (PAPER_IDM, IDMParameters(time_headway=1.4))
+    write_population(tmp_path / "drivers.json", Population(PAPER_IDM, drivers, (-4.0, 2.0)))
+    (tmp_path / "pi.unjam").write_bytes(controller_bytes(make_driver("pi", 0.1), {}))
+    told: list[str] = []
+    populations = {"calibrated": tmp_path / "drivers.json"}
+    people_on_ring.run(tmp_path / "out", populations, tmp_path / "pi.unjam", 1, told.append)
+    rows = json.loads((tmp_path / "out" / "ring.json").read_text())["rows"]
+    found = [(row["people"], row["driver"]) for row in rows]
+    assert found == [
+        (people, driver) for people in ("paper's IDM", "calibrated") for driver in ("human", "pi", "trained")
+    ]
+    assert len(told) == 6
+    assert rows[1]["mean_speed"] == rows[2]["mean_speed"] != rows[4]["mean_speed"]
+    assert all("wave_speed" in row for row in rows)
+    assert (tmp_path / "out" / "ring.png").stat().st_size > 10_000

@@ -1,0 +1,133 @@
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from unjam.errors import InputError
+from unjam.files import write_whole
+from unjam.studies import STUDIES, TOGETHER, plan
+from unjam.studies.plan import PlannedRun
+from unjam.studies.pool import Pool
+from unjam.studies.reproduce import estimated_seconds, make_plan, reproduce, studies_of
+from unjam.training.folder import read_config
+
+Made = tuple[Path, list[str]]
+
+
+@pytest.mark.parametrize("name", STUDIES)
+def test_every_study_lists_trainings_that_can_be_configured(name: str) -> None:
+    runs = STUDIES[name].runs(2)
+    assert len(set(runs)) == len(runs)
+    for run in runs:
+        config = run.config
+        assert config.seed == run.seed
+        assert config.make_scenario().horizon > 0
+
+
+def test_all_is_every_study_and_figures_are_drawn_with_their_tables() -> None:
+    assert set(studies_of(["all"])) == set(STUDIES)
+    assert set(studies_of(["figure-7"])) == {"table-2"}
+    assert set(studies_of(["figure-4"])) == set(studies_of(["table-1"]))
+    assert set(studies_of(["table-1"])) == {f"table-1-{road}" for road in ("ring", "figure-eight", "merge")}
+    assert {study for names in TOGETHER.values() for study in names} == set(STUDIES)
+
+
+def test_an_unknown_study_lists_the_known(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="study: 'table-9' is not allowed; allowed: table-1"):
+        make_plan(["table-9"], 1, Pool(tmp_path))
+
+
+def test_a_training_that_two_studies_want_is_planned_once(tmp_path: Path) -> None:
+    both = make_plan(["table-1", "table-2"], 2, Pool(tmp_path))
+    alone = [make_plan([name], 2, Pool(tmp_path)) for name in ("table-1", "table-2")]
+    assert len(set(both.runs)) == len(both.runs) < sum(len(part.runs) for part in alone)
+    assert both.seconds(2) < sum(part.seconds(2) for part in alone)
+    assert both.seconds(4) < both.seconds(2)
+
+
+def test_the_paper_settings_cost_what_their_budget_says() -> None:
+    short, long = (estimated_seconds(PlannedRun("ring", name, 0)) for name in ("proposed", "proposed-long"))
+    assert long == pytest.approx(short * 4_000_000 / 300_000)
+
+
+def test_a_study_leaves_its_trainings_numbers_picture_and_manifest(reproduced: Made) -> None:
+    folder, told = reproduced
+    for variant in ("plain", "virtual"):
+        for seed in (0, 1):
+            assert (folder / "runs" / "little" / variant / str(seed) / "report.html").is_file()
+    assert {path.name for path in (folder / "little").iterdir()} == {
+        *("table.json", "table.csv", "curves.json", "curves.png", "manifest.json")
+    }
+    assert sum("failed" in line for line in told) == 0
+    manifest = json.loads((folder / "little" / "manifest.json").read_text())
+    assert manifest["seeds"] == 2
+    assert len({entry["weights_sha256"] for entry in manifest["trainings"]}) == 4
+
+
+def test_what_is_there_is_not_trained_again(reproduced: Made) -> None:
+    folder, _ = reproduced
+    before = {path: path.stat().st_mtime_ns for path in (folder / "runs").rglob("controller.unjam")}
+    plan_now = make_plan(["little"], 2, Pool(folder))
+    assert (plan_now.runs, plan_now.finished, plan_now.roads) == ([], 4, [])
+    told: list[str] = []
+    reproduce(plan_now, 2, told=told.append)
+    assert {path: path.stat().st_mtime_ns for path in before} == before
+    assert len(told) == 1
+
+
+def test_the_table_is_made_of_the_rows_of_its_trainings(reproduced: Made) -> None:
+    folder, _ = reproduced
+    table = {row["name"]: row for row in json.loads((folder / "little" / "table.json").read_text())}
+    assert list(table) == ["human", "PI", "ACC", "plain", "with a model"]
+    experts = {name: table[name]["return"]["mean"] for name in ("PI", "ACC")}
+    best = max(experts, key=lambda name: experts[name])
+    assert [name for name in experts if table[name]["best_expert"]] == [best]
+    returns = []
+    for seed in (0, 1):
+        run = folder / "runs" / "little" / "plain" / str(seed)
+        rows = json.loads((run / "evaluation.json").read_text())["rows"]
+        returns.append(np.mean([row["return"] for row in rows if row["driver"] == "trained"]))
+    assert table["plain"]["return"]["mean"] == pytest.approx(np.mean(returns))
+    beyond = table["plain"]["beyond_best_expert"]["mean"]
+    assert beyond == pytest.approx(np.mean(returns) - experts[best])
+    progress = [
+        json.loads((folder / "runs/little/plain" / seed / "progress.jsonl").read_text().splitlines()[-1])
+        for seed in ("0", "1")
+    ]
+    lengths = table["plain"]["steady_by_draw"]["length"]
+    assert list(lengths) == sorted(lengths, key=float)
+    assert min(lengths.values()) <= table["plain"]["mean_speed_steady"]["mean"] <= max(lengths.values())
+    convention = table["plain"]["paper_convention"]
+    assert convention["speed"]["mean"] == pytest.approx(np.mean([row["cav_mean_speed"] for row in progress]))
+    assert math.isclose(convention["reward"]["mean"], np.mean([row["return_mean"] for row in progress]))
+    assert set(pd.read_csv(folder / "little" / "table.csv")["name"]) == set(table)
+
+
+def test_a_training_with_other_settings_is_not_taken_for_ours(reproduced: Made) -> None:
+    folder, _ = reproduced
+    config = folder / "runs/little/plain/0/config.toml"
+    before = config.read_text()
+    try:
+        write_whole(config, before.replace("gamma = 0.99", "gamma = 0.9"))
+        with pytest.raises(InputError, match="was trained with other settings; allowed: a new folder"):
+            make_plan(["little"], 2, Pool(folder))
+    finally:
+        write_whole(config, before)
+
+
+def test_a_stopped_training_goes_on(reproduced: Made, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What a stop leaves: no judgement yet, and fewer steps than planned."""
+    folder, _ = reproduced
+    run = PlannedRun("little", "plain", 1)
+    monkeypatch.setitem(plan.VARIANTS, "plain", replace(plan.VARIANTS["plain"], steps=480))
+    (folder / "runs" / run.name / "evaluation.json").unlink()
+    to_do = make_plan(["little"], 2, Pool(folder))
+    assert run in to_do.runs
+    reproduce(to_do, 2)
+    assert read_config(folder / "runs" / run.name).steps == 480
+    rows = (folder / "runs" / run.name / "progress.jsonl").read_text().splitlines()
+    assert [json.loads(row)["actual_steps"] for row in rows] == [160, 320, 480]

@@ -1,0 +1,75 @@
+import json
+import shutil
+import subprocess
+import sys
+from datetime import UTC, datetime, timedelta
+from importlib.metadata import version
+from pathlib import Path
+
+import pytest
+
+import unjam
+from unjam import manifest as module
+from unjam.manifest import manifest
+
+
+def git(*arguments: str) -> subprocess.CompletedProcess[str]:
+    here = Path(unjam.__file__).parent
+    return subprocess.run(["git", *arguments], cwd=here, capture_output=True, text=True, check=False)
+
+
+def test_names_what_the_result_depends_on() -> None:
+    made = manifest()
+    assert made["unjam"] == unjam.__version__
+    assert made["python"] == ".".join(map(str, sys.version_info[:3]))
+    for package in ("libsumo", "eclipse-sumo", "torch", "numpy", "stable-baselines3", "sb3-contrib"):
+        assert made["packages"][package] == version(package)
+    assert made["machine"]["cores"] >= 1
+
+
+def test_is_json() -> None:
+    assert json.loads(json.dumps(manifest())).keys() == manifest().keys()
+
+
+def test_was_made_now() -> None:
+    age = datetime.now(UTC) - datetime.fromisoformat(manifest()["started"])
+    assert timedelta(seconds=-2) < age < timedelta(minutes=1)
+
+
+def test_names_the_command_without_the_place_of_the_program(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "argv", ["/somewhere/bin/unjam", "train", "--set", "seed=3"])
+    assert manifest()["command"] == ["unjam", "train", "--set", "seed=3"]
+
+
+def test_a_package_that_is_missing_has_no_version(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "PACKAGES", ("numpy", "no-such-package-of-ours"))
+    assert manifest()["packages"] == {"numpy": version("numpy"), "no-such-package-of-ours": None}
+
+
+@pytest.mark.skipif(not shutil.which("git") or git("rev-parse").returncode != 0, reason="no checkout")
+def test_names_the_commit_of_its_source() -> None:
+    commit = manifest()["commit"]
+    assert git("rev-parse", commit.removesuffix("+")).stdout == git("rev-parse", "HEAD").stdout
+
+
+def test_elsewhere_than_in_a_checkout_there_is_no_commit(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "__file__", str(tmp_path / "manifest.py"))
+    assert manifest()["commit"] is None
+
+
+@pytest.mark.skipif(not shutil.which("git"), reason="no git")
+def test_a_package_installed_inside_somebody_elses_checkout_has_no_commit(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    author = ["-c", "user.name=me", "-c", "user.email=me@here"]
+    for arguments in (["init"], [*author, "commit", "--allow-empty", "-m", "mine"]):
+        subprocess.run(["git", *arguments], cwd=tmp_path, capture_output=True, check=True)
+    monkeypatch.setattr(module, "__file__", str(tmp_path / "manifest.py"))
+    assert manifest()["commit"] is None
+
+
+def test_without_git_there_is_no_commit(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PATH", "")
+    assert manifest()["commit"] is None

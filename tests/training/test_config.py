@@ -1,0 +1,195 @@
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from unjam.drivers import PISaturation
+from unjam.drivers.constant import Constant
+from unjam.errors import InputError
+from unjam.learners.algorithms import LEARNERS
+from unjam.learners.settings import PolicySettings, TRPOSettings
+from unjam.parameters import merge
+from unjam.training.config import EvaluationSettings, RunConfig, load_config, read_toml, to_toml
+from unjam.training.evaluate import HELD_OUT, VALIDATION
+from unjam.training.presets import PRESETS
+
+
+def written(folder: Path, text: str) -> Path:
+    path = folder / "config.toml"
+    path.write_text(text)
+    return path
+
+
+def test_without_anything_it_is_the_defaults() -> None:
+    assert load_config() == RunConfig()
+    assert load_config().scenario == "ring"
+
+
+def test_later_sources_go_before_earlier_ones(tmp_path: Path) -> None:
+    file = written(tmp_path, "steps = 7\nseed = 7\n[trpo]\ngamma = 0.7\ngae_lambda = 0.7\n")
+    made = load_config(file, "paper", {"seed": 8, "trpo.gamma": 0.8})
+    assert made.seed == 8  # changes before file
+    assert made.trpo.gamma == 0.8
+    assert made.steps == 7  # file before preset
+    assert made.trpo.gae_lambda == 0.7
+    assert made.trpo.target_kl == PRESETS["paper"]["trpo"]["target_kl"]  # preset before defaults
+    assert made.trpo.target_kl != TRPOSettings().target_kl
+    assert made.trpo.cg_steps == TRPOSettings().cg_steps
+    assert made.preset == "paper"
+
+
+def test_a_change_of_one_key_leaves_the_rest_of_its_table() -> None:
+    made = load_config(changes={"policy": {"hold": 3}, "policy.authority": 0.5, "road": {"vehicles": 20}})
+    assert made.policy == PolicySettings(hold=3, authority=0.5)
+    assert made.make_scenario().vehicles == 20  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def test_the_road_can_be_changed_key_by_key() -> None:
+    made = load_config(changes={"scenario": "ring-warm", "road.length": [230, 240], "road.horizon": 50})
+    scenario = made.make_scenario()
+    assert scenario.length == (230, 240)  # pyright: ignore[reportAttributeAccessIssue]
+    assert (scenario.horizon, scenario.warmup) == (50, 750)
+
+
+def test_presets_are_not_changed_by_their_use() -> None:
+    before = load_config(preset="paper")
+    load_config(preset="paper", changes={"trpo.gamma": 0.5, "policy.hold": 9})
+    assert load_config(preset="paper") == before
+
+
+def test_merging_changes_neither_side() -> None:
+    values, changes = {"a": {"b": 1, "c": 2}, "d": 3}, {"a": {"b": 5}, "d": {"e": 6}}
+    assert merge(values, changes) == {"a": {"b": 5, "c": 2}, "d": {"e": 6}}
+    assert (values, changes) == ({"a": {"b": 1, "c": 2}, "d": 3}, {"a": {"b": 5}, "d": {"e": 6}})
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"sed": 1}, "sed: unknown name"),
+        ({"trpo.gama": 0.9}, "trpo.gama: unknown name"),
+        ({"evaluation.evry": 1}, "evaluation.evry: unknown name"),
+        ({"trpo.gamma": 1.5}, "trpo.gamma: 1.5 is not allowed; allowed: less than 1"),
+        ({"trpo.gamma": float("nan")}, "trpo.gamma: nan is not allowed"),
+        ({"trpo": 3}, "trpo: 3 is not allowed"),
+        ({"trpo.gamma.x": 3}, "trpo.gamma: {'x': 3} is not allowed"),
+        ({"agent": "magic"}, "agent: 'magic' is not allowed; allowed: 'trpo', 'ppo' or 'sac'"),
+        ({"ppo.clip": 2.0}, "ppo.clip: 2.0 is not allowed; allowed: less than 1"),
+        ({"sac.start": "slowly"}, "sac.start: 'slowly' is not allowed; allowed: 'expert' or 'uniform'"),
+        ({"sac.gama": 0.9}, "sac.gama: unknown name"),
+        ({"steps": 0}, "steps: 0 is not allowed"),
+        ({"steps": 1.5}, "steps: 1.5 is not allowed"),
+        ({"steps": "many"}, "steps: 'many' is not allowed"),
+        ({"seed": -1}, "seed: -1 is not allowed"),
+        ({"workers": 0}, "workers: 0 is not allowed"),
+        ({"scenario": ["ring"]}, "scenario: ['ring'] is not allowed"),
+        ({"evaluation.episodes": 0}, "evaluation.episodes: 0 is not allowed"),
+        ({"evaluation.every": -1}, "evaluation.every: -1 is not allowed"),
+        ({"evaluation.baselines": "pi"}, "evaluation.baselines: 'pi' is not allowed"),
+        ({"policy.observe": ["stars"]}, "policy.observe.0: 'stars' is not allowed"),
+        ({"scenario": "rong"}, "scenario: 'rong' is not allowed; allowed: ring, ring-warm, ring-jammed"),
+        ({"road": {"lenght": [220, 230]}}, "scenario ring.lenght: unknown name"),
+        ({"road.vehicles": 1}, "scenario ring.vehicles: 1 is not allowed"),
+        ({"road.length": [250, 230]}, "scenario ring.length: 230 m is not allowed as the largest"),
+    ],
+)
+def test_a_wrong_value_gets_one_line_that_begins_with_its_name(changes: dict[str, Any], words: str) -> None:
+    with pytest.raises(InputError) as caught:
+        load_config(changes=changes)
+    assert str(caught.value).startswith(words)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("seed", [HELD_OUT, VALIDATION])
+def test_a_seed_that_would_train_on_the_judging_episodes_is_refused(seed: int) -> None:
+    with pytest.raises(InputError, match="seed"):
+        load_config(changes={"seed": seed})
+
+
+def test_an_unknown_preset_lists_the_known() -> None:
+    with pytest.raises(InputError, match="preset: 'papre' is not allowed; allowed: paper, demo"):
+        load_config(preset="papre")
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b"steps = ", "not TOML"),
+        (b"steps = 1\nsteps = 2\n", "not TOML"),
+        (b"\xff\xfe\x00", "not TOML"),
+        (b"[trpo]\ngama = 1\n", "trpo.gama: unknown name"),
+        (b"steps = 'many'\n", "steps: 'many' is not allowed"),
+        (b"steps = 2020-01-01\n", "is not allowed"),
+    ],
+)
+def test_a_wrong_file_gets_one_line(tmp_path: Path, content: bytes, words: str) -> None:
+    path = tmp_path / "wrong.toml"
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=words) as caught:
+        load_config(path)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_missing_file_and_a_folder_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"none\.toml: No such file"):
+        read_toml(tmp_path / "none.toml")
+    with pytest.raises(InputError, match=r"config file .*directory"):
+        read_toml(tmp_path)
+
+
+@pytest.mark.parametrize("preset", ["", *PRESETS])
+def test_the_toml_of_a_configuration_makes_it_again(tmp_path: Path, preset: str) -> None:
+    made = load_config(
+        preset=preset, changes={"road.humans": {"time_headway": 1.3}, "expert": 'a "b" c.py:d'}
+    )
+    assert load_config(written(tmp_path, to_toml(made))) == made
+
+
+def test_the_toml_of_a_road_given_in_python_makes_it_again(tmp_path: Path) -> None:
+    made = load_config(changes={"road.length": (230, 240)})
+    assert load_config(written(tmp_path, to_toml(made))) == made
+
+
+@given(
+    made=st.builds(
+        RunConfig,
+        expert=st.text(),
+        reward=st.text(),
+        steps=st.integers(1, 2**62),
+        seed=st.integers(0, 10**6 - 1),
+        policy=st.builds(
+            PolicySettings,
+            hidden=st.lists(st.integers(1, 999), min_size=1).map(tuple),
+            authority=st.floats(1e-300, 1e300),
+            learn_exploration=st.booleans(),
+        ),
+        trpo=st.builds(TRPOSettings, gamma=st.floats(0, 1, exclude_min=True, exclude_max=True)),
+        evaluation=st.builds(EvaluationSettings, baselines=st.lists(st.text()).map(tuple)),
+    )
+)
+def test_any_configuration_survives_being_written(made: RunConfig, tmp_path_factory: Any) -> None:
+    path = tmp_path_factory.getbasetemp() / "any.toml"
+    path.write_bytes(to_toml(made).encode())
+    assert load_config(path) == made
+
+
+@pytest.mark.parametrize("agent", LEARNERS)
+def test_each_learner_has_its_own_settings(agent: str) -> None:
+    made = load_config(changes={"agent": agent, f"{agent}.gamma": 0.7, f"{agent}.batch_steps": 77})
+    assert (made.learner.gamma, made.learner.batch_steps) == (0.7, 77)
+    assert made.learner == getattr(made, agent)
+
+
+def test_every_key_is_written_out() -> None:
+    text = to_toml(RunConfig())
+    for key in ("steps", "seed", "expert", "gamma", "critic_rate", "hold", "observe", "baselines", "preset"):
+        assert f"\n{key} = " in f"\n{text}"
+
+
+def test_the_expert_is_made_as_named() -> None:
+    assert load_config(changes={"expert": "none"}).make_expert() == Constant()
+    assert load_config(changes={"expert": "pi:window=30"}).make_expert() == PISaturation(window=30)
+    slow = load_config(changes={"road.steps_per_decision": 5}).make_expert()
+    assert slow == PISaturation(time_step=0.5)

@@ -1,0 +1,222 @@
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from unjam.drivers import IDM, LocalState, PISaturation
+from unjam.drivers.driver import Driver, Memory
+from unjam.errors import InputError
+from unjam.files import to_json
+from unjam.measures.metrics import METRICS
+from unjam.reports.results import read_results
+from unjam.scenarios import Ring
+from unjam.training.drive import DriveResult, drive, raise_failures
+from unjam.training.evaluate import held_out_seeds
+from unjam.worlds.drive import run_episode
+
+ROAD: dict[str, Any] = {"length": (120, 130), "vehicles": 8, "horizon": 60}
+
+
+@pytest.fixture(scope="module")
+def compared(tmp_path_factory: pytest.TempPathFactory) -> DriveResult:
+    """Two drivers on the same three episodes, written into a folder."""
+    out = tmp_path_factory.mktemp("drives") / "new" / "folder"
+    return drive("ring", ["pi", IDM()], episodes=3, seed=4, road=ROAD, workers=1, out=out)
+
+
+def test_every_driver_has_a_row_for_every_seed(compared: DriveResult) -> None:
+    assert list(compared.rows) == ["pi", "idm"]
+    for rows in compared.rows.values():
+        assert [row["seed"] for row in rows] == [4, 5, 6]
+        assert {row["status"] for row in rows} == {"completed"}
+
+
+def test_a_row_measures_the_episode_of_its_seed(compared: DriveResult) -> None:
+    ring = Ring(**ROAD)
+    for row in compared.rows["pi"]:
+        (trajectory,) = run_episode(ring, PISaturation(), (row["seed"],)).trajectories
+        assert row["return"] == trajectory.reward.sum()
+
+
+def test_held_out_seeds_are_those_that_judge_trainings() -> None:
+    judged = drive("ring", "pi", episodes=2, road=ROAD, workers=1, held_out=True).rows["pi"]
+    again = [run_episode(Ring(**ROAD), PISaturation(), seed).trajectories[0] for seed in held_out_seeds(2)]
+    assert [row["return"] for row in judged] == [trajectory.reward.sum() for trajectory in again]
+
+
+def test_what_was_driven_is_written_with_a_report(compared: DriveResult) -> None:
+    assert compared.folder is not None
+    assert {path.name for path in compared.folder.iterdir()} == {
+        "evaluation.json",
+        "episodes.parquet",
+        "shown.safetensors",
+        "report.html",
+    }
+    assert compared.report == compared.folder / "report.html"
+    results = read_results(compared.folder)
+    assert list(results.rows) == ["pi", "idm"]
+    assert results.about["reward"] == "released"
+    assert results.trained is None
+
+
+def test_the_mean_is_that_of_the_first_driver(compared: DriveResult) -> None:
+    speeds = [row["mean_speed"] for row in compared.rows["pi"]]
+    assert compared.mean["mean_speed"] == pytest.approx(np.mean(speeds))
+    found = compared.summary("idm")["mean_speed"]
+    assert found.mean == pytest.approx(np.mean([row["mean_speed"] for row in compared.rows["idm"]]))
+    assert found.low <= found.mean <= found.high
+    assert found.count == 3
+
+
+def test_the_document_of_several_drivers_is_a_list_of_such(compared: DriveResult) -> None:
+    document = json.loads(to_json(compared.document()))
+    assert document["scenario"] == "ring"
+    assert [entry["driver"] for entry in document["drivers"]] == ["pi", "idm"]
+    for entry in document["drivers"]:
+        assert len(entry["episodes"]) == 3
+        assert entry["mean"].keys() == entry["interval"].keys() == METRICS.keys()
+        assert entry["report"] == str(compared.report)
+
+
+def test_the_document_of_one_driver_is_strict_json_with_null_for_nan() -> None:
+    result = drive("ring", "pi", episodes=1, road=ROAD, workers=1)
+    document = json.loads(to_json(result.document()), parse_constant=lambda name: pytest.fail(name))
+    assert document["driver"] == "pi"
+    assert document["mean"]["mean_speed"] == result.mean["mean_speed"]
+    assert (
+        document["mean"]["time_to_dissolve"] is None
+    )  # 6 s are too short for traffic to be calm for a minute
+    assert document["interval"]["mean_speed"] == [None, None]  # one episode has no spread
+    assert document["folder"] is None
+
+
+def test_without_out_nothing_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    result = drive("ring", "idm", episodes=1, road=ROAD, workers=1)
+    assert (result.folder, result.report) == (None, None)
+    assert not list(tmp_path.iterdir())
+
+
+def test_no_temporary_file_is_left(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    monkeypatch.setattr("tempfile.tempdir", None)  # where Python remembers what TMPDIR was
+    drive("ring", "idm", episodes=1, road=ROAD, workers=1)
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_number_of_workers_changes_nothing(compared: DriveResult) -> None:
+    other = drive("ring", ["pi", "idm"], episodes=3, seed=4, road=ROAD, workers=2)
+    assert to_json(other.rows) == to_json(compared.rows)
+
+
+def test_progress_is_told_by_driver_and_episode() -> None:
+    told: list[tuple[Any, int]] = []
+    drive(
+        "ring", ["pi", "idm"], 1, road=ROAD, workers=1, progress=lambda key, steps: told.append((key, steps))
+    )
+    assert (("pi", 0), 60) in told
+    assert (("idm", 0), 60) in told
+
+
+def test_a_reward_of_the_users_own(my_drivers: Path, tmp_path: Path) -> None:
+    name = f"{my_drivers}:calm"
+    result = drive("ring", "idm", 1, road=ROAD, reward=name, workers=1, out=tmp_path / "out")
+    (trajectory,) = run_episode(Ring(**ROAD), IDM(), (0,), name).trajectories
+    assert result.rows["idm"][0]["return"] == trajectory.reward.sum()
+    assert read_results(tmp_path / "out").about["reward"] == name
+
+
+def test_a_driver_that_fails_has_rows_that_say_so_and_can_be_raised(my_drivers: Path, tmp_path: Path) -> None:
+    bad = f"{my_drivers}:broken"
+    result = drive("ring", ["idm", bad], episodes=2, road=ROAD, workers=1, out=tmp_path / "out")
+    assert [row["status"] for row in result.rows[bad]] == ["failed", "failed"]
+    assert [row["status"] for row in result.rows["idm"]] == ["completed", "completed"]
+    assert (tmp_path / "out" / "report.html").is_file()
+    with pytest.raises(InputError, match="step 0: acceleration of cav_0 is nan") as caught:
+        raise_failures(result)
+    assert "\n" not in str(caught.value)
+
+
+def test_where_all_went_well_nothing_is_raised(compared: DriveResult) -> None:
+    raise_failures(compared)
+
+
+class Unknown(Driver):
+    """A driver that another process cannot make again."""
+
+    def act(self, state: LocalState, memory: Memory) -> tuple[Any, Memory]:
+        return state.speed * 0.0, memory
+
+
+@pytest.fixture
+def started(monkeypatch: pytest.MonkeyPatch) -> Callable[[], bool]:
+    """Tells whether a worker process was started."""
+    from unjam.worlds import workers
+
+    begun: list[object] = []
+    start = workers._Worker._start
+
+    def noted(self: Any) -> Any:
+        begun.append(self)
+        return start(self)
+
+    monkeypatch.setattr(workers._Worker, "_start", noted)
+    return lambda: bool(begun)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"scenario": "rong"},
+        {"driver": "nobody"},
+        {"driver": ["pi", "nobody"]},
+        {"driver": "pi:speed=1"},
+        pytest.param({"driver": Unknown()}, id="unknown driver"),
+        {"driver": []},
+        {"road": {"lenght": (120, 130)}},
+        {"road": {"vehicles": 1}},
+        {"reward": "gold"},
+        {"reward": "nowhere.py:gold"},
+        {"episodes": 0},
+        {"seed": -1},
+        {"seed": 3, "held_out": True},
+        {"workers": -1},
+    ],
+    ids=str,
+)
+def test_wrong_arguments_are_told_before_anything_starts(
+    tmp_path: Path, started: Callable[[], bool], wrong: dict[str, Any]
+) -> None:
+    arguments = {"driver": "pi", "episodes": 1, "road": ROAD, "workers": 1, "out": tmp_path / "out", **wrong}
+    with pytest.raises(InputError) as caught:
+        drive(**arguments)
+    assert "\n" not in str(caught.value)
+    assert not (tmp_path / "out").exists()
+    assert not started()
+
+
+@pytest.mark.parametrize("kind", ["folder", "file"])
+def test_what_is_already_there_is_left_alone(tmp_path: Path, started: Callable[[], bool], kind: str) -> None:
+    mine = tmp_path / "out" / "mine.txt" if kind == "folder" else tmp_path / "out"
+    mine.parent.mkdir(exist_ok=True)
+    mine.write_text("keep")
+    with pytest.raises(InputError, match="out' is not empty; allowed: a new folder"):
+        drive("ring", "pi", 1, road=ROAD, out=tmp_path / "out")
+    assert mine.read_text() == "keep"
+    assert not started()
+
+
+def test_started_notices_a_worker(started: Callable[[], bool]) -> None:
+    assert not started()
+    drive("ring", "idm", 1, road=ROAD, workers=1)
+    assert started()
+
+
+def test_two_drivers_of_the_same_description_are_both_driven(my_drivers: Path) -> None:
+    from unjam.controller import make_driver
+
+    drivers = [make_driver(f"{my_drivers}:Keeper:gain={gain}", 0.1) for gain in (0.1, 0.2)]
+    assert len(drive("ring", drivers, 1, road=ROAD, workers=1).rows) == 2

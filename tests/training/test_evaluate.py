@@ -1,0 +1,221 @@
+import json
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from unjam.drivers import IDM, Driver, PISaturation
+from unjam.drivers.from_file import FileDriver
+from unjam.errors import DiskError, EpisodeError, InputError, MissingPartError, UnjamError
+from unjam.measures.metrics import METRICS
+from unjam.reports.results import read_results
+from unjam.scenarios import Ring
+from unjam.training.evaluate import (
+    HELD_OUT,
+    VALIDATION,
+    Evaluation,
+    evaluate,
+    held_out_seeds,
+    raise_failure,
+    save_evaluation,
+)
+from unjam.worlds.drive import run_episode
+from unjam.worlds.workers import Workers
+
+RING = Ring(length=(120, 130), vehicles=8, horizon=60)
+SEEDS = [(7, 0), (7, 1), (7, 2)]
+
+
+@pytest.fixture(scope="module")
+def pool() -> Iterator[Workers]:
+    with Workers(1) as workers:
+        yield workers
+
+
+@pytest.fixture(scope="module")
+def found(pool: Workers) -> Evaluation:
+    return evaluate(RING, {"mine": PISaturation(), "other": IDM()}, SEEDS, pool)
+
+
+def test_every_driver_has_a_row_for_every_seed_in_their_order(found: Evaluation) -> None:
+    assert list(found.rows) == ["mine", "other"]
+    for rows in found.rows.values():
+        assert [tuple(row["seed"]) for row in rows] == SEEDS
+        assert {row["status"] for row in rows} == {"completed"}
+        assert all(METRICS.keys() <= row.keys() for row in rows)
+
+
+def test_a_row_measures_the_episode_of_its_driver_and_seed(found: Evaluation) -> None:
+    drivers: dict[str, Driver] = {"mine": PISaturation(), "other": IDM()}
+    for label, driver in drivers.items():
+        for seed, row in zip(SEEDS, found.rows[label], strict=True):
+            episode = run_episode(RING, driver, seed)
+            assert row["return"] == episode.trajectories[0].reward.sum()
+            assert row["mean_speed"] == np.mean(episode.speeds[1:])
+
+
+def test_all_drivers_meet_the_same_traffic(found: Evaluation) -> None:
+    assert found.shown["mine"].drawn == found.shown["other"].drawn
+    assert found.shown["mine"].seed == found.shown["other"].seed == SEEDS[0]
+    assert not np.array_equal(found.shown["mine"].speeds, found.shown["other"].speeds)
+
+
+def test_fuel_is_measured(found: Evaluation) -> None:
+    fuel = [name for name in METRICS if "fuel" in name]
+    assert fuel
+    assert all(row[name] > 0 for rows in found.rows.values() for row in rows for name in fuel)
+
+
+def test_means_are_over_the_seeds(found: Evaluation) -> None:
+    expected = np.mean([row["return"] for row in found.rows["mine"]])
+    assert found.means()["mine"]["return"] == pytest.approx(expected)
+
+
+def test_another_reward_changes_the_return_alone(found: Evaluation, pool: Workers) -> None:
+    other = evaluate(RING, {"mine": PISaturation()}, SEEDS, pool, reward="eq16")
+    for row, before in zip(other.rows["mine"], found.rows["mine"], strict=True):
+        assert row["return"] == pytest.approx(before["return_eq16"])
+        assert row["return"] != before["return"]
+        assert row["mean_speed"] == before["mean_speed"]
+
+
+def test_progress_names_driver_and_episode(pool: Workers) -> None:
+    told: list[tuple[tuple[str, int], int]] = []
+    evaluate(
+        RING,
+        {"a": IDM(), "b": IDM()},
+        SEEDS[:2],
+        pool,
+        progress=lambda episode, steps: told.append((episode, steps)),
+    )
+    assert {episode for episode, steps in told if steps == 60} == {("a", 0), ("a", 1), ("b", 0), ("b", 1)}
+
+
+def test_a_driver_that_fails_has_rows_that_say_so_and_does_not_stop_the_others(
+    pool: Workers, my_drivers: Path
+) -> None:
+    found = evaluate(RING, {"bad": FileDriver(my_drivers, "raises"), "good": IDM()}, SEEDS[:2], pool)
+    assert [row["status"] for row in found.rows["bad"]] == ["failed", "failed"]
+    assert [tuple(row["seed"]) for row in found.rows["bad"]] == SEEDS[:2]
+    assert all("lost the map" in row["reason"] for row in found.rows["bad"])
+    assert all(math.isnan(row["return"]) for row in found.rows["bad"])
+    assert [row["status"] for row in found.rows["good"]] == ["completed", "completed"]
+    assert list(found.shown) == ["good"]
+    assert math.isnan(found.means()["bad"]["return"])
+
+
+@pytest.mark.parametrize("kind", [InputError, MissingPartError, DiskError, EpisodeError, UnjamError])
+def test_a_failure_is_raised_as_the_error_that_it_was(kind: type[UnjamError]) -> None:
+    rows = [
+        {"status": "completed", "seed": (1,)},
+        {"status": "failed", "seed": (2,), "reason": "no way", "error": kind.__name__},
+        {"status": "failed", "seed": (3,), "reason": "never", "error": "UnjamError"},
+    ]
+    with pytest.raises(kind, match="no way") as caught:
+        raise_failure(rows)
+    assert type(caught.value) is kind
+    assert ("seed (2,)" in str(caught.value)) is (kind is not InputError)
+
+
+def test_where_nothing_failed_nothing_is_raised(found: Evaluation) -> None:
+    raise_failure([row for rows in found.rows.values() for row in rows])
+
+
+def test_an_error_of_an_unknown_name_is_still_one_of_ours() -> None:
+    with pytest.raises(UnjamError, match="no way"):
+        raise_failure([{"status": "failed", "seed": (2,), "reason": "no way", "error": "Surprise"}])
+
+
+def numbers_of(seed: tuple[int, ...]) -> tuple[int, ...]:
+    """What a seed means to NumPy, which takes (1, 2) and (1, 2, 0) for the same."""
+    return tuple(np.random.SeedSequence(list(seed)).generate_state(4).tolist())
+
+
+def test_seeds_that_train_choose_and_judge_have_nothing_in_common() -> None:
+    judging = {numbers_of(seed) for seed in held_out_seeds(500)}
+    choosing = {numbers_of((VALIDATION, index)) for index in range(500)}
+    training = {
+        numbers_of((run, iteration, index))
+        for run in (0, 1, 2, 3, 42, 1_000_002, 1_000_004)
+        for iteration in range(1, 60)
+        for index in range(4)
+    }
+    assert len(judging) == len(choosing) == 500
+    assert judging.isdisjoint(choosing)
+    assert training.isdisjoint(judging | choosing)
+    assert HELD_OUT + 500 > VALIDATION > HELD_OUT  # a seed that only counted up from one would meet the other
+
+
+def test_more_held_out_episodes_contain_the_fewer() -> None:
+    assert held_out_seeds(20)[:5] == held_out_seeds(5)
+
+
+def strict(text: str) -> Any:
+    """JSON as its standard has it."""
+
+    def refuse(name: str) -> None:
+        raise AssertionError(f"{name} is not JSON")
+
+    return json.loads(text, parse_constant=refuse)
+
+
+def test_a_saved_evaluation_can_be_read_again(found: Evaluation, tmp_path: Path) -> None:
+    save_evaluation(
+        tmp_path / "new", found, {"scenario": "ring", "reward": "released", "limit": float("inf")}
+    )
+    assert {path.name for path in (tmp_path / "new").iterdir()} == {
+        "evaluation.json",
+        "episodes.parquet",
+        "shown.safetensors",
+    }
+    document = strict((tmp_path / "new" / "evaluation.json").read_text())
+    assert document["scenario"] == "ring"
+    assert document["limit"] is None
+    assert len(document["rows"]) == 6
+    results = read_results(tmp_path / "new")
+    for label, rows in found.rows.items():
+        for row, expected in zip(results.rows[label], rows, strict=True):
+            for name in METRICS:
+                same = row[name] == expected[name] or (
+                    math.isnan(row[name]) and not math.isfinite(expected[name])
+                )
+                assert same, name
+    for label, episode in found.shown.items():
+        np.testing.assert_array_equal(results.shown[label].positions, episode.positions.astype(np.float32))
+        np.testing.assert_array_equal(results.shown[label].outline, episode.outline.astype(np.float32))
+        assert results.shown[label].drawn == episode.drawn
+        assert tuple(results.shown[label].cav_ids) == episode.cav_ids
+
+
+def test_the_table_has_the_rows(found: Evaluation, tmp_path: Path) -> None:
+    save_evaluation(tmp_path, found, {})
+    table = pd.read_parquet(tmp_path / "episodes.parquet")
+    assert table["driver"].tolist() == ["mine"] * 3 + ["other"] * 3
+    assert table["seed"].tolist() == [str(row["seed"]) for rows in found.rows.values() for row in rows]
+    np.testing.assert_array_equal(
+        table["mean_speed"], [row["mean_speed"] for rows in found.rows.values() for row in rows]
+    )
+
+
+def test_an_evaluation_in_which_all_failed_can_be_saved(
+    pool: Workers, my_drivers: Path, tmp_path: Path
+) -> None:
+    found = evaluate(RING, {"bad": FileDriver(my_drivers, "broken")}, SEEDS[:1], pool)
+    save_evaluation(tmp_path, found, {})
+    (row,) = strict((tmp_path / "evaluation.json").read_text())["rows"]
+    assert (row["status"], row["return"]) == ("failed", None)
+    assert read_results(tmp_path).shown == {}
+    assert pd.read_parquet(tmp_path / "episodes.parquet")["status"].tolist() == ["failed"]
+
+
+def test_a_new_evaluation_takes_the_place_of_the_old(
+    found: Evaluation, tmp_path: Path, pool: Workers
+) -> None:
+    save_evaluation(tmp_path, found, {})
+    save_evaluation(tmp_path, evaluate(RING, {"one": IDM()}, SEEDS[:1], pool), {})
+    assert list(read_results(tmp_path).rows) == ["one"]
+    assert list(read_results(tmp_path).shown) == ["one"]

@@ -1,0 +1,150 @@
+"""Command lines at once: in processes of this machine, and on a Ray cluster of two."""
+
+import hashlib
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.training.test_run import small_config
+from unjam.errors import MissingPartError, UnjamError
+from unjam.reports.results import read_progress
+from unjam.training import executors
+from unjam.training.config import RunConfig
+from unjam.training.executors import Command, Processes, run_all
+from unjam.training.trainings import training_command
+
+FAST = small_config(evaluation__every=0, evaluation__episodes=1, evaluation__baselines=[])
+
+
+def command_of(folder: Path, config: RunConfig = FAST) -> Command:
+    return training_command(config, folder / "run", folder / "plan.toml", folder / "log")
+
+
+def hash_of(folder: Path) -> str:
+    return hashlib.sha256((folder / "run" / "controller.unjam").read_bytes()).hexdigest()
+
+
+def test_one_failure_does_not_stop_the_others(tmp_path: Path) -> None:
+    commands = {
+        "bad": Command(["fly"], tmp_path / "bad.log"),
+        "good": Command(["--version"], tmp_path / "logs" / "good.log"),
+    }
+    told: list[str] = []
+    with pytest.raises(UnjamError, match="1 of 2 failed: bad; what the first of them said"):
+        run_all(commands, 1, "local", told.append)
+    assert "unjam 0" in commands["good"].log.read_text()
+    assert sorted(line.split(": ")[1] for line in told) == ["bad failed", "good"]
+
+
+def test_what_was_begun_is_gone_on_with(tmp_path: Path) -> None:
+    command = command_of(tmp_path)
+    assert command.line()[3:5] == ["train", "--config"]
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "config.toml").touch()
+    assert command.line()[3:5] == ["train", "--resume"]
+
+
+def test_what_a_signal_kills_is_started_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    script = tmp_path / "script.py"
+    script.write_text(
+        "import os, pathlib, sys\n"
+        "file = pathlib.Path(sys.argv[1])\n"
+        "file.write_text((file.read_text() if file.exists() else '') + 'x')\n"
+        "if len(file.read_text()) < int(sys.argv[2]): os.kill(os.getpid(), 9)\n"
+    )
+    monkeypatch.setattr(Command, "line", lambda self: [sys.executable, str(script), *self.words])
+    for times, code in ((2, 0), (3, 0), (9, -9)):
+        counted = tmp_path / f"{times}"
+        assert Processes().run(Command([str(counted), str(times)], tmp_path / "log")) == code
+        assert len(counted.read_text()) == min(times, executors.ATTEMPTS)
+
+
+def test_a_stop_ends_what_runs_and_starts_nothing_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Command, "line", lambda self: [sys.executable, "-c", "import time; time.sleep(60)"])
+    processes, codes = Processes(), []
+    thread = threading.Thread(target=lambda: codes.append(processes.run(Command([], tmp_path / "log"))))
+    thread.start()
+    while not processes._running:
+        time.sleep(0.01)
+    processes.stop()
+    thread.join(timeout=10)
+    assert codes == [-signal.SIGTERM]
+    assert (tmp_path / "log").read_text().count("$ ") == 1
+
+
+def test_without_ray_one_line_says_how_to_get_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "ray", None)
+    with pytest.raises(MissingPartError, match=r"pip install 'unjam\[ray\]'"):
+        run_all({"any": Command(["--version"], tmp_path / "log")}, 1, "ray", print)
+
+
+@pytest.fixture
+def cluster(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+    """A Ray cluster of two machines, which are processes here, with a core each."""
+    pytest.importorskip("ray")
+    from ray.cluster_utils import Cluster
+
+    started = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False})
+    monkeypatch.setenv("RAY_ADDRESS", str(started.address))
+    yield started
+    started.shutdown()
+
+
+@pytest.mark.slow
+def test_a_cluster_ends_with_the_bytes_of_this_machine(tmp_path: Path, cluster: Any) -> None:
+    cluster.add_node(num_cpus=1)
+    names = ("one", "two")
+    configs = [small_config(seed=seed, evaluation__baselines=[]) for seed in range(2)]
+    hashes = []
+    for executor in ("local", "ray"):
+        commands = {
+            name: command_of(tmp_path / executor / name, config)
+            for name, config in zip(names, configs, strict=True)
+        }
+        run_all(commands, 2, executor, lambda line: None)
+        hashes.append([hash_of(tmp_path / executor / name) for name in names])
+    assert hashes[0] == hashes[1]
+    assert hashes[0][0] != hashes[0][1]
+
+
+@pytest.mark.slow
+def test_a_training_whose_machine_is_lost_goes_on_elsewhere(tmp_path: Path, cluster: Any) -> None:
+
+    lost = cluster.add_node(num_cpus=1)
+    config = small_config(steps=6000, evaluation__every=0, evaluation__baselines=[])
+    commands = {name: command_of(tmp_path / name, config) for name in ("one", "two")}
+    failures: list[BaseException] = []
+
+    def drive() -> None:
+        try:
+            run_all(commands, 2, "ray", lambda line: None)
+        except BaseException as error:
+            failures.append(error)
+
+    thread = threading.Thread(target=drive)
+    thread.start()
+    wait_until(lambda: all(len(read_progress(tmp_path / name / "run")) >= 2 for name in commands))
+    cluster.remove_node(lost, allow_graceful=False)
+    thread.join(timeout=180)
+    assert not thread.is_alive()
+    assert failures == []
+    for name in commands:
+        assert read_progress(tmp_path / name / "run")[-1]["actual_steps"] == 6000
+        assert (tmp_path / name / "run" / "report.html").is_file()
+    logs = [(tmp_path / name / "log").read_text() for name in commands]
+    assert sorted(log.count("--resume") for log in logs) == [0, 1]
+
+
+def wait_until(condition: Callable[[], bool], seconds: float = 120.0) -> None:
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "waited in vain"
+        time.sleep(0.05)

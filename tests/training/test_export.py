@@ -1,0 +1,112 @@
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.pictures import empty_pictures
+from tests.training.test_run import small_config
+from unjam.controller import load_controller
+from unjam.controller.archive import GRAPH, MANIFEST, SAMPLE, WEIGHTS, unpack_parts
+from unjam.controller.sample import read_sample
+from unjam.drivers import PISaturation, ResidualDriver
+from unjam.errors import InputError
+from unjam.training.export import SAMPLED, export_controller
+from unjam.training.train import train
+
+
+def manifest_of(path: Path) -> dict[str, Any]:
+    return json.loads(unpack_parts(path)[MANIFEST])
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("runs") / "run"
+    with empty_pictures():
+        train(small_config(steps=300, virtual__virtual_ratio=0.0), folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def exported(run: Path) -> Path:
+    return export_controller(run, run.parent / "ring.unjam").file
+
+
+def test_it_is_the_runs_controller_that_is_exported(run: Path, exported: Path) -> None:
+    made, kept = load_controller(exported), load_controller(run)
+    assert isinstance(made, ResidualDriver)
+    assert isinstance(kept, ResidualDriver)
+    for ours, theirs in zip(made.network.layers, kept.network.layers, strict=True):
+        np.testing.assert_array_equal(ours[0], theirs[0])
+    assert unpack_parts(exported).keys() == {MANIFEST, WEIGHTS, SAMPLE}
+
+
+def test_its_manifest_says_where_it_comes_from_and_how_good_it_is(run: Path, exported: Path) -> None:
+    said = manifest_of(exported)
+    assert said["run"] == {"scenario": "ring", "agent": "trpo", "seed": 0}
+    assert said["scenario"]["vehicles"] == 8
+    assert (said["time_step"], said["action_limit"], said["expert"]) == (0.1, 1.0, "pi")
+    assert said["versions"]["libsumo"].startswith("1.28")
+    rows = json.loads((run / "evaluation.json").read_text())["rows"]
+    trained = [row["return"] for row in rows if row["driver"] == "trained"]
+    metrics = said["metrics"]
+    assert metrics["trained"]["episodes"] == len(trained) == 2
+    assert metrics["trained"]["return"]["mean"] == pytest.approx(np.mean(trained))
+    assert {"reward", "trained", "pi"} == metrics.keys()
+
+
+def test_the_sample_is_what_a_cav_perceived_in_an_episode(exported: Path) -> None:
+    states, answers = read_sample(unpack_parts(exported)[SAMPLE])
+    assert len(answers) == 100  # the horizon of the run
+    np.testing.assert_allclose(np.diff(states.speed), 0.1 * answers[:-1], atol=1e-6)
+    assert set(states.loop_length) <= set(range(120, 131))
+
+
+def test_a_run_that_was_not_evaluated_yet_has_no_metrics(run: Path, tmp_path: Path) -> None:
+    for name in ("config.toml", "controller.unjam"):
+        (tmp_path / name).write_bytes((run / name).read_bytes())
+    assert manifest_of(export_controller(tmp_path, tmp_path / "it.unjam").file)["metrics"] is None
+
+
+@pytest.mark.slow
+def test_a_driver_by_itself_gets_step_and_bounds_of_its_road(tmp_path: Path) -> None:
+    done = export_controller("pi:window=30", tmp_path / "pi.unjam", scenario="merge")
+    assert load_controller(done.file) == PISaturation(window=30, time_step=1.0)
+    said = manifest_of(done.file)
+    assert (said["time_step"], said["action"]["high"]) == (1.0, 1.0)
+    assert done.decisions <= SAMPLED
+    again = export_controller(done.file, tmp_path / "again.unjam", scenario="merge")
+    assert load_controller(again.file) == load_controller(done.file)
+
+
+def test_with_a_graph_it_is_in_the_file_and_beside_it(run: Path, tmp_path: Path) -> None:
+    pytest.importorskip("onnxscript")
+    pytest.importorskip("onnxruntime")
+    done = export_controller(run, tmp_path / "ring.unjam", onnx=True)
+    assert done.graph == tmp_path / "ring.onnx"
+    assert (tmp_path / "ring.onnx").read_bytes() == unpack_parts(done.file)[GRAPH]
+
+
+@pytest.mark.parametrize(
+    ("source", "to", "scenario", "words"),
+    [
+        ("pi", "it.zip", "", "a file that ends in .unjam"),
+        ("ghost", "it.unjam", "", "driver: 'ghost' is not allowed"),
+        ("pi", "it.unjam", "nowhere", "'nowhere' is not allowed"),
+        ("human", "it.unjam", "", "human is the simulator itself"),
+        ("mine.py:gentle", "it.unjam", "", "mine.py is Python code"),
+        ("none.unjam", "it.unjam", "", "does not exist"),
+        (".", "it.unjam", "", "not a run folder"),
+        (".", "it.unjam", "ring", "none beside a run"),
+    ],
+)
+@pytest.mark.usefixtures("my_drivers")
+def test_what_cannot_be_exported_is_refused(
+    source: str, to: str, scenario: str, words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError) as caught:
+        export_controller(source, to, scenario=scenario)
+    assert words in str(caught.value)
+    assert not Path(to).exists()

@@ -1,0 +1,90 @@
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.training.test_run import STEPS, small_config
+from tests.worlds.sumo.own_roads import straight
+from unjam.errors import InputError
+from unjam.training.config import load_config
+from unjam.training.folder import check_possible, continue_folder, read_config, start_folder
+from unjam.training.train import train
+
+
+def test_an_empty_folder_may_be_there(tmp_path: Path) -> None:
+    start_folder(tmp_path, small_config())
+    assert read_config(tmp_path) == small_config()
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"expert": "nobody"},
+        {"expert": "nowhere.py:nothing"},
+        {"reward": "gold"},
+        {"evaluation__baselines": ["human", "nobody"]},
+        {"expert": "none", "policy__observe": ["expert_memory"]},
+        {"scenario": "merge", "road": {}, "policy__observe": ["local", "place"]},
+    ],
+    ids=["expert", "file of the expert", "reward", "baseline", "nothing to observe", "place where none is"],
+)
+def test_what_cannot_work_is_told_before_anything_is_written(tmp_path: Path, changes: dict[str, Any]) -> None:
+    with pytest.raises(InputError) as caught:
+        train(small_config(**changes), tmp_path / "run")
+    assert "\n" not in str(caught.value)
+    assert not (tmp_path / "run").exists()
+
+
+def test_vehicles_on_a_network_of_ones_own_know_no_position(tmp_path: Path) -> None:
+    file = straight(tmp_path, '<flow id="f" type="car" route="along" begin="0" end="60" period="3"/>')
+    changes = {"scenario": str(file), "road.cav_types": ["car"], "policy.observe": ["route_position"]}
+    with pytest.raises(InputError, match="'route_position' is not allowed on a network of one's own"):
+        check_possible(load_config(changes=changes))
+
+
+@pytest.mark.parametrize("content", [{}, {"notes.txt": "mine"}])
+def test_only_a_run_can_be_resumed(tmp_path: Path, content: dict[str, str]) -> None:
+    for name, text in content.items():
+        (tmp_path / name).write_text(text)
+    for folder in (tmp_path, tmp_path / "nowhere"):
+        with pytest.raises(InputError, match=r"is not a run folder: it has no config\.toml"):
+            train(small_config(), folder, resume=True)
+    assert {path.name for path in tmp_path.iterdir()} == set(content)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"seed": 1},
+        {"expert": "idm"},
+        {"reward": "eq16"},
+        {"trpo.gamma": 0.9},
+        {"policy.hold": 5},
+        {"road.length": [120, 131]},
+        {"evaluation.every": 2},
+        {"scenario": "ring-warm"},
+    ],
+    ids=str,
+)
+def test_what_a_run_is_cannot_change_when_it_goes_on(tmp_path: Path, changes: dict[str, Any]) -> None:
+    start_folder(tmp_path, small_config())
+    before = (tmp_path / "config.toml").read_bytes()
+    changed = load_config(tmp_path / "config.toml", changes={"steps": 900, **changes})
+    with pytest.raises(InputError, match="only steps and workers may change"):
+        train(changed, tmp_path, resume=True)
+    assert (tmp_path / "config.toml").read_bytes() == before
+
+
+def test_budget_and_workers_may_change_when_a_run_goes_on(tmp_path: Path) -> None:
+    start_folder(tmp_path, small_config())
+    changed = replace(small_config(), steps=9 * STEPS, workers=7)
+    continue_folder(tmp_path, changed)
+    assert read_config(tmp_path) == changed
+
+
+def test_a_run_whose_road_was_given_in_python_goes_on(tmp_path: Path) -> None:
+    config = small_config(road__length=(120, 130))
+    start_folder(tmp_path, config)
+    continue_folder(tmp_path, config)
+    assert read_config(tmp_path).make_scenario() == config.make_scenario()

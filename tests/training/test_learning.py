@@ -1,0 +1,46 @@
+"""Each learner reaches a return that driving by chance does not, actual and virtual rows together."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.training.test_run import learn_with
+from unjam.training.config import load_config
+from unjam.worlds.workers import Workers
+
+LITTLE_RING: dict[str, Any] = {
+    "scenario": "ring",
+    "road.length": [110, 130],
+    "road.vehicles": 10,
+    "road.horizon": 600,
+    "expert": "none",
+    "policy.exploration_std": 0.3,
+    "virtual.virtual_ratio": 2.0,
+    "evaluation.every": 4,
+    "workers": 1,
+}
+QUICK: dict[str, dict[str, Any]] = {
+    "trpo": {"trpo.batch_steps": 3000, "steps": 48_000},
+    "ppo": {"ppo.batch_steps": 3000, "ppo.epochs": 40, "steps": 36_000},
+    "sac": {
+        **{"sac.batch_steps": 3000, "sac.start_steps": 3000, "sac.updates_per_step": 0.3},
+        **{"sac.temperature": 0.2, "steps": 24_000},
+    },
+}
+STANDING = 60.0
+"""more than what a network that has learned nothing earns: it never starts, and stops those ahead"""
+TARGET = 100.0
+"""measured with other seeds: 166 (trpo), 195 (ppo), 173 (sac)"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("agent", QUICK)
+def test_a_network_alone_learns_to_drive_on_a_little_ring(agent: str, tmp_path: Path) -> None:
+    config = load_config(changes={**LITTLE_RING, "agent": agent, **QUICK[agent]})
+    rows: list[dict[str, Any]] = []
+    with Workers(1) as workers:
+        learn_with(workers, tmp_path / "run", config, rows.append)
+    assert rows[0]["return_expert"] < STANDING
+    assert max(row["return_validation"] or 0.0 for row in rows) > TARGET
+    assert sum(row["virtual_steps"] for row in rows) > 0

@@ -1,0 +1,133 @@
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tests.training.test_run import STEPS, learn_with, small_config
+from unjam.errors import InputError
+from unjam.reports.results import MODEL_FILE, read_progress
+from unjam.training import model_facts
+from unjam.training.config import RunConfig
+from unjam.training.folder import read_config
+from unjam.training.model_facts import decisions_ahead, measure_model, newest_model_facts
+from unjam.worlds.workers import Workers
+
+CONFIG = small_config(virtual__virtual_ratio=1.0, virtual__epochs=4, virtual__members=3, steps=2 * STEPS)
+NUMBERS = ["speed", "leader_speed", "follower_speed", "leader_gap", "follower_gap"]
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of two iterations of three episodes, 100 decisions each; episodes 0, 2 and 5 are held out."""
+    folder = tmp_path_factory.mktemp("runs") / "with-model"
+    with Workers(1) as workers:
+        learn_with(workers, folder, CONFIG)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def facts(run: Path) -> dict[str, Any]:
+    return measure_model(run, CONFIG)
+
+
+def test_only_decisions_that_no_network_learned_from_count(facts: dict[str, Any]) -> None:
+    held_out = [0, 5]
+    assert facts["held_out"] == 100 * len(held_out)
+    for found in facts["where"].values():
+        assert sum(found["decisions"]) == facts["held_out"]
+
+
+def test_errors_in_bins_make_up_the_error_of_all(facts: dict[str, Any]) -> None:
+    for found in facts["where"].values():
+        assert found["at"] == sorted(found["at"])
+        for name, error in facts["one_step"].items():
+            for kind in ("base", "model"):
+                squares = np.square(found[kind][name])
+                whole = np.sqrt(np.average(squares, weights=found["decisions"]))
+                assert whole == pytest.approx(error[kind], rel=5e-3, abs=1e-12), (name, kind)
+
+
+def test_replays_go_over_half_of_a_stay(facts: dict[str, Any]) -> None:
+    replay = facts["replay"]
+    assert replay["seconds"][-1] == pytest.approx(5.0)
+    assert list(replay["numbers"]) == NUMBERS
+    for found in replay["numbers"].values():
+        assert {len(values) for values in found.values()} == {len(replay["seconds"])}
+    assert max(replay["numbers"]["speed"]["base"]) < 1e-4
+    assert 0 < replay["starts"] <= model_facts.STARTS
+
+
+def test_examples_begin_where_they_were_recorded(facts: dict[str, Any]) -> None:
+    examples = facts["replay"]["examples"]
+    assert len(examples) == model_facts.EXAMPLES
+    for example in examples:
+        for found in example["numbers"].values():
+            assert len(found["members"]) == 3
+            assert all(abs(member[0] - found["actual"][0]) < 0.2 for member in found["members"])
+            assert {len(line) for line in (found["actual"], found["base"], *found["members"])} == {50}
+
+
+def test_the_bound_is_that_of_the_run(
+    run: Path, facts: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    newest = read_progress(run)[-1]
+    monkeypatch.setattr(model_facts, "LENGTHS", (newest["k_star"],))
+    found = measure_model(run, CONFIG)["bound"]
+    assert found["C"][0] == pytest.approx(newest["virtual"]["bound"], rel=1e-3)
+    assert facts["bound"]["largest_return"] > found["largest_reward"]
+    assert facts["k_star"] == newest["k_star"]
+
+
+def test_a_single_member_has_no_bound(run: Path, tmp_path: Path) -> None:
+    lone = shutil.copytree(run, tmp_path / "lone")
+    rows = read_progress(lone)
+    rows[-1]["virtual"]["eps_m_by_estimator"]["total_variation"] = None
+    (lone / "progress.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    assert measure_model(lone, CONFIG)["bound"] is None
+
+
+def test_facts_are_small_and_the_same_each_time(run: Path, facts: dict[str, Any]) -> None:
+    assert measure_model(run, CONFIG) == facts
+    assert len(json.dumps(facts)) < 60_000
+
+
+@pytest.mark.parametrize("kept", [None, "{", "[]", '{"iteration": 1}'])
+def test_missing_damaged_and_old_facts_are_measured_anew(
+    kept: str | None, run: Path, facts: dict[str, Any]
+) -> None:
+    (run / MODEL_FILE).unlink(missing_ok=True)
+    if kept is not None:
+        (run / MODEL_FILE).write_text(kept)
+    assert newest_model_facts(run, CONFIG) == json.loads(json.dumps(facts))
+
+
+def test_newest_facts_are_read(run: Path) -> None:
+    (run / MODEL_FILE).write_text('{"iteration": 2, "base": "told"}')
+    assert newest_model_facts(run, CONFIG)["base"] == "told"
+
+
+def without_virtual() -> RunConfig:
+    return small_config(virtual__virtual_ratio=0.0)
+
+
+def test_a_run_without_a_virtual_environment_says_so(run: Path) -> None:
+    with pytest.raises(InputError, match="has no virtual environment"):
+        newest_model_facts(run, without_virtual())
+
+
+def test_a_run_that_has_only_begun_says_so(run: Path, tmp_path: Path) -> None:
+    shutil.copy(run / "config.toml", tmp_path)
+    with pytest.raises(InputError, match="has no checkpoint yet"):
+        newest_model_facts(tmp_path, read_config(tmp_path))
+
+
+@given(st.lists(st.integers(1, 5000), min_size=1, max_size=50))
+def test_at_least_half_of_the_stays_are_long_enough_to_be_replayed(stays: list[int]) -> None:
+    ahead = decisions_ahead(stays)
+    assert 1 <= ahead <= model_facts.LONGEST
+    assert np.mean([stay >= ahead for stay in stays]) >= 0.5

@@ -1,0 +1,48 @@
+import dataclasses
+from typing import Any
+
+import pytest
+
+from unjam.drivers import PISaturation
+from unjam.training.config import RunConfig, load_config
+from unjam.training.presets import PRESETS
+
+
+def flat(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    for key, value in values.items():
+        found |= flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {f"{prefix}{key}": value}
+    return found
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_each_preset_makes_a_configuration_and_an_expert(name: str) -> None:
+    made = load_config(preset=name)
+    assert made.preset == name
+    made.make_expert()
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_a_preset_changes_what_it_names_and_nothing_else(name: str) -> None:
+    defaults = flat(dataclasses.asdict(RunConfig()))
+    made = flat(dataclasses.asdict(load_config(preset=name)))
+    named = flat(PRESETS[name])
+    for key, value in named.items():
+        assert made[key] == (tuple(value) if isinstance(value, list) else value), key
+    assert {key for key in made if made[key] != defaults[key]} <= {*named, "preset"}
+
+
+def test_the_papers_preset_has_the_papers_numbers() -> None:
+    made = load_config(preset="paper")
+    assert (made.trpo.gamma, made.trpo.gae_lambda, made.trpo.target_kl) == (0.995, 0.97, 0.01)
+    ppo, sac = made.ppo, made.sac
+    assert (ppo.gamma, ppo.epochs, ppo.clip, ppo.actor_rate, ppo.critic_rate) == (0.99, 80, 0.2, 3e-4, 1e-3)
+    assert (ppo.batch_steps, ppo.minibatches) == (6000, 1)
+    assert (sac.gamma, sac.tau, sac.rate, sac.temperature) == (0.99, 5e-3, 3e-4, 0.2)
+    assert (sac.start_steps, sac.start, sac.batch) == (10_000, "uniform", 256)
+    assert (sac.learn_temperature, sac.reward_scale) == (False, 1.0)
+    assert (made.trpo.batch_steps, made.policy.hidden, made.policy.exploration_std) == (6000, (64, 64), 1.0)
+    assert made.policy.observe == ("local",)
+    assert made.policy.decisions_held(0.1) == 1
+    assert not made.spread
+    assert made.make_expert() == PISaturation(time_constant=0)

@@ -1,0 +1,368 @@
+import json
+import shutil
+import zipfile
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from unjam.controller import load_controller
+from unjam.drivers import PISaturation, ResidualDriver
+from unjam.errors import InputError
+from unjam.reports.results import read_progress
+from unjam.training.checkpoint import TENSORS, load_checkpoint, save_checkpoint
+from unjam.training.config import RunConfig, load_config
+from unjam.training.evaluate import HELD_OUT, VALIDATION
+from unjam.training.folder import continue_folder, start_folder
+from unjam.training.run import Run
+from unjam.worlds.workers import Workers
+
+torch.set_num_threads(1)  # as a training does
+
+STEPS = 300
+"""actual steps of an iteration of a small run: three episodes"""
+
+
+def small_config(**changes: Any) -> RunConfig:
+    """A run of two iterations on a ring of eight vehicles; with a dot in a key written as two underscores."""
+    small = {
+        "road": {"length": [120, 130], "vehicles": 8, "horizon": 100},
+        "policy": {"hidden": [8]},
+        "trpo": {"batch_steps": STEPS, "critic_epochs": 2, "critic_batch": 16},
+        "ppo": {"batch_steps": STEPS, "epochs": 3},
+        "sac": {"batch_steps": STEPS, "start_steps": 400, "updates_per_step": 0.02, "batch": 8},
+        "evaluation": {"every": 1, "validation_episodes": 2, "episodes": 2, "baselines": ["human"]},
+        "steps": 2 * STEPS,
+        "workers": 1,
+    }
+    return load_config(changes={**small, **{key.replace("__", "."): value for key, value in changes.items()}})
+
+
+class Stop(Exception):
+    """Stands for whatever ends a run in the middle."""
+
+
+def stop_after(iterations: int) -> Callable[[dict[str, Any]], None]:
+    def told(row: dict[str, Any]) -> None:
+        if row["iteration"] == iterations:
+            raise Stop
+
+    return told
+
+
+def learn_with(
+    workers: Workers,
+    folder: Path,
+    config: RunConfig,
+    told: Callable[[dict[str, Any]], None] | None = None,
+    resume: bool = False,
+) -> Run:
+    """Train without the final judgement and the report."""
+    if resume:
+        continue_folder(folder, config)
+    else:
+        start_folder(folder, config)
+    run = Run(folder, config, workers, told)
+    run.train()
+    return run
+
+
+Learn = Callable[..., Run]
+
+
+@pytest.fixture(scope="module")
+def learn() -> Iterator[Learn]:
+    """`learn_with` a worker that all tests of this file share."""
+    with Workers(1) as workers:
+        yield partial(learn_with, workers)
+
+
+def progress(folder: Path) -> list[dict[str, Any]]:
+    """The rows of progress without what differs from one run to the next."""
+    return [{key: value for key, value in row.items() if key != "seconds"} for row in read_progress(folder)]
+
+
+def outcome(folder: Path) -> tuple[Any, ...]:
+    """All that a run must repeat to the last bit."""
+    found = load_checkpoint(folder / "checkpoint")
+    assert found is not None
+    state, tensors = found
+    weights = {name: tensor.numpy().tobytes() for name, tensor in tensors.items()}
+    return state, weights, (folder / "controller.unjam").read_bytes(), progress(folder)
+
+
+def controller_manifest(folder: Path) -> dict[str, Any]:
+    with zipfile.ZipFile(folder / "controller.unjam") as archive:
+        return json.loads(archive.read("manifest.json"))
+
+
+@pytest.fixture(scope="module")
+def uninterrupted(tmp_path_factory: pytest.TempPathFactory, learn: Learn) -> Path:
+    """A run of four iterations."""
+    folder = tmp_path_factory.mktemp("runs") / "uninterrupted"
+    learn(folder, small_config(steps=4 * STEPS))
+    return folder
+
+
+def test_progress_has_a_row_per_iteration_that_counts_actual_steps(uninterrupted: Path) -> None:
+    rows = progress(uninterrupted)
+    assert [row["iteration"] for row in rows] == [1, 2, 3, 4]
+    assert [row["actual_steps"] for row in rows] == [300, 600, 900, 1200]
+    assert all(row["virtual_steps"] >= row["actual_steps"] for row in rows if row["k_star"] >= 10)
+
+
+def test_a_row_of_progress_is_whole(uninterrupted: Path) -> None:
+    for row in read_progress(uninterrupted):
+        numbers = [
+            row[name]
+            for name in ("return_mean", "return_expert", "return_validation", "mean_speed", "mean_abs_accel")
+        ]
+        assert np.isfinite(numbers).all()
+        assert set(row["seconds"]) == {"actual", "fit", "imagine", "update", "validation"}
+        assert row["eps_m"] == row["virtual"]["eps_m_by_estimator"]["unexplained"] > 0
+        assert 0.0 < row["learner"]["kl_divergence_loss"] <= 0.03
+        assert row["collisions"] == 0
+        assert 0.0 <= row["shield_override_share"] <= 1.0
+        assert 0.0 < row["mean_speed"] < 30.0
+
+
+def test_steps_are_rounded_up_to_whole_episodes_and_whole_iterations(tmp_path: Path, learn: Learn) -> None:
+    run = learn(tmp_path / "run", small_config(trpo__batch_steps=101, steps=201))
+    assert [row["actual_steps"] for row in progress(tmp_path / "run")] == [200, 400]
+    assert run.learner.num_timesteps == 400
+
+
+def test_the_same_configuration_repeats_to_the_last_bit(
+    uninterrupted: Path, tmp_path: Path, learn: Learn
+) -> None:
+    learn(tmp_path / "again", small_config(steps=4 * STEPS))
+    assert outcome(tmp_path / "again") == outcome(uninterrupted)
+
+
+def test_another_seed_is_another_run(uninterrupted: Path, tmp_path: Path, learn: Learn) -> None:
+    learn(tmp_path / "other", small_config(steps=STEPS, seed=1))
+    assert progress(tmp_path / "other")[0]["return_mean"] != progress(uninterrupted)[0]["return_mean"]
+
+
+def test_the_number_of_workers_changes_nothing(uninterrupted: Path, tmp_path: Path) -> None:
+    with Workers(2) as two:
+        learn_with(two, tmp_path / "two", small_config(steps=4 * STEPS, workers=2))
+    assert outcome(tmp_path / "two") == outcome(uninterrupted)
+
+
+@pytest.mark.parametrize("iterations", [pytest.param(1, marks=pytest.mark.slow), 3])
+def test_a_run_that_was_stopped_ends_as_if_it_had_not_been(
+    uninterrupted: Path, tmp_path: Path, iterations: int, learn: Learn
+) -> None:
+    folder, config = tmp_path / "run", small_config(steps=4 * STEPS)
+    with pytest.raises(Stop):
+        learn(folder, config, stop_after(iterations))
+    assert len(progress(folder)) == iterations
+    learn(folder, config, resume=True)
+    assert outcome(folder) == outcome(uninterrupted)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("agent", ["ppo", "sac"])
+def test_a_run_of_any_learner_ends_as_if_it_had_not_been_stopped(
+    tmp_path: Path, agent: str, learn: Learn
+) -> None:
+    config = small_config(agent=agent, steps=4 * STEPS, policy__hidden=[8, 8])
+    learn(tmp_path / "one go", config)
+    for iterations in (1, 3):
+        with pytest.raises(Stop):
+            learn(tmp_path / "run", config, stop_after(iterations), resume=iterations > 1)
+    learn(tmp_path / "run", config, resume=True)
+    assert outcome(tmp_path / "run") == outcome(tmp_path / "one go")
+
+
+def test_each_learner_learns_its_own_way(uninterrupted: Path, tmp_path: Path, learn: Learn) -> None:
+    for agent, key in {"ppo": "clip_fraction", "sac": "critic_loss"}.items():
+        learn(tmp_path / agent, small_config(agent=agent))
+        rows = progress(tmp_path / agent)
+        assert rows[0]["return_expert"] == progress(uninterrupted)[0]["return_expert"]
+        assert key in rows[1]["learner"]
+        assert [row["actual_steps"] for row in rows] == [STEPS, 2 * STEPS]
+        loaded = load_controller(tmp_path / agent)
+        assert isinstance(loaded, ResidualDriver)
+        assert loaded.network.squashes_noise is (agent == "sac")
+
+
+@pytest.mark.slow
+def test_a_run_that_is_stopped_again_and_again_ends_as_if_it_had_not_been(
+    uninterrupted: Path, tmp_path: Path, learn: Learn
+) -> None:
+    folder, config = tmp_path / "run", small_config(steps=4 * STEPS)
+    for iterations in (1, 2, 3):
+        with pytest.raises(Stop):
+            learn(folder, config, stop_after(iterations), resume=iterations > 1)
+    learn(folder, config, resume=True)
+    assert outcome(folder) == outcome(uninterrupted)
+
+
+def test_a_run_that_goes_on_with_a_larger_budget_ends_as_one_in_one_go(
+    uninterrupted: Path, tmp_path: Path, learn: Learn
+) -> None:
+    folder = tmp_path / "run"
+    learn(folder, small_config(steps=2 * STEPS))
+    learn(folder, small_config(steps=4 * STEPS, workers=2), resume=True)
+    assert outcome(folder) == outcome(uninterrupted)
+
+
+@pytest.mark.slow
+def test_validating_at_the_end_of_a_smaller_budget_does_not_change_what_is_learned(
+    tmp_path: Path, learn: Learn
+) -> None:
+    longer, folder = small_config(steps=4 * STEPS, evaluation__every=2), tmp_path / "run"
+    learn(folder, replace(longer, steps=3 * STEPS))
+    learn(folder, longer, resume=True)
+    learn(tmp_path / "one go", longer)
+    ((_, found, *_), (_, expected, *_)) = outcome(folder), outcome(tmp_path / "one go")
+    assert found == expected
+
+
+def test_a_run_killed_before_its_first_checkpoint_starts_again(
+    uninterrupted: Path, tmp_path: Path, learn: Learn
+) -> None:
+    folder, config = tmp_path / "run", small_config(steps=4 * STEPS)
+    with pytest.raises(Stop):
+        learn(folder, config, stop_after(1))
+    shutil.rmtree(folder / "checkpoint")
+    (folder / "progress.jsonl").unlink()
+    learn(folder, config, resume=True)
+    assert outcome(folder) == outcome(uninterrupted)
+
+
+DAMAGE: dict[str, Callable[[Path], object]] = {
+    "killed before the checkpoint": lambda folder: shutil.rmtree(folder / "checkpoint" / "000003"),
+    "damaged checkpoint": lambda folder: (folder / "checkpoint" / "000003" / TENSORS).write_bytes(b"lost"),
+    "line cut short": lambda folder: (folder / "progress.jsonl").open("a").write('{"iteration": 4, "actu'),
+}
+KILLED, *OTHERS = DAMAGE
+
+
+@pytest.mark.parametrize("name", [KILLED, *(pytest.param(name, marks=pytest.mark.slow) for name in OTHERS)])
+def test_what_a_crash_left_behind_does_not_show_in_the_end(
+    uninterrupted: Path, tmp_path: Path, name: str, learn: Learn
+) -> None:
+    folder, config = tmp_path / "run", small_config(steps=4 * STEPS)
+    with pytest.raises(Stop):
+        learn(folder, config, stop_after(3))
+    DAMAGE[name](folder)
+    learn(folder, config, resume=True)
+    assert outcome(folder) == outcome(uninterrupted)
+
+
+def test_two_checkpoints_are_kept(uninterrupted: Path) -> None:
+    assert sorted(place.name for place in (uninterrupted / "checkpoint").iterdir()) == ["000003", "000004"]
+
+
+def test_the_controller_is_the_best_on_the_validation_seeds(uninterrupted: Path) -> None:
+    rows = progress(uninterrupted)
+    best = max(rows, key=lambda row: row["return_validation"])
+    expected = best["iteration"] if best["return_validation"] > best["return_expert"] else 0
+    assert controller_manifest(uninterrupted)["iteration"] == expected
+    assert controller_manifest(uninterrupted)["actual_steps"] == expected * STEPS
+
+
+def test_a_controller_from_before_a_stop_stays_where_nothing_later_beats_it(
+    tmp_path: Path, learn: Learn
+) -> None:
+    learn(tmp_path, small_config(steps=STEPS))
+    before = (tmp_path / "controller.unjam").read_bytes()
+    found = load_checkpoint(tmp_path / "checkpoint")
+    assert found is not None
+    save_checkpoint(tmp_path / "checkpoint", {**found[0], "validation_best": 1e9}, found[1])
+    learn(tmp_path, small_config(steps=2 * STEPS), resume=True)
+    assert (tmp_path / "controller.unjam").read_bytes() == before
+    assert len(progress(tmp_path)) == 2
+
+
+def test_the_expert_stays_the_controller_where_nothing_beats_it(tmp_path: Path, learn: Learn) -> None:
+    # A residual of almost nothing, whose exploration alone moves the car.
+    config = small_config(policy__authority=1e-30, policy__exploration_std=1e-12, steps=STEPS)
+    learn(tmp_path / "run", config)
+    (row,) = progress(tmp_path / "run")
+    assert row["return_validation"] == row["return_expert"]
+    assert controller_manifest(tmp_path / "run")["iteration"] == 0
+
+
+def test_before_the_first_iteration_the_controller_is_the_expert(tmp_path: Path, learn: Learn) -> None:
+    with pytest.raises(Stop):
+        learn(tmp_path / "run", small_config(evaluation__every=5), stop_after(1))
+    loaded = load_controller(tmp_path / "run")
+    assert isinstance(loaded, ResidualDriver)
+    assert loaded.expert == PISaturation()
+    assert not loaded.network.layers[-1][0].any()
+
+
+def test_without_validation_the_last_policy_is_the_controller(tmp_path: Path, learn: Learn) -> None:
+    run = learn(tmp_path / "run", small_config(evaluation__every=0))
+    assert {row["return_validation"] for row in progress(tmp_path / "run")} == {None}
+    loaded = load_controller(tmp_path / "run")
+    assert isinstance(loaded, ResidualDriver)
+    for found, expected in zip(loaded.network.layers, run.learner.network().layers, strict=True):
+        np.testing.assert_array_equal(found[0], expected[0])
+        np.testing.assert_array_equal(found[1], expected[1])
+    assert controller_manifest(tmp_path / "run")["iteration"] == 2
+
+
+def test_validates_now_and_then_and_at_the_end(tmp_path: Path, learn: Learn) -> None:
+    learn(tmp_path / "run", small_config(evaluation__every=2, steps=3 * STEPS))
+    validated = [row["return_validation"] is not None for row in progress(tmp_path / "run")]
+    assert validated == [False, True, True]
+
+
+@pytest.mark.parametrize("spread", [True, False])
+def test_episodes_of_an_iteration_are_spread_over_the_lengths_where_asked(
+    tmp_path: Path, spread: bool, learn: Learn
+) -> None:
+    config = small_config(
+        spread=spread, trpo__batch_steps=11 * 20, steps=20, road__horizon=20, evaluation__every=0
+    )
+    run = learn(tmp_path / "run", config)
+    lengths = [episode.drawn["length"] for episode in run.learner._episodes]
+    assert (sorted(lengths) == list(range(120, 131))) is spread
+    assert set(lengths) <= set(range(120, 131))
+
+
+def test_every_training_episode_has_a_seed_of_its_own_that_never_judges(tmp_path: Path) -> None:
+    seeds: list[tuple[int, ...]] = []
+
+    def told(row: dict[str, Any]) -> None:
+        seeds.extend(episode.seed for episode in run.learner._episodes)
+
+    with Workers(1) as workers:
+        run = Run(tmp_path, small_config(seed=5), workers, told)
+        run.train()
+    assert len(seeds) == len(set(seeds)) == 6
+    assert {seed[0] for seed in seeds} == {5}
+    assert not {HELD_OUT, VALIDATION} & {number for seed in seeds for number in seed}
+
+
+def test_training_explores_and_validation_does_not(tmp_path: Path, learn: Learn) -> None:
+    run = learn(tmp_path / "run", small_config(policy__exploration_std=0.3))
+    (trajectory,) = run.learner._episodes[0].trajectories
+    assert np.std(trajectory.residual) > 0.1
+    again = run.driver(run.learner.network())
+    assert run._validate(again) == progress(tmp_path / "run")[-1]["return_validation"]
+
+
+@pytest.mark.parametrize("name", ["broken", "short", "raises"])
+def test_an_expert_at_fault_is_told_at_once(
+    tmp_path: Path, my_drivers: Path, learn: Learn, name: str
+) -> None:
+    with pytest.raises(InputError) as caught:
+        learn(tmp_path / "run", small_config(expert=f"{my_drivers}:{name}"))
+    assert "\n" not in str(caught.value)
+    assert not (tmp_path / "run" / "checkpoint").exists()
+
+
+def test_a_reward_at_fault_is_told_at_once(tmp_path: Path, my_drivers: Path, learn: Learn) -> None:
+    with pytest.raises(InputError, match="reward: step 0: term 'speed' is nan"):
+        learn(tmp_path / "run", small_config(reward=f"{my_drivers}:wrong_reward"))

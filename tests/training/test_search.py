@@ -1,0 +1,186 @@
+"""Searches on a ring so small that a training takes a second."""
+
+import json
+import math
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.training.test_run import small_config
+from unjam.errors import InputError, MissingPartError, UnjamError
+from unjam.files import to_json
+from unjam.training.config import load_config
+from unjam.training.executors import Command, Processes
+from unjam.training.search import gain_of, search
+from unjam.training.search_space import Choice, Range, check_space, space_of, trial_config
+
+BASE = small_config(evaluation__every=1)
+SPACE = space_of(["trpo.target_kl=0.001..0.1:log", "trpo.critic_batch=8,16", "trpo.critic_epochs=1..9"])
+
+
+def test_ranges_and_choices_are_read() -> None:
+    assert space_of(["trpo.gamma=0.9..0.99", "a=1..8", "b=1e-3..1:log", "expert=pi,bcm", "c=true,1,2.5"]) == {
+        "trpo.gamma": Range(0.9, 0.99),
+        "a": Range(1, 8),
+        "b": Range(0.001, 1, log=True),
+        "expert": Choice(("pi", "bcm")),
+        "c": Choice((True, 1, 2.5)),
+    }
+    assert Range(1, 8).whole
+    assert not Range(1, 8.0).whole
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["a", "=1..2", "a=", "a=2..1", "a=1..1", "a=0..1:log", "a=x..y", "a=1..2..3", "a=0..inf", "a=true..2"],
+)
+def test_what_is_no_range_is_refused_in_one_line(text: str) -> None:
+    with pytest.raises(InputError, match=r"^vary: .* is not allowed; allowed: [^\n]*$"):
+        space_of([text])
+
+
+def test_nothing_to_vary_is_refused() -> None:
+    with pytest.raises(InputError, match="at least one key is needed"):
+        space_of([])
+
+
+@pytest.mark.parametrize(
+    ("changes", "text", "words"),
+    [
+        ({}, "trpo.nothing=1..2", "trpo.nothing: unknown name"),
+        ({}, "trpo.gamma=0.9..1.5", "trpo.gamma: 1.5 is not allowed"),
+        ({}, "expert=pi,nobody", "nobody"),
+        ({"evaluation__every": 0}, "trpo.gamma=0.9..0.99", "judged by validations"),
+    ],
+)
+def test_what_cannot_work_is_told_before_anything_is_trained(
+    changes: dict[str, Any], text: str, words: str
+) -> None:
+    with pytest.raises(InputError, match=words):
+        check_space(small_config(**{"evaluation__every": 1, **changes}), space_of([text]))
+
+
+def test_a_trial_differs_from_the_base_in_its_values_alone() -> None:
+    changed = trial_config(BASE, {"trpo.gamma": 0.5, "road.vehicles": 7})
+    assert (changed.trpo.gamma, changed.make_scenario().possible_cavs()) == (0.5, ("cav_0",))
+    assert trial_config(changed, {"trpo.gamma": BASE.trpo.gamma, "road.vehicles": 8}) == BASE
+
+
+def test_a_training_is_worth_its_best_validation_beyond_its_expert(tmp_path: Path) -> None:
+    rows = [(None, 10.0), (12.0, 10.0), (17.0, 10.0), (11.0, 10.0)]
+    lines = [to_json({"return_validation": found, "return_expert": expert}) for found, expert in rows]
+    (tmp_path / "progress.jsonl").write_text("\n".join(lines))
+    assert gain_of(tmp_path) == 7.0
+    (tmp_path / "progress.jsonl").write_text(lines[0])
+    assert gain_of(tmp_path) is None
+
+
+class Trainings:
+    """Stands for trainings: each is worth what its target_kl says, and can be made to fail or to stop."""
+
+    def __init__(self) -> None:
+        self.done: list[Path] = []
+        self.stop_at: int | None = None
+        self.failing = False
+
+    def __call__(self, command: Command) -> int:
+        if len(self.done) == self.stop_at:
+            raise KeyboardInterrupt
+        if self.failing:
+            return 2
+        config = load_config(Path(command.line()[5]))
+        folder = Path(command.words[-1])
+        folder.mkdir(parents=True)
+        worth = -abs(math.log10(config.trpo.target_kl) + 2)
+        row = {"return_validation": worth, "return_expert": 0.0}
+        (folder / "progress.jsonl").write_text(to_json(row))
+        self.done.append(folder)
+        return 0
+
+
+@pytest.fixture
+def trainings(monkeypatch: pytest.MonkeyPatch) -> Trainings:
+    made = Trainings()
+    monkeypatch.setattr(Processes, "run", lambda self, command: made(command))
+    return made
+
+
+def test_the_best_comes_first_and_is_there_to_be_trained_with(tmp_path: Path, trainings: Trainings) -> None:
+    found = search(BASE, SPACE, 25, tmp_path / "search", 2)
+    gains = [trial.gain for trial in found]
+    assert len(found) == len(trainings.done) == 25
+    assert gains == sorted(gains, key=lambda gain: gain or 0.0, reverse=True)
+    # Found, not stumbled upon: the last trials are nearer to the best value than the first.
+    ordered = sorted(found, key=lambda trial: trial.number)
+    early, late = (sum(trial.gain or 0.0 for trial in part) for part in (ordered[:10], ordered[-10:]))
+    assert late > early
+    best = load_config(tmp_path / "search" / "best.toml")
+    assert best == trial_config(BASE, found[0].values)
+    assert abs(math.log10(best.trpo.target_kl) + 2) < 0.2
+    written = json.loads((tmp_path / "search" / "search.json").read_text())
+    assert [row["gain"] for row in written["trials"]] == pytest.approx(gains)
+    assert written["manifest"]["packages"]["torch"]
+
+
+def test_values_are_within_their_ranges(tmp_path: Path, trainings: Trainings) -> None:
+    for trial in search(BASE, SPACE, 12, tmp_path, 3):
+        assert 0.001 <= trial.values["trpo.target_kl"] <= 0.1
+        assert trial.values["trpo.critic_batch"] in (8, 16)
+        assert isinstance(trial.values["trpo.critic_epochs"], int)
+        assert 1 <= trial.values["trpo.critic_epochs"] <= 9
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_a_search_that_was_stopped_goes_on(tmp_path: Path, trainings: Trainings, workers: int) -> None:
+    trainings.stop_at = 4
+    with pytest.raises(KeyboardInterrupt):
+        search(BASE, SPACE, 8, tmp_path, workers)
+    assert not (tmp_path / "best.toml").exists()
+    trainings.stop_at = None
+    found = search(BASE, SPACE, 8, tmp_path, workers)
+    assert sorted(trial.number for trial in found) == list(range(8))
+    assert None not in [trial.gain for trial in found]
+    assert len(set(trainings.done)) == len(trainings.done) == 8
+    assert len({trial.values["trpo.target_kl"] for trial in found}) == 8
+
+
+def test_a_search_goes_on_with_more_trials_but_not_with_others(tmp_path: Path, trainings: Trainings) -> None:
+    search(BASE, SPACE, 2, tmp_path, 1)
+    assert len(search(BASE, SPACE, 5, tmp_path, 1)) == 5
+    assert len(trainings.done) == 5
+    with pytest.raises(InputError, match="is of other ranges"):
+        search(BASE, space_of(["trpo.target_kl=0.001..0.2"]), 6, tmp_path, 1)
+    with pytest.raises(InputError, match="is of another configuration"):
+        search(small_config(seed=1), SPACE, 6, tmp_path, 1)
+
+
+def test_a_folder_with_something_else_is_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "mine.txt").touch()
+    with pytest.raises(InputError, match="is not empty and no search"):
+        search(BASE, SPACE, 2, tmp_path, 1)
+    assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
+
+
+def test_a_search_of_which_all_fails_says_so(tmp_path: Path, trainings: Trainings) -> None:
+    trainings.failing = True
+    told: list[str] = []
+    with pytest.raises(UnjamError, match="all 3 trainings failed; what they said is in"):
+        search(BASE, SPACE, 3, tmp_path, 2, told=told.append)
+    assert all(line.endswith("failed") for line in told)
+
+
+def test_without_optuna_one_line_says_how_to_get_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "optuna", None)
+    with pytest.raises(MissingPartError, match=r"pip install 'unjam\[search\]'"):
+        search(BASE, SPACE, 2, tmp_path / "it", 1)
+    assert not (tmp_path / "it").exists()
+
+
+@pytest.mark.slow
+def test_real_trainings_are_searched(tmp_path: Path) -> None:
+    found = search(BASE, SPACE, 2, tmp_path, 2)
+    for trial in found:
+        assert trial.gain == gain_of(trial.folder)
+        assert (trial.folder / "report.html").is_file()

@@ -1,0 +1,66 @@
+import os
+from collections.abc import Iterator
+
+import pytest
+
+from unjam.drivers import PISaturation
+from unjam.drivers.check import check_driver
+from unjam.training import speed
+from unjam.training.speed import measure_speed, neural_driver
+
+RATES = ("bare_steps_per_s", "episode_steps_per_s", "traci_steps_per_s", "every_step_steps_per_s")
+
+
+@pytest.fixture
+def short(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Measures less, and so less exactly."""
+    monkeypatch.setattr(speed, "TRACI_STEPS", 50)
+    monkeypatch.setattr(speed, "VIRTUAL", {"long": (500, 20), "short": (50, 10)})
+    monkeypatch.setattr(speed, "SIZES", {22: 200, 66: 100})
+
+
+@pytest.fixture(autouse=True)
+def cores() -> Iterator[None]:
+    """Gives the other tests back the cores that they had."""
+    if not hasattr(os, "sched_setaffinity"):
+        yield
+        return
+    before = os.sched_getaffinity(0)
+    yield
+    os.sched_setaffinity(0, before)
+
+
+@pytest.mark.parametrize("hold", [1, 10])
+def test_the_driver_that_is_timed_keeps_the_contract(hold: int) -> None:
+    driver = neural_driver(hold)
+    check_driver(driver)
+    assert driver.expert == PISaturation()
+    assert driver.hold == hold
+    assert [weight.shape for weight, _ in driver.network.layers] == [(5, 64), (64, 64), (64, 1)]
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("short")
+def test_measures_rates_and_their_ratios_and_gives_back_the_cores_that_it_did_not_use() -> None:
+    told: list[str] = []
+    cores = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else None
+    found = measure_speed(1, told.append)
+    assert found["rounds"] == 1
+    assert min(found[name] for name in RATES) > 0
+    assert found["over_bare"] == pytest.approx(found["episode_steps_per_s"] / found["bare_steps_per_s"])
+    assert found["over_bare_every_step"] == pytest.approx(
+        found["every_step_steps_per_s"] / found["bare_steps_per_s"]
+    )
+    assert found["over_traci"] > 2.0
+    for rollouts in found["virtual"].values():
+        assert rollouts["over_actual"] == pytest.approx(
+            rollouts["steps_per_s"] / found["episode_steps_per_s"]
+        )
+    assert found["virtual"]["long"]["over_actual"] > 2.0
+    for road in found["roads"].values():
+        assert road["over_bare"] == pytest.approx(road["episode_steps_per_s"] / road["bare_steps_per_s"])
+    costs = [entry["us_per_vehicle_step"] for entry in found["scaling"]]
+    assert [entry["vehicles"] for entry in found["scaling"]] == [22, 66]
+    assert found["growth"] == max(costs) / costs[0]
+    assert told == ["round 1 of 1", "larger roads"]
+    assert cores is None or os.sched_getaffinity(0) == cores

@@ -1,0 +1,208 @@
+import json
+import math
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from tests.pictures import empty_pictures
+from tests.training.test_run import STEPS, learn_with, outcome, small_config
+from unjam.controller import load_controller
+from unjam.drivers import ResidualDriver
+from unjam.drivers.constant import Constant
+from unjam.drivers.registry import describe
+from unjam.errors import InputError, UnjamError
+from unjam.measures.metrics import METRICS
+from unjam.reports.results import read_progress, read_results
+from unjam.training.config import RunConfig
+from unjam.training.evaluate import held_out_seeds
+from unjam.training.folder import read_config
+from unjam.training.train import TrainResult, gain_of, train
+from unjam.worlds.drive import run_episode
+from unjam.worlds.workers import Workers
+
+pytestmark = pytest.mark.usefixtures("without_pictures")
+
+CONTENT = {
+    "checkpoint",
+    "config.toml",
+    "controller.unjam",
+    "episodes.parquet",
+    "evaluation.json",
+    "manifest.json",
+    "model.json",
+    "progress.jsonl",
+    "report.html",
+    "shown.safetensors",
+}
+
+
+class Trained(NamedTuple):
+    config: RunConfig
+    result: TrainResult
+    told: list[dict[str, Any]]
+    judged: list[tuple[tuple[str, int], int]]
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> Trained:
+    """A finished run of two iterations."""
+    folder, config = tmp_path_factory.mktemp("runs") / "finished", small_config()
+    told: list[dict[str, Any]] = []
+    judged: list[tuple[tuple[str, int], int]] = []
+    with empty_pictures():
+        result = train(
+            config, folder, told=told.append, progress=lambda episode, steps: judged.append((episode, steps))
+        )
+    return Trained(config, result, told, judged)
+
+
+def test_a_run_leaves_all_that_it_made_in_its_folder(trained: Trained) -> None:
+    folder = trained.result.folder
+    assert {path.name for path in folder.iterdir()} == CONTENT
+    assert trained.result.controller == folder / "controller.unjam"
+    assert trained.result.report == folder / "report.html"
+
+
+def test_the_folder_says_how_it_was_made(trained: Trained) -> None:
+    assert read_config(trained.result.folder) == trained.config
+    manifest = json.loads((trained.result.folder / "manifest.json").read_text())
+    assert manifest["packages"]["torch"]
+    assert manifest["started"]
+
+
+def test_told_is_what_progress_holds(trained: Trained) -> None:
+    assert trained.told == read_progress(trained.result.folder)
+    assert [row["actual_steps"] for row in trained.told] == [STEPS, 2 * STEPS]
+
+
+def test_every_driver_is_judged_on_the_held_out_seeds(trained: Trained) -> None:
+    rows = trained.result.rows
+    assert list(rows) == ["human", "pi", "trained"]
+    for found in rows.values():
+        assert [tuple(row["seed"]) for row in found] == held_out_seeds(2)
+        assert {row["status"] for row in found} == {"completed"}
+        assert {row["steps"] for row in found} == {100}
+
+
+def test_progress_of_the_judgement_is_told(trained: Trained) -> None:
+    ended = {episode for episode, steps in trained.judged if steps == 100}
+    assert ended == {(driver, index) for driver in ("human", "pi", "trained") for index in (0, 1)}
+
+
+def test_the_controller_earns_what_the_evaluation_says(trained: Trained) -> None:
+    scenario, driver = trained.config.make_scenario(), load_controller(trained.result.controller)
+    for seed, row in zip(held_out_seeds(2), trained.result.rows["trained"], strict=True):
+        (trajectory,) = run_episode(scenario, driver, seed).trajectories
+        assert trajectory.reward.sum() == row["return"]
+
+
+def test_the_gain_is_the_mean_difference_to_the_expert_on_the_same_seeds(trained: Trained) -> None:
+    rows = trained.result.rows
+    differences = [
+        ours["return"] - theirs["return"] for ours, theirs in zip(rows["trained"], rows["pi"], strict=True)
+    ]
+    assert trained.result.gain is not None
+    assert trained.result.gain.mean == pytest.approx(np.mean(differences))
+    assert trained.result.gain.count == 2
+    assert min(differences) <= trained.result.gain.low <= trained.result.gain.high <= max(differences)
+
+
+def test_the_evaluation_of_a_folder_is_that_of_the_result(trained: Trained) -> None:
+    results = read_results(trained.result.folder)
+    about = results.about
+    assert (about["scenario"], about["reward"], about["expert"]) == ("ring", "released", "pi")
+    assert results.trained == "trained"
+    for driver, rows in trained.result.rows.items():
+        for found, expected in zip(results.rows[driver], rows, strict=True):
+            for name in METRICS:
+                assert found[name] == pytest.approx(expected[name], rel=0, abs=0, nan_ok=True), name
+    table = pd.read_parquet(trained.result.folder / "episodes.parquet")
+    assert table.groupby("driver").size().to_dict() == {"human": 2, "pi": 2, "trained": 2}
+    assert table["return"].tolist() == [
+        row["return"] for rows in trained.result.rows.values() for row in rows
+    ]
+
+
+def test_the_shown_episode_is_the_first_of_each_driver(trained: Trained) -> None:
+    shown = read_results(trained.result.folder).shown
+    assert list(shown) == ["human", "pi", "trained"]
+    expected = run_episode(
+        trained.config.make_scenario(), load_controller(trained.result.controller), held_out_seeds(1)[0]
+    )
+    np.testing.assert_array_equal(shown["trained"].speeds, expected.speeds.astype(np.float32))
+    assert shown["trained"].speeds.shape == (101, 8)
+
+
+def test_the_report_shows_the_run(trained: Trained) -> None:
+    page = trained.result.report.read_text()
+    assert page.lower().startswith("<!doctype html>")
+    assert "trained" in page
+    assert len(page) > 20_000
+
+
+@pytest.mark.slow
+def test_a_finished_run_goes_on_with_a_larger_budget(trained: Trained, tmp_path: Path) -> None:
+    folder, longer = tmp_path / "run", replace(trained.config, steps=3 * STEPS)
+    shutil.copytree(trained.result.folder, folder)
+    result = train(longer, folder, resume=True)
+    with Workers(1) as workers:
+        learn_with(workers, tmp_path / "one go", longer)
+    assert outcome(folder) == outcome(tmp_path / "one go")
+    assert read_config(folder) == longer
+    assert {path.name for path in folder.iterdir()} == CONTENT
+    assert same_rows(result.rows["pi"], trained.result.rows["pi"])
+
+
+def same_rows(ours: list[dict[str, Any]], theirs: list[dict[str, Any]]) -> bool:
+    return all(
+        mine[name] == other[name] or (math.isnan(mine[name]) and math.isnan(other[name]))
+        for mine, other in zip(ours, theirs, strict=True)
+        for name in METRICS
+    )
+
+
+@pytest.mark.slow
+def test_a_network_learns_without_an_expert(tmp_path: Path) -> None:
+    config = small_config(expert="none", evaluation__baselines=(), evaluation__every=0)
+    result = train(config, tmp_path / "run")
+    assert result.gain is None
+    assert list(result.rows) == ["trained"]
+    loaded = load_controller(result.controller)
+    assert isinstance(loaded, ResidualDriver)
+    assert loaded.expert == Constant()
+    (trajectory,) = run_episode(config.make_scenario(), loaded, (0,)).trajectories
+    assert not trajectory.expert.any()
+    assert trajectory.applied.any()
+    assert result.report.is_file()
+
+
+def test_a_folder_that_is_not_empty_is_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "thesis.txt").write_text("mine")
+    with pytest.raises(InputError, match="is not empty; allowed: a new folder"):
+        train(small_config(), tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["thesis.txt"]
+
+
+def test_a_file_in_the_place_of_the_folder_is_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("mine")
+    with pytest.raises(UnjamError):
+        train(small_config(), tmp_path / "file")
+    assert (tmp_path / "file").read_text() == "mine"
+
+
+def test_the_gain_is_that_over_an_expert_with_parameters() -> None:
+    config = small_config(expert="pi:window=30")
+    expert = describe(config.make_expert())
+    rows = {
+        "pi": [{"seed": (1, 0), "return": 100.0}],
+        expert: [{"seed": (1, 0), "return": 5.0}, {"seed": (1, 1), "return": 6.0}],
+        "trained": [{"seed": (1, 1), "return": 9.0}, {"seed": (1, 0), "return": 6.0}],
+    }
+    gain = gain_of(config, rows)
+    assert gain is not None
+    assert gain.mean == pytest.approx(2.0)

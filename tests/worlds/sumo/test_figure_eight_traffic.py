@@ -1,0 +1,142 @@
+"""The figure eight on the actual simulator."""
+
+from typing import Any
+
+import libsumo
+import numpy as np
+import pytest
+
+from unjam.drivers import Driver, LocalState, Memory, PISaturation
+from unjam.drivers.idm import Human
+from unjam.drivers.pacer import Pacer
+from unjam.measures.metrics import measure
+from unjam.scenarios.figure_eight import FigureEight
+from unjam.scenarios.scenario import SMALLEST_CAV_GAP
+from unjam.worlds.drive import run_episode
+from unjam.worlds.sumo.closed import ClosedTraffic
+from unjam.worlds.sumo.simulation import Simulation
+from unjam.worlds.sumo.stepping import make_traffic
+from unjam.worlds.workers import EpisodeTask, Workers
+
+SEEDS = 5
+FLOW = {
+    # (driver, radius): mean speed of all vehicles in the first 1,500 steps, measured with Flow on SUMO 1.28
+    ("human", 32): 6.02,
+    ("human", 35): 6.34,
+    ("pi", 32): 6.33,
+    ("pi", 35): 6.39,
+}
+DRIVERS = {"human": Human(), "pi": PISaturation(time_constant=0.0)}
+
+
+def test_agrees_with_flow_within_six_percent_without_collision() -> None:
+    tasks = [
+        EpisodeTask(FigureEight(radius=(radius, radius)), DRIVERS[driver], (seed,))
+        for driver, radius in FLOW
+        for seed in range(SEEDS)
+    ]
+    with Workers(2) as workers:
+        episodes = workers.run(tasks)
+    assert all(episode.status == "completed" for episode in episodes)
+    speeds = np.array([measure(episode)["mean_speed"] for episode in episodes]).reshape(-1, SEEDS).mean(1)
+    np.testing.assert_allclose(speeds, list(FLOW.values()), rtol=0.06)
+
+
+def test_leader_and_gap_are_those_of_sumo(simulation: Simulation) -> None:
+    traffic = make_traffic(FigureEight(cavs=14), (3,), simulation)
+    assert isinstance(traffic, ClosedTraffic)
+    traffic.start(controlled=True)
+    ids, compared = traffic.road.vehicle_ids, 0
+    for _ in range(400):
+        traffic.advance(np.full(14, 0.2))
+        state = traffic.local_state()
+        for row, name in enumerate(ids):
+            found = libsumo.vehicle.getLeader(name, 200.0)
+            if found:
+                leader, gap = found
+                assert leader == ids[(row + 1) % 14]
+                assert state.leader_gap[row] == pytest.approx(gap + SMALLEST_CAV_GAP, abs=1e-3)
+                compared += 1
+    assert compared > 1000
+
+
+@pytest.mark.parametrize("cavs", [2, 7, 14])
+def test_each_of_several_cavs_is_driven_and_recorded_by_itself(cavs: int, simulation: Simulation) -> None:
+    road = FigureEight(cavs=cavs, horizon=300)
+    episode = run_episode(road, ByRow(), (1,), simulation=simulation)
+    assert (episode.status, len(episode.trajectories)) == ("completed", cavs)
+    assert tuple(trajectory.vehicle for trajectory in episode.trajectories) == episode.cav_ids
+    for row, trajectory in enumerate(episode.trajectories):
+        place = episode.vehicle_ids.index(trajectory.vehicle)
+        states = trajectory.states
+        np.testing.assert_array_equal(states.speed, episode.speeds[:, place])
+        np.testing.assert_array_equal(states.leader_speed, episode.speeds[:, (place + 1) % 14])
+        np.testing.assert_array_equal(states.follower_gap, episode.gaps[:, (place - 1) % 14])
+        np.testing.assert_allclose(trajectory.applied, 0.1 + 0.02 * row + 0.001 * np.arange(300), atol=1e-12)
+        wanted = np.maximum(states.speed[:-1] + 0.1 * trajectory.applied, 0.0)
+        np.testing.assert_allclose(states.speed[1:], wanted - 0.1 * trajectory.shield, atol=1e-9)
+
+
+class ByRow(Driver):
+    """Each CAV pushes a little harder than the one before it, and all harder with time."""
+
+    def initial_memory(self, n: int) -> Memory:
+        return {"decisions": np.zeros(n)}
+
+    def act(self, state: LocalState, memory: Memory) -> tuple[Any, Memory]:
+        push = 0.1 + 0.02 * np.arange(len(state.speed)) + 0.001 * memory["decisions"]
+        return push, {"decisions": memory["decisions"] + 1.0}
+
+
+def test_vehicles_from_the_right_yield(simulation: Simulation) -> None:
+    """Somebody stands before the crossing on the yielding way, nobody ever does on the other."""
+    episode = run_episode(FigureEight(radius=(32, 32)), Human(), (0,), simulation=simulation)
+    road = FigureEight(radius=(32, 32)).draw(np.random.default_rng(0))
+    place = episode.positions % road.loop_length
+    standing = episode.speeds < 0.1
+    for (start, _), expected in zip(road.crossings, (False, True), strict=True):
+        at_the_line = (place > start - 3) & (place <= start)
+        assert bool((standing & at_the_line)[50:].any()) is expected
+
+
+def test_on_the_crossing_people_are_left_to_sumo(
+    simulation: Simulation, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    traffic = make_traffic(FigureEight(radius=(32, 32)), (0,), simulation)
+    assert isinstance(traffic, ClosedTraffic)
+    asked: list[tuple[str, float]] = []
+    monkeypatch.setattr(
+        simulation, "command_speeds", lambda ids, speeds: asked.extend(zip(ids, speeds, strict=True))
+    )
+    traffic.start(controlled=False)
+    for _ in range(200):
+        asked.clear()
+        place = np.array(list(traffic._near_positions.values())) % traffic.road.loop_length
+        traffic.advance(None)
+        for row, (_, speed) in enumerate(asked):
+            inside = any(start <= place[row] < end for start, end in traffic.road.crossings)
+            assert (speed == -1.0) == inside
+            assert inside or speed >= 0.0
+
+
+def slowly(*values: object) -> Any:
+    return pytest.param(*values, marks=pytest.mark.slow)
+
+
+@pytest.mark.parametrize(
+    ("driver", "radius", "speed"),
+    [
+        slowly(Pacer(), 32, 5.8),
+        slowly(Pacer(), 35, 6.2),
+        slowly(Pacer(varying=True), 32, 6.8),
+        slowly(Pacer(varying=True), 33, 6.8),
+        slowly(Pacer(varying=True), 34, 6.9),
+        (Pacer(varying=True), 35, 7.2),
+    ],
+)
+def test_pacers_hold_a_queue_that_never_meets_itself(driver: Pacer, radius: int, speed: float) -> None:
+    road = FigureEight(radius=(radius, radius), horizon=3000)
+    with Workers(2) as workers:
+        episodes = workers.run([EpisodeTask(road, driver, (seed,)) for seed in range(3)])
+    assert all(episode.status == "completed" for episode in episodes)
+    assert min(measure(episode)["mean_speed_steady"] for episode in episodes) > speed

@@ -1,0 +1,282 @@
+"""CAVs that come and go, on the merge: what each stay records, and what a driver remembers of it."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.conftest import random_network
+from tests.worlds.test_record import fingerprint, travelled
+from unjam.drivers import IDM, Constant, Driver, Human, LocalState, Memory, PISaturation, ResidualDriver
+from unjam.drivers.from_file import FunctionDriver
+from unjam.drivers.local_state import local_vector
+from unjam.errors import InputError
+from unjam.scenarios import Merge
+from unjam.worlds.drive import run_episode
+from unjam.worlds.record import Episode, Trajectory
+from unjam.worlds.sumo.simulation import Simulation
+from unjam.worlds.sumo.stepping import make_traffic
+from unjam.worlds.workers import EpisodeTask, Workers
+
+MERGE = Merge(penetration=0.3, horizon=120)
+
+
+class Counting(Driver):
+    """Pushes harder the longer it has been on the road, and remembers in numbers and in rows of them."""
+
+    def initial_memory(self, n: int) -> Memory:
+        return {"decisions": np.zeros(n), "speeds": np.full((n, 3), -1.0)}
+
+    def act(self, state: LocalState, memory: Memory) -> tuple[Any, Memory]:
+        speeds = np.column_stack([state.speed, memory["speeds"][:, :-1]])
+        after = {"decisions": memory["decisions"] + 1.0, "speeds": speeds}
+        # Also by its speed three decisions ago: wrong at once where rows are mixed up.
+        return 0.001 * memory["decisions"] + 0.01 * memory["speeds"][:, -1], after
+
+
+def expected_of_counting(trajectory: Trajectory) -> Any:
+    speed = trajectory.states.speed
+    old = np.concatenate([np.full(3, -1.0), speed])[: len(speed) - 1]
+    return 0.001 * np.arange(len(speed) - 1) + 0.01 * old
+
+
+@pytest.fixture(scope="module")
+def counted() -> Episode:
+    return run_episode(MERGE, Counting(), (2,))
+
+
+def test_a_driver_remembers_each_cav_by_itself_from_its_entry_on(counted: Episode) -> None:
+    assert len(counted.trajectories) > 12
+    for trajectory in counted.trajectories:
+        np.testing.assert_allclose(trajectory.applied, expected_of_counting(trajectory), rtol=0, atol=1e-12)
+
+
+def test_cavs_came_and_left_in_between(counted: Episode) -> None:
+    stays = [(each.start, each.start + len(each.applied)) for each in counted.trajectories]
+    assert len({start for start, _ in stays}) > 10
+    assert sum(end < 120 for _, end in stays) > 3
+    assert sum(end == 120 for _, end in stays) > 3
+    assert [start for start, _ in stays] == sorted(start for start, _ in stays)
+
+
+def test_each_stay_of_a_cav_is_one_trajectory_that_holds_what_was_recorded_of_it(counted: Episode) -> None:
+    assert len({each.vehicle for each in counted.trajectories}) == len(counted.trajectories)
+    assert counted.cav_ids == tuple(each.vehicle for each in counted.trajectories)
+    for trajectory in counted.trajectories:
+        column = counted.vehicle_ids.index(trajectory.vehicle)
+        start, end = trajectory.start, trajectory.start + len(trajectory.applied)
+        speeds = counted.speeds[:, column]
+        there = np.flatnonzero(~np.isnan(speeds))
+        assert there.tolist() == list(range(start, end + 1))
+        states = trajectory.states
+        np.testing.assert_array_equal(states.speed, speeds[start : end + 1])
+        np.testing.assert_array_equal(states.leader_gap, counted.gaps[start : end + 1, column])
+        np.testing.assert_array_equal(states.route_position, counted.positions[start : end + 1, column])
+        assert np.isnan(states.loop_length).all()
+        assert not trajectory.terminated
+        for name, values in trajectory.terms.items():
+            np.testing.assert_array_equal(values, counted.terms[name][start:end])
+
+
+def test_leader_and_follower_of_a_stay_were_there_as_recorded(counted: Episode) -> None:
+    seen = 0
+    for trajectory in counted.trajectories:
+        column = counted.vehicle_ids.index(trajectory.vehicle)
+        for moment in range(len(trajectory.applied) + 1):
+            row = trajectory.start + moment
+            own, others = counted.positions[row, column], np.delete(counted.positions[row], column)
+            speeds = np.delete(counted.speeds[row], column)
+            states = LocalState(*(values[moment] for values in trajectory.states))
+            for gap, speed, place in (
+                (states.leader_gap, states.leader_speed, own + 5.0 + states.leader_gap),
+                (states.follower_gap, states.follower_speed, own - 5.0 - states.follower_gap),
+            ):
+                if gap == 100.0:
+                    assert speed == states.speed
+                    continue
+                found = np.flatnonzero(np.abs(others - place) < 1e-6)
+                assert speed in speeds[found]
+                seen += 1
+    assert seen > 1000
+
+
+def test_commands_are_carried_out_unless_the_shield_brakes(counted: Episode) -> None:
+    for trajectory in counted.trajectories:
+        speed, free = trajectory.states.speed, trajectory.shield < 1e-9
+        expected = np.maximum(speed[:-1] + trajectory.applied, 0.0)  # five steps of 0.2 s
+        calm = free & (expected < 29.0) & (speed[:-1] > 1.0)
+        np.testing.assert_allclose(speed[1:][calm], expected[calm], atol=1e-9)
+        assert (speed[1:] <= expected + 1e-9).all()
+
+
+def test_the_same_seed_gives_the_same_bytes_in_process_and_in_workers(simulation: Simulation) -> None:
+    residual = ResidualDriver(PISaturation(), random_network(), 1.0, hold=3)
+    tasks = [
+        EpisodeTask(MERGE, residual, (2,), explore=True),
+        EpisodeTask(replace(MERGE, warmup=100), Counting(), (5, 1)),
+        EpisodeTask(replace(MERGE, penetration=0.0), Human(), (2,)),
+    ]
+    with Workers(2) as workers:
+        found = [fingerprint(episode) for episode in workers.run([*tasks[:1], *tasks[2:]])]
+    here = [
+        run_episode(task.scenario, task.driver, task.seed, explore=task.explore, simulation=simulation)
+        for task in tasks
+    ]
+    again = [
+        run_episode(task.scenario, task.driver, task.seed, explore=task.explore, simulation=simulation)
+        for task in tasks
+    ]
+    assert [fingerprint(episode) for episode in again] == [fingerprint(episode) for episode in here]
+    assert found == [fingerprint(here[0]), fingerprint(here[2])]
+    assert [fingerprint(travelled(episode)) for episode in here] == [fingerprint(each) for each in here]
+
+
+def test_the_same_vehicles_are_cavs_whoever_drives(simulation: Simulation) -> None:
+    short = replace(MERGE, horizon=40)
+    driven = [run_episode(short, driver, (4,), simulation=simulation) for driver in (Human(), Constant(0.5))]
+    early = [[name for name in episode.cav_ids if int(name.removeprefix("cav_")) < 15] for episode in driven]
+    assert early[0] == early[1] != []
+
+
+def test_undriven_cavs_have_trajectories_of_what_they_did(simulation: Simulation) -> None:
+    episode = run_episode(MERGE, Human(), (2,), simulation=simulation)
+    assert len(episode.trajectories) > 5
+    for trajectory in episode.trajectories:
+        np.testing.assert_allclose(trajectory.applied, np.diff(trajectory.states.speed), atol=1e-12)
+        assert not trajectory.shield.any()
+
+
+@pytest.mark.parametrize("hold", [1, 4])
+def test_a_residual_driver_counts_its_looks_from_each_entry(hold: int, simulation: Simulation) -> None:
+    driver = ResidualDriver(Counting(), random_network(), 1.0, hold=hold)
+    episode = run_episode(MERGE, driver, (2,), explore=True, simulation=simulation)
+    noises = []
+    assert len(episode.trajectories) > 5
+    for trajectory in episode.trajectories:
+        steps = len(trajectory.applied)
+        np.testing.assert_allclose(trajectory.expert, expected_of_counting(trajectory), atol=1e-12)
+        total = np.clip(trajectory.expert + trajectory.residual, -1.0, 1.0)
+        np.testing.assert_allclose(trajectory.applied, total, atol=1e-12)
+        looks = [*range(0, steps, hold), steps]
+        seen = local_vector(LocalState(*(values[looks] for values in trajectory.states)))
+        np.testing.assert_allclose(trajectory.observations, seen, atol=1e-12)
+        chosen, _ = trajectory.looks
+        np.testing.assert_array_equal(trajectory.residual, np.repeat(chosen, hold)[:steps])
+        noises.append(chosen - driver.network(trajectory.observations[:-1]))
+        assert trajectory.memory.keys() == {"decisions", "speeds"}
+        assert trajectory.memory["decisions"] == 0.0
+        np.testing.assert_array_equal(trajectory.memory["speeds"], -1.0)
+    noise = np.concatenate(noises)
+    assert noise.std() == pytest.approx(0.2, rel=0.15)
+    assert len(np.unique(noise)) == len(noise)
+
+
+def test_what_stays_say_is_enough_to_drive_them_again(simulation: Simulation) -> None:
+    driver = ResidualDriver(PISaturation(), random_network(), 1.0)
+    episode = run_episode(MERGE, driver, (2,), simulation=simulation)
+    for trajectory in episode.trajectories:
+        memory = {name: values[None] for name, values in trajectory.memory.items()}
+        for step in range(len(trajectory.applied)):
+            state = LocalState(*(values[step : step + 1] for values in trajectory.states))
+            expert, memory = driver.expert.act(state, memory)
+            assert np.clip(expert[0], -1, 1) == pytest.approx(trajectory.expert[step], abs=1e-12)
+
+
+def test_exploration_leaves_the_traffics_noise_alone(simulation: Simulation) -> None:
+    mute = ResidualDriver(Constant(), replace(random_network(), exploration_std=0.0), 1.0)
+    still, explored = (
+        run_episode(MERGE, mute, (2,), explore=explore, simulation=simulation) for explore in (False, True)
+    )
+    np.testing.assert_array_equal(explored.speeds, still.speeds)
+
+
+def test_a_driver_that_remembers_nothing_drives_whoever_comes(simulation: Simulation) -> None:
+    function = FunctionDriver(lambda state: 0.1 * (state.leader_speed - state.speed))
+    episode = run_episode(MERGE, function, (2,), simulation=simulation)
+    for trajectory in episode.trajectories:
+        states = LocalState(*(values[:-1] for values in trajectory.states))
+        wanted = np.clip(0.1 * (states.leader_speed - states.speed), -1, 1)
+        np.testing.assert_allclose(trajectory.applied, wanted, atol=1e-12)
+
+
+@pytest.mark.parametrize("driver", [IDM(), ResidualDriver(PISaturation(), random_network(), 1.0, hold=2)])
+def test_time_goes_on_while_no_cav_is_on_the_road(driver: Driver, simulation: Simulation) -> None:
+    lonely = Merge(cavs=1, standing=0, horizon=150)
+    episode = run_episode(lonely, driver, (3,), explore=True, simulation=simulation)
+    (trajectory,) = episode.trajectories
+    assert trajectory.start > 3
+    assert trajectory.start + len(trajectory.applied) < 150
+    assert episode.steps == 150
+    assert {values.shape for values in episode.terms.values()} == {(150,)}
+
+
+def test_where_no_cav_ever_comes_one_line_says_so(simulation: Simulation) -> None:
+    empty = Merge(penetration=0.0, horizon=10)
+    with pytest.raises(InputError, match="no CAV was on the road in 10 decisions"):
+        run_episode(empty, Constant(), (0,), simulation=simulation)
+    assert run_episode(empty, Human(), (0,), simulation=simulation).trajectories == ()
+
+
+def test_a_warmup_hands_over_the_cavs_that_are_on_the_road(simulation: Simulation) -> None:
+    warm = replace(MERGE, warmup=200, horizon=60)
+    episode = run_episode(warm, Counting(), (2,), simulation=simulation)
+    assert sum(trajectory.start == 0 for trajectory in episode.trajectories) > 2
+    for trajectory in episode.trajectories:
+        np.testing.assert_allclose(trajectory.applied, expected_of_counting(trajectory), atol=1e-12)
+    assert episode.warmup == 200
+    assert (~np.isnan(episode.speeds[0])).sum() > 15
+
+
+def test_a_collision_terminates_the_stays_that_it_ends_and_no_earlier_ones(simulation: Simulation) -> None:
+    reckless = Merge(penetration=0.5, actuation="raw", standing=0)
+    episode = run_episode(reckless, Constant(1.0), (1,), simulation=simulation)
+    assert (episode.status, episode.collisions >= 2) == ("collision", True)
+    assert episode.steps < 600
+    ends = [each.start + len(each.applied) for each in episode.trajectories]
+    assert [each.terminated for each in episode.trajectories] == [end == episode.steps for end in ends]
+    assert episode.reward[-1] == 0.0
+
+
+def test_rows_of_those_who_stay_follow_who_leaves_and_enters(simulation: Simulation) -> None:
+    traffic = make_traffic(MERGE, (2,), simulation)
+    traffic.start(controlled=True)
+    moved = 0
+    for _ in range(100):
+        before = list(traffic.cavs)
+        traffic.advance(np.zeros(len(before)))
+        stayed = [before[row] for row in traffic.stayed]
+        assert list(traffic.cavs[: len(stayed)]) == stayed
+        assert not set(traffic.cavs[len(stayed) :]) & set(before)
+        assert traffic.local_state().speed.shape == (len(traffic.cavs),)
+        moved += stayed != before
+    assert moved > 2
+
+
+@pytest.mark.parametrize(
+    ("answer", "words"),
+    [
+        (lambda state: np.zeros(len(state.speed) + 1), r"acceleration has shape \(\d+,\); allowed: \(\d+,\)"),
+        (lambda state: state.speed * np.nan, "acceleration of cav_0 is nan; allowed: finite"),
+    ],
+)
+def test_a_wrong_answer_is_refused_with_its_step(answer: Any, words: str, simulation: Simulation) -> None:
+    everyone = Merge(penetration=1.0, standing=0, horizon=20)
+    with pytest.raises(InputError, match=f"driver: step \\d+: {words}"):
+        run_episode(everyone, FunctionDriver(answer), (0,), simulation=simulation)
+
+
+def test_fuel_and_places_are_recorded_only_when_asked_for_and_change_nothing_else(
+    simulation: Simulation,
+) -> None:
+    short = replace(MERGE, horizon=40)
+    plain, full = (
+        run_episode(short, Counting(), (2,), full=asked, simulation=simulation) for asked in (False, True)
+    )
+    steps, vehicles = plain.speeds.shape
+    assert (plain.fuel.shape, plain.places.shape, plain.lines.shape) == ((0, 0), (0, 0, 3), (0, 2))
+    assert (full.fuel.shape, full.places.shape) == ((steps - 1, vehicles), (steps, vehicles, 3))
+    np.testing.assert_array_equal(np.isnan(full.fuel), np.isnan(full.speeds[1:]))
+    np.testing.assert_array_equal(np.isnan(full.places[..., 0]), np.isnan(full.speeds))
+    same = replace(full, fuel=plain.fuel, places=plain.places, lines=plain.lines)
+    assert fingerprint(same) == fingerprint(plain)

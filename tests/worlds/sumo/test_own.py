@@ -1,0 +1,273 @@
+"""The user's own network on the actual simulator, on networks that nobody here made."""
+
+import warnings
+from pathlib import Path
+from typing import Any
+
+import libsumo
+import numpy as np
+import pytest
+
+from tests.worlds.sumo.own_roads import game, grid, straight
+from tests.worlds.test_record import fingerprint, travelled
+from unjam.drivers import IDM, Constant, Human, PISaturation
+from unjam.errors import InputError
+from unjam.measures.metrics import measure
+from unjam.scenarios import Scenario, make_scenario
+from unjam.worlds.drive import run_episode
+from unjam.worlds.sumo.own import OwnTraffic
+from unjam.worlds.sumo.simulation import Simulation
+from unjam.worlds.sumo.stepping import make_traffic
+from unjam.worlds.workers import EpisodeTask, Workers
+
+
+@pytest.fixture(scope="module", params=["ramp", "cross", "grid"])
+def file(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp(request.param)
+    return grid(folder) if request.param == "grid" else game(folder, request.param)
+
+
+@pytest.fixture(scope="module")
+def signalled(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return grid(tmp_path_factory.mktemp("signalled"))
+
+
+def scenario_of(file: Path, **changes: Any) -> Scenario:
+    return make_scenario(str(file), {"cav_share": 0.3, "horizon": 200, **changes})
+
+
+def own(simulation: Simulation, file: Path, seed: int = 0, **changes: Any) -> OwnTraffic:
+    traffic = make_traffic(scenario_of(file, **changes), (seed,), simulation, full=True)
+    assert isinstance(traffic, OwnTraffic)
+    traffic.start(controlled=True)
+    return traffic
+
+
+def test_the_same_seed_gives_the_same_bytes_in_process_and_in_workers(
+    file: Path, simulation: Simulation
+) -> None:
+    task = EpisodeTask(scenario_of(file, horizon=80), PISaturation(), (3,))
+    here = run_episode(task.scenario, task.driver, task.seed, simulation=simulation)
+    run_episode(task.scenario, Constant(0.4), (4,), simulation=simulation)
+    with Workers(1) as workers:
+        (there,) = workers.run([task])
+    again = run_episode(task.scenario, task.driver, task.seed, simulation=simulation)
+    assert here.status == "completed"
+    assert fingerprint(there) == fingerprint(again) == fingerprint(here) == fingerprint(travelled(here))
+
+
+def test_the_same_vehicles_are_cavs_whoever_drives(file: Path, simulation: Simulation) -> None:
+    scenario = scenario_of(file)
+    slow, fast, human = (
+        run_episode(scenario, driver, (0,), simulation=simulation)
+        for driver in (Constant(-0.2), IDM(), Human())
+    )
+    assert len(human.cav_ids) > 2
+    for one, other in ((slow, fast), (fast, human)):
+        both = set(one.vehicle_ids) & set(other.vehicle_ids)
+        # A vehicle that came in the very last decision has no trajectory.
+        new = {name for each in (one, other) for name in each.vehicle_ids if stayed(each, name) < 2}
+        assert set(one.cav_ids) & both - new == set(other.cav_ids) & both - new
+
+
+def stayed(episode: Any, name: str) -> int:
+    column = episode.vehicle_ids.index(name)
+    return int((~np.isnan(episode.speeds[:, column])).sum())
+
+
+def test_a_share_is_about_that_share_and_types_are_all_of_theirs(tmp_path: Path) -> None:
+    file = game(tmp_path, "ramp")
+    episode = run_episode(scenario_of(file, cav_share=0.3, horizon=600), Human(), (0,))
+    share = len(episode.cav_ids) / len(episode.vehicle_ids)
+    assert share == pytest.approx(0.3, abs=0.12)
+    with Simulation() as simulation:
+        traffic = own(simulation, file, cav_share=0.0, cav_types=["truck"], horizon=300)
+        kinds: dict[str, str] = {}
+        for _ in range(150):
+            for name in libsumo.vehicle.getIDList():
+                kinds.setdefault(name, libsumo.vehicle.getTypeID(name))
+            traffic.advance(np.zeros(len(traffic.cavs)))
+        assert {name for name, kind in kinds.items() if "truck" in kind} >= set(traffic.cavs)
+        driven = {name for moment in traffic._log_cavs for name in moment}
+        there = set(traffic._log_moments[-2][0]) | driven
+        assert driven == {name for name in there if "truck" in kinds.get(name, "")} != set()
+
+
+def test_everyone_may_be_a_cav_and_nobody(file: Path, simulation: Simulation) -> None:
+    everyone = run_episode(scenario_of(file, cav_share=1.0, horizon=60), IDM(), (0,), simulation=simulation)
+    there = [name for name in everyone.vehicle_ids if stayed(everyone, name) > 1]
+    assert set(everyone.cav_ids) == set(there)
+    with pytest.raises(InputError, match="no CAV was on the road in 5 decisions"):
+        run_episode(scenario_of(file, cav_share=1e-9, horizon=5), IDM(), (0,), simulation=simulation)
+
+
+def test_cavs_are_never_faster_than_allowed(file: Path, simulation: Simulation) -> None:
+    traffic = own(simulation, file)
+    compared = 0
+    for _ in range(200):
+        driven = list(traffic.cavs)
+        traffic.advance(np.ones(len(driven)))
+        for name in driven:
+            if name in traffic.cavs:
+                speed, allowed = libsumo.vehicle.getSpeed(name), libsumo.vehicle.getAllowedSpeed(name)
+                compared += 1
+                assert speed <= allowed + 1e-6
+    assert compared > 200
+    assert not traffic.crashed
+
+
+def test_cavs_stop_at_red(signalled: Path, simulation: Simulation) -> None:
+    traffic = own(simulation, signalled, cav_share=1.0, horizon=240)
+    waited = passed = 0
+    ahead: dict[str, Any] = {}
+    for _ in range(200):
+        traffic.advance(np.ones(len(traffic.cavs)))
+        for name in libsumo.vehicle.getIDList():
+            signals = libsumo.vehicle.getNextTLS(name)
+            now = signals[0] if signals else None
+            before = ahead.get(name)
+            if before is not None and (now is None or now[0] != before[0]):
+                passed += 1
+                assert before[3] != "r", f"{name} drove across a red light"
+            if now is not None:
+                waited += now[3] == "r" and now[2] < 3.0 and libsumo.vehicle.getSpeed(name) < 0.1
+            ahead[name] = now
+        for name in set(ahead) - set(libsumo.vehicle.getIDList()):
+            del ahead[name]
+    assert waited > 20
+    assert passed > 20
+
+
+COLUMN = "".join(
+    f'<vehicle id="{number}" type="{"van" if number % 3 == 1 else "car"}" route="along" depart="0" '
+    f'departPos="{place}" departSpeed="10"/>'
+    for number, place in enumerate((400, 340, 310, 180, 60))
+)
+
+
+def test_neighbours_on_one_lane_are_those_of_the_positions(tmp_path: Path, simulation: Simulation) -> None:
+    traffic = own(simulation, straight(tmp_path, COLUMN), cav_share=1.0, horizon=400)
+    generator = np.random.default_rng(0)
+    lengths = {name: 7.0 if int(name) % 3 == 1 else 5.0 for name in "01234"}
+    seen = 0
+    for _ in range(300):
+        traffic.advance(generator.uniform(-0.6, 0.5, len(traffic.cavs)))
+        state = traffic.local_state()
+        order = sorted(traffic.cavs)  # nobody overtakes on one lane
+        place = {name: libsumo.vehicle.getLanePosition(name) for name in order}
+        speed = {name: libsumo.vehicle.getSpeed(name) for name in order}
+        for row, name in enumerate(traffic.cavs):
+            at = order.index(name)
+            for other, gap, rate in (
+                (order[at - 1] if at else None, state.leader_gap[row], state.leader_speed[row]),
+                (
+                    order[at + 1] if at + 1 < len(order) else None,
+                    state.follower_gap[row],
+                    state.follower_speed[row],
+                ),
+            ):
+                if other is None:
+                    assert (gap, rate) == (100.0, speed[name])
+                    continue
+                front, back = (name, other) if place[name] > place[other] else (other, name)
+                expected = place[front] - lengths[front] - place[back]
+                near = expected < 100.0
+                assert gap == pytest.approx(expected if near else 100.0, abs=1e-6)
+                assert rate == (speed[other] if near else speed[name])
+                seen += near
+    assert seen > 500
+
+
+def test_commands_are_carried_out_exactly_where_it_is_safe_and_allowed(
+    tmp_path: Path, simulation: Simulation
+) -> None:
+    one = '<vehicle id="v" type="van" route="along" depart="0" departPos="10" departSpeed="5"/>'
+    scenario = scenario_of(straight(tmp_path, one), cav_share=1.0, horizon=300)
+    (trajectory,) = run_episode(scenario, Constant(0.7), (0,), simulation=simulation).trajectories
+    expected = np.minimum(5.0 + 0.07 * np.arange(301), 20.0)
+    np.testing.assert_allclose(trajectory.states.speed, expected, atol=1e-9)
+    assert not (trajectory.shield > 1e-9).any()
+
+
+def test_an_episode_ends_when_the_last_vehicle_has_arrived(tmp_path: Path, simulation: Simulation) -> None:
+    scenario = scenario_of(straight(tmp_path, COLUMN), cav_share=1.0, horizon=4000)
+    episode = run_episode(scenario, IDM(), (0,), simulation=simulation)
+    assert episode.status == "completed"
+    assert episode.steps < 1500
+    assert (episode.arrived, len(episode.trajectories)) == (5, 5)
+    assert not any(trajectory.terminated for trajectory in episode.trajectories)
+
+
+def test_an_episode_is_measured_without_complaint(file: Path, simulation: Simulation) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for horizon in (2, 200):
+            found = run_episode(
+                scenario_of(file, cav_share=0.9, horizon=horizon),
+                Human(),
+                (0,),
+                full=True,
+                simulation=simulation,
+            )
+            row = measure(found)
+    assert 0 < row["mean_speed"] < 40
+    assert row["throughput_veh_per_h"] == pytest.approx(found.arrived / (200 * found.step) * 3600)
+    assert 0.2 < row["speed_limit_ratio"] < 1.2
+    assert row["fuel_ml_per_km"] > 20
+
+
+def test_positions_are_along_the_route_that_most_drive(file: Path, simulation: Simulation) -> None:
+    episode = run_episode(scenario_of(file), Human(), (0,), full=True, simulation=simulation)
+    assert np.isnan(run_episode(scenario_of(file), Human(), (0,), simulation=simulation).positions).all()
+    there = ~np.isnan(episode.positions)
+    assert there.sum() > 300
+    assert not (there & np.isnan(episode.speeds)).any()
+    forward = np.diff(episode.positions, axis=0)
+    assert np.nanmin(forward) > -1e-6
+    assert np.isfinite(episode.places[~np.isnan(episode.speeds)]).all()
+    # On the route, distance driven is distance along it, but for the ways across junctions.
+    step = episode.speeds[1:] * episode.step
+    close = np.abs(forward - step)[there[1:] & there[:-1]]
+    assert np.mean(close < 1e-3) > 0.6
+
+
+def test_a_warmup_runs_before_the_first_decision(file: Path, simulation: Simulation) -> None:
+    cold = run_episode(scenario_of(file, horizon=100), Human(), (1,), simulation=simulation)
+    warm = run_episode(scenario_of(file, horizon=40, warmup=60), Human(), (1,), simulation=simulation)
+    for name in warm.vehicle_ids:
+        if name in cold.vehicle_ids:
+            column, other = warm.vehicle_ids.index(name), cold.vehicle_ids.index(name)
+            np.testing.assert_array_equal(warm.speeds[:, column], cold.speeds[60:, other])
+
+
+def test_a_vehicle_that_sumo_refuses_later_is_told_in_one_line(tmp_path: Path) -> None:
+    late = COLUMN + '<vehicle id="v" type="ghost" route="along" depart="300"/>'
+    scenario = scenario_of(straight(tmp_path, late, end=1000.0), cav_share=1.0, horizon=5000)
+    with Workers(1) as workers:
+        (episode,) = workers.run([EpisodeTask(scenario, IDM(), (0,))])
+    assert episode.status == "failed"
+    assert "ghost" in episode.reason
+    assert "\n" not in episode.reason
+
+
+def test_nothing_is_written_into_the_users_folder(tmp_path: Path) -> None:
+    scenario = scenario_of(straight(tmp_path, COLUMN), cav_share=1.0, horizon=20)
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    with Workers(1) as workers:
+        (episode,) = workers.run([EpisodeTask(scenario, IDM(), (0,), full=True)])
+    assert episode.ok
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
+def test_a_network_that_breaks_later_fails_its_episode_and_nothing_else(tmp_path: Path) -> None:
+    scenario = scenario_of(straight(tmp_path, COLUMN), cav_share=1.0, horizon=20)
+    whole = (tmp_path / "road.net.xml").read_text()
+    with Workers(1) as workers:
+        task = EpisodeTask(scenario, IDM(), (0,))
+        (tmp_path / "road.net.xml").write_text("<net><edge/></net>")  # on this one SUMO itself would crash
+        (broken,) = workers.run([task])
+        (tmp_path / "road.net.xml").write_text(whole)
+        (mended,) = workers.run([task])
+    assert (broken.status, broken.error) == ("failed", "InputError")
+    assert "the network has no version" in broken.reason
+    assert mended.status == "completed"

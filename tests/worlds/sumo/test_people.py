@@ -1,0 +1,60 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from unjam.drivers.idm import Human
+from unjam.drivers.network import Network
+from unjam.physics.idm import PAPER_IDM, IDMParameters, idm_acceleration
+from unjam.scenarios.population import Population, write_population
+from unjam.scenarios.registry import make_scenario
+from unjam.worlds.drive import run_episode
+from unjam.worlds.sumo.people import as_calibrated
+
+DRIVERS = (
+    IDMParameters(time_headway=0.9),
+    IDMParameters(time_headway=1.3, max_acceleration=1.4, minimum_gap=3.0),
+)
+QUARTER = Network(((np.zeros((3, 1)), np.array([np.arctanh(0.5)])),), 0.5)
+"""a residual of a quarter m/s2, whatever it sees"""
+
+
+def population(folder: Path, residual: Network | None = None) -> str:
+    path = folder / "drivers.json"
+    write_population(path, Population(PAPER_IDM, DRIVERS, (-4.0, 2.0), residual))
+    return str(path)
+
+
+def test_limits_and_residual_change_an_idm() -> None:
+    seen = np.array([5.0, 5.0]), np.array([4.0, 0.0]), np.array([10.0, 0.5])
+    acceleration = idm_acceleration(*seen)
+    assert as_calibrated(None, acceleration, *seen) is acceleration
+    found = as_calibrated(Population(PAPER_IDM, DRIVERS, (-4.0, 2.0), QUARTER), acceleration, *seen)
+    np.testing.assert_allclose(found, [acceleration[0] + 0.25, -4.0])
+
+
+@pytest.mark.parametrize("people", ["native", "commanded"])
+def test_each_person_on_the_ring_drives_by_its_own_parameters(tmp_path: Path, people: str) -> None:
+    file = population(tmp_path)
+    scenario = make_scenario(
+        "ring", {"population": file, "people": people, "noise": 0.0, "horizon": 300, "length": (300, 300)}
+    )
+    road = scenario.draw(np.random.default_rng(0))
+    assert set(road.people.values()) == set(DRIVERS)
+    episode = run_episode(scenario, Human(), (3,))
+    assert episode.ok
+    acceleration = np.diff(episode.speeds, axis=0)[200:] / episode.step
+    speeds, gaps = episode.speeds[200:-1], episode.gaps[200:-1]
+    # Who drives what is drawn: it is told from how they drive.
+    wanted = [idm_acceleration(speeds, np.roll(speeds, -1, 1), gaps, one) for one in DRIVERS]
+    errors = np.abs(np.array(wanted) - acceleration).max(1)
+    assert errors.min(0).max() < 1e-6
+    assert set(errors.argmin(0)) == {0, 1}
+
+
+@pytest.mark.parametrize("name", ["ring", "figure-eight", "merge"])
+def test_every_road_can_have_them_with_a_residual(tmp_path: Path, name: str) -> None:
+    file = population(tmp_path, QUARTER)
+    episode = run_episode(make_scenario(name, {"population": file, "horizon": 60}), Human(), (0,))
+    assert episode.status == "completed"
+    assert np.nanmax(episode.speeds) > 1.0

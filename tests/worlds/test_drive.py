@@ -1,0 +1,365 @@
+import random
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.conftest import random_network
+from tests.worlds.test_record import fingerprint
+from unjam.drivers import (
+    IDM,
+    Constant,
+    Driver,
+    FollowerStopper,
+    Human,
+    LocalState,
+    PISaturation,
+    ResidualDriver,
+)
+from unjam.drivers.from_file import FileDriver
+from unjam.drivers.local_state import local_vector
+from unjam.errors import EpisodeError, InputError
+from unjam.scenarios import Ring
+from unjam.worlds.drive import run_episode
+from unjam.worlds.sumo.simulation import Simulation
+
+RING = Ring(horizon=300)
+RESIDUAL = ResidualDriver(PISaturation(), random_network(), 1.0)
+
+
+def drives_badly(simulation: Simulation) -> None:
+    ring = replace(RING, actuation="raw", horizon=3000)
+    assert run_episode(ring, Constant(1.0), (9,), simulation=simulation).status == "collision"
+
+
+def another_road(simulation: Simulation) -> None:
+    ring = Ring(length=(130, 140), vehicles=11, cavs=3, warmup=77, horizon=50, simulation_step=0.2)
+    run_episode(ring, RESIDUAL, (9,), explore=True, full=True, simulation=simulation)
+
+
+def stops_in_the_middle(simulation: Simulation) -> None:
+    class Stops(Driver):
+        def act(self, state: LocalState, memory: dict) -> tuple:
+            if state.route_position[0] > 0.5:
+                raise KeyboardInterrupt
+            return state.speed * 0.0 + 1.0, memory
+
+    with pytest.raises(KeyboardInterrupt):
+        run_episode(RING, Stops(), (9,), simulation=simulation)
+
+
+def cannot_start(simulation: Simulation) -> None:
+    with pytest.raises(EpisodeError):
+        run_episode(replace(RING, emission_class="coal"), IDM(), (9,), simulation=simulation)
+
+
+def uses_up_random_numbers(simulation: Simulation) -> None:
+    random.seed(9)
+    np.random.seed(9)
+    run_episode(RING, IDM(), (9,), simulation=simulation)
+
+
+@pytest.mark.parametrize(
+    ("scenario", "driver"),
+    [
+        (RING, PISaturation()),
+        (replace(RING, warmup=120), RESIDUAL),
+        (replace(RING, cavs=2, steps_per_decision=2), FollowerStopper()),
+        (replace(RING, warmup=50, actuation="flow"), Human()),
+    ],
+)
+@pytest.mark.parametrize(
+    "before", [drives_badly, another_road, stops_in_the_middle, cannot_start, uses_up_random_numbers]
+)
+def test_an_episode_is_the_same_to_the_last_bit_whatever_ran_before(
+    scenario: Ring, driver: Driver, before: Callable[[Simulation], None]
+) -> None:
+    first = fingerprint(run_episode(scenario, driver, (1, 2), explore=True))
+    with Simulation() as simulation:
+        before(simulation)
+        second = run_episode(scenario, driver, (1, 2), explore=True, simulation=simulation)
+        before(simulation)
+        third = run_episode(scenario, driver, (1, 2), explore=True, simulation=simulation)
+    fourth = run_episode(scenario, driver, (1, 2), explore=True)
+    assert [fingerprint(episode) for episode in (second, third, fourth)] == [first] * 3
+
+
+def test_an_episode_without_a_simulation_closes_its_own(my_drivers: Path) -> None:
+    with pytest.raises(InputError):
+        run_episode(RING, FileDriver(my_drivers, "broken"), (0,))
+    run_episode(replace(RING, horizon=1), IDM(), (0,))
+    Simulation().close()
+
+
+def test_other_seeds_give_other_roads_and_other_noise(simulation: Simulation) -> None:
+    seeds = [(0,), (1,), (2,), (0, 1), (1, 1), (1, 2, 3)]
+    fixed = replace(RING, length=(230, 230))
+    found = [run_episode(fixed, IDM(), seed, simulation=simulation) for seed in seeds]
+    assert len({episode.speeds.tobytes() for episode in found}) == len(seeds)
+    assert [episode.seed for episode in found] == seeds
+    short = replace(RING, horizon=1)
+    lengths = {run_episode(short, IDM(), (seed,), simulation=simulation).loop_length for seed in range(12)}
+    assert len(lengths) > 6
+
+
+def test_the_same_seed_is_the_same_traffic_for_every_driver(simulation: Simulation) -> None:
+    ring = replace(RING, warmup=100, horizon=1)
+    found = [
+        run_episode(ring, driver, (4,), simulation=simulation)
+        for driver in (IDM(), Human(), Constant(1.0), RESIDUAL)
+    ]
+    assert len({episode.speeds[0].tobytes() for episode in found}) == 1
+    assert len({str(episode.drawn) for episode in found}) == 1
+
+
+@pytest.mark.parametrize(("warmup", "held", "hold", "cavs"), [(0, 1, 1, 1), (30, 5, 1, 2), (0, 1, 7, 3)])
+def test_all_that_is_recorded_has_a_row_for_each_decision_and_one_for_the_end(
+    warmup: int, held: int, hold: int, cavs: int, simulation: Simulation
+) -> None:
+    ring = replace(RING, horizon=60, warmup=warmup, steps_per_decision=held, cavs=cavs)
+    driver = replace(RESIDUAL, hold=hold)
+    episode = run_episode(ring, driver, (0,), simulation=simulation)
+    assert episode.steps == 60
+    for array in (episode.speeds, episode.positions, episode.gaps):
+        assert array.shape == (61, 22)
+        assert np.isfinite(array).all()
+    for trajectory in episode.trajectories:
+        assert trajectory.start == 0
+        assert {values.shape for values in trajectory.states} == {(61,)}
+        assert trajectory.observations.shape == (-(-60 // hold) + 1, 5)
+        once = (trajectory.expert, trajectory.residual, trajectory.applied, trajectory.shield)
+        assert {values.shape for values in once} == {(60,)}
+        assert {values.shape for values in trajectory.terms.values()} == {(60,)}
+        assert trajectory.hold == hold
+        assert not trajectory.terminated
+    assert (episode.status, episode.collisions, episode.warmup) == ("completed", 0, warmup)
+
+
+@pytest.mark.parametrize("cavs", [1, 2, 3, 4, 22])
+def test_each_trajectory_is_that_of_its_vehicle(cavs: int, simulation: Simulation) -> None:
+    class Different(Driver):
+        def act(self, state: LocalState, memory: dict) -> tuple:
+            return np.linspace(0.1, 0.4, len(state.speed)), memory
+
+    ring = replace(RING, cavs=cavs, horizon=80)
+    episode = run_episode(ring, Different(), (0,), simulation=simulation)
+    assert tuple(trajectory.vehicle for trajectory in episode.trajectories) == episode.cav_ids
+    assert len(episode.cav_ids) == cavs
+    for trajectory, push in zip(episode.trajectories, np.linspace(0.1, 0.4, cavs), strict=True):
+        place = episode.vehicle_ids.index(trajectory.vehicle)
+        ahead, behind = (place + 1) % 22, (place - 1) % 22
+        states = trajectory.states
+        np.testing.assert_array_equal(states.speed, episode.speeds[:, place])
+        np.testing.assert_array_equal(states.leader_speed, episode.speeds[:, ahead])
+        np.testing.assert_array_equal(states.leader_gap, episode.gaps[:, place])
+        np.testing.assert_array_equal(states.follower_speed, episode.speeds[:, behind])
+        np.testing.assert_array_equal(states.follower_gap, episode.gaps[:, behind])
+        along = episode.positions[:, place] % episode.loop_length
+        np.testing.assert_allclose(states.route_position, along, atol=1e-9)
+        np.testing.assert_array_equal(states.loop_length, episode.loop_length)
+        np.testing.assert_array_equal(trajectory.applied, push)
+        np.testing.assert_array_equal(trajectory.expert, push)
+        assert not trajectory.residual.any()
+
+
+def test_what_the_seed_drew_is_written_down(simulation: Simulation) -> None:
+    episode = run_episode(RING, IDM(), (5,), simulation=simulation)
+    assert episode.drawn == {"length": episode.loop_length}
+    assert 220 <= episode.loop_length <= 270
+    assert 3.0 <= episode.limit_speed <= 5.27
+    np.testing.assert_allclose(episode.positions[0], np.arange(22) * episode.loop_length / 22, atol=1e-9)
+    assert episode.outline[-1, 0] == episode.loop_length
+
+
+@pytest.mark.parametrize("cavs", [1, 2])
+@pytest.mark.parametrize("hold", [1, 7])
+@pytest.mark.parametrize("expert", [PISaturation(time_constant=0), IDM()])
+def test_a_residual_drivers_record_adds_up(
+    cavs: int, hold: int, expert: Driver, simulation: Simulation
+) -> None:
+    ring = replace(RING, cavs=cavs, horizon=500, warmup=50)
+    driver = ResidualDriver(expert, random_network(), 0.5, hold=hold)
+    calm, explored = (
+        run_episode(ring, driver, (0,), explore=explore, simulation=simulation) for explore in (False, True)
+    )
+    for episode in (calm, explored):
+        for trajectory in episode.trajectories:
+            total = np.clip(trajectory.expert + trajectory.residual, -0.5, 0.5)
+            np.testing.assert_array_equal(trajectory.applied, total)
+            assert np.abs(trajectory.expert).max() <= 0.5
+            seen = local_vector(LocalState(*(values[::hold] for values in trajectory.states)))
+            looks = len(trajectory.observations) - 1
+            np.testing.assert_allclose(trajectory.observations[:-1], seen[:looks], atol=1e-12)
+            end = local_vector(LocalState(*(values[-1:] for values in trajectory.states)))
+            np.testing.assert_allclose(trajectory.observations[-1:], end, atol=1e-12)
+    for trajectory in calm.trajectories:
+        wanted = driver.network(trajectory.observations[:-1])
+        np.testing.assert_allclose(trajectory.residual, np.repeat(wanted, hold)[:500], atol=1e-12)
+        assert np.abs(trajectory.residual).max() > 0.01
+
+
+@pytest.mark.parametrize("cavs", [1, 2])
+@pytest.mark.parametrize("hold", [1, 5])
+def test_exploration_adds_noise_of_the_networks_spread(cavs: int, hold: int, simulation: Simulation) -> None:
+    driver = replace(RESIDUAL, hold=hold)
+    ring = replace(RING, cavs=cavs, horizon=1000 * hold)
+    episode = run_episode(ring, driver, (0,), explore=True, simulation=simulation)
+    noises = []
+    for trajectory in episode.trajectories:
+        chosen, _ = trajectory.looks
+        np.testing.assert_array_equal(trajectory.residual, np.repeat(chosen, hold))
+        noises.append(chosen - driver.network(trajectory.observations[:-1]))
+        assert noises[-1].std() == pytest.approx(0.2, rel=0.06)
+        assert abs(noises[-1].mean()) < 0.03
+        assert abs(np.corrcoef(noises[-1][:-1], noises[-1][1:])[0, 1]) < 0.1
+    if cavs == 2:
+        assert abs(np.corrcoef(*noises)[0, 1]) < 0.1
+
+
+def test_exploration_follows_the_seed_and_leaves_the_traffics_noise_alone(simulation: Simulation) -> None:
+    ring = replace(RING, length=(230, 230), horizon=100)
+    mute = replace(RESIDUAL, network=replace(RESIDUAL.network, exploration_std=0.0))
+    still = run_episode(ring, mute, (0,), simulation=simulation)
+    explored = run_episode(ring, mute, (0,), explore=True, simulation=simulation)
+    np.testing.assert_array_equal(explored.speeds, still.speeds)
+    first, second = (
+        run_episode(ring, RESIDUAL, (seed,), explore=True, simulation=simulation) for seed in (0, 1)
+    )
+    noises = [
+        trajectory.residual - RESIDUAL.network(trajectory.observations[:-1])
+        for trajectory in (first.trajectories[0], second.trajectories[0])
+    ]
+    assert np.abs(noises[0] - noises[1]).min() > 0.0
+
+
+def test_of_a_driver_without_a_network_the_expert_is_all(simulation: Simulation) -> None:
+    driver = PISaturation(time_constant=0)
+    episode = run_episode(RING, driver, (0,), explore=True, simulation=simulation)
+    trajectory = episode.trajectories[0]
+    np.testing.assert_array_equal(trajectory.expert, trajectory.applied)
+    assert not trajectory.residual.any()
+    assert trajectory.observations.shape == (1, 0)
+    still = run_episode(RING, driver, (0,), simulation=simulation)
+    assert fingerprint(still) == fingerprint(episode)
+
+
+def test_fuel_is_recorded_only_when_asked_for_and_changes_nothing_else(simulation: Simulation) -> None:
+    without = run_episode(RING, IDM(), (0,), simulation=simulation)
+    episode = run_episode(RING, IDM(), (0,), full=True, simulation=simulation)
+    assert without.fuel.shape == (0, 0)
+    assert episode.fuel.shape == (300, 22)
+    assert (episode.fuel >= 0.0).all()
+    assert (episode.fuel > 0.0).mean() > 0.5
+    # A petrol car burns about a litre an hour standing still, and some ten driving slowly [mg/s].
+    assert 100.0 < episode.fuel.mean() < 3000.0
+    assert fingerprint(replace(episode, fuel=without.fuel)) == fingerprint(without)
+
+
+def test_fuel_depends_on_the_emission_class(simulation: Simulation) -> None:
+    van = replace(RING, emission_class="HBEFA4/LCV_diesel_N1-III_Euro-6ab")
+    car, other = (
+        run_episode(scenario, IDM(), (0,), full=True, simulation=simulation).fuel.mean()
+        for scenario in (RING, van)
+    )
+    assert other > 1.1 * car
+
+
+def test_the_reward_is_the_scenarios_own_where_none_is_named(simulation: Simulation) -> None:
+    episode = run_episode(RING, PISaturation(), (0,), simulation=simulation)
+    trajectory = episode.trajectories[0]
+    assert set(trajectory.terms) == {"speed", "acceleration"}
+    np.testing.assert_allclose(trajectory.terms["speed"], 0.2 * episode.speeds[1:].mean(1), atol=1e-12)
+    np.testing.assert_allclose(trajectory.terms["acceleration"], -4.0 * np.abs(trajectory.applied))
+
+
+def test_a_named_reward_and_ones_own_are_used(my_drivers: Path, simulation: Simulation) -> None:
+    ring = replace(RING, cavs=2)
+    found = run_episode(ring, Constant(0.2), (0,), "eq16", simulation=simulation).trajectories
+    assert set(found[0].terms) == {"speed", "headway", "acceleration"}
+    episode = run_episode(ring, Constant(0.2), (0,), f"{my_drivers}:calm", simulation=simulation)
+    for trajectory in episode.trajectories:
+        assert set(trajectory.terms) == {"speed", "push"}
+        np.testing.assert_allclose(trajectory.terms["speed"], episode.speeds[1:].mean(1))
+        np.testing.assert_allclose(trajectory.terms["push"], -0.4)
+
+
+def test_the_headways_of_a_reward_are_those_after_each_step(simulation: Simulation) -> None:
+    trajectory = run_episode(RING, Constant(1.0), (0,), "eq16", simulation=simulation).trajectories[0]
+    gap, speed = trajectory.states.leader_gap[1:], trajectory.states.speed[1:]
+    expected = [-0.1 * max(1.0 - g / max(v, 1e-3), 0.0) for g, v in zip(gap, speed, strict=True)]
+    np.testing.assert_allclose(trajectory.terms["headway"], expected, atol=1e-12)
+    assert trajectory.terms["headway"].min() < 0.0
+
+
+BAD_REWARDS = """
+import numpy as np
+
+def late(outcome):
+    speed = outcome.speeds.mean(-1)
+    return {"good": speed, "bad": np.where(np.arange(len(speed)) == 7, np.inf, speed)}
+
+def total(outcome):
+    return outcome.speeds.mean()
+
+def each_vehicle(outcome):
+    return {"speed": outcome.speeds}
+
+def listed(outcome):
+    return {"speed": [1] * len(outcome.crashed)}
+"""
+
+
+def test_a_reward_that_is_not_finite_is_refused_with_its_term_and_step(
+    my_drivers: Path, tmp_path: Path, simulation: Simulation
+) -> None:
+    with pytest.raises(InputError, match="reward: step 0: term 'speed' is nan; allowed: finite"):
+        run_episode(RING, IDM(), (0,), f"{my_drivers}:wrong_reward", simulation=simulation)
+    file = tmp_path / "rewards.py"
+    file.write_text(BAD_REWARDS)
+    with pytest.raises(InputError, match="reward: step 7: term 'bad' is inf; allowed: finite"):
+        run_episode(RING, IDM(), (0,), f"{file}:late", simulation=simulation)
+
+
+@pytest.mark.parametrize("name", ["total", "each_vehicle"])
+def test_a_reward_of_a_wrong_shape_is_refused(name: str, tmp_path: Path, simulation: Simulation) -> None:
+    file = tmp_path / "rewards.py"
+    file.write_text(BAD_REWARDS)
+    with pytest.raises(InputError, match=r"reward: term '\w+' has shape .*; allowed: \(300,\)"):
+        run_episode(RING, IDM(), (0,), f"{file}:{name}", simulation=simulation)
+
+
+def test_a_reward_may_answer_in_lists_of_whole_numbers(tmp_path: Path, simulation: Simulation) -> None:
+    file = tmp_path / "rewards.py"
+    file.write_text(BAD_REWARDS)
+    episode = run_episode(RING, IDM(), (0,), f"{file}:listed", simulation=simulation)
+    assert episode.trajectories[0].terms["speed"].dtype == np.float64
+
+
+def test_an_unknown_reward_is_refused_before_anything_runs() -> None:
+    with pytest.raises(InputError, match="reward: 'fame' is not allowed"):
+        run_episode(RING, IDM(), (0,), "fame")
+
+
+def test_progress_is_told_during_warm_up_and_episode(simulation: Simulation) -> None:
+    told: list[int] = []
+    ring = replace(RING, warmup=1200, horizon=2600)
+    run_episode(ring, IDM(), (0,), simulation=simulation, progress=told.append)
+    assert told == sorted(told)
+    assert told.count(0) >= 2
+    assert 2000 < told[-1] <= 2600
+    assert len(set(told)) >= 4
+
+
+def test_a_trajectory_begins_with_what_its_expert_remembered_of_the_warmup(simulation: Simulation) -> None:
+    warm = Ring(length=(230, 230), vehicles=8, horizon=20, warmup=30)
+    driver = ResidualDriver(PISaturation(), random_network(), 1.0, hold=5)
+    trajectory = run_episode(warm, driver, (3,), simulation=simulation).trajectories[0]
+    assert set(trajectory.memory) == {"window", "total", "seen", "command"}
+    assert trajectory.memory["seen"] == 30
+    memory = {name: values[None] for name, values in trajectory.memory.items()}
+    for step in range(20):
+        seen = LocalState(*(values[step : step + 1] for values in trajectory.states))
+        expert, memory = driver.expert.act(seen, memory)
+        assert np.clip(expert[0], -1.0, 1.0) == pytest.approx(trajectory.expert[step], abs=1e-12)

@@ -1,0 +1,100 @@
+from dataclasses import fields, is_dataclass, replace
+from io import BytesIO
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.conftest import random_network
+from unjam.drivers import IDM, Constant, Driver, Human, PISaturation, ResidualDriver
+from unjam.scenarios import Ring
+from unjam.worlds.drive import run_episode
+from unjam.worlds.messages import read_message, write_message
+from unjam.worlds.record import Episode, Trajectory, failed_episode, pack_episode, unpack_episode
+from unjam.worlds.sumo.simulation import Simulation
+
+RING = Ring(length=(230, 240), horizon=60)
+
+
+def fingerprint(value: Any) -> Any:
+    """All of an episode, to the last bit, in a form that can be compared."""
+    if is_dataclass(value):
+        return {field.name: fingerprint(getattr(value, field.name)) for field in fields(value)}
+    if isinstance(value, np.ndarray):
+        return value.dtype.str, value.shape, value.tobytes()
+    if isinstance(value, dict):
+        return {key: fingerprint(entry) for key, entry in value.items()}
+    if isinstance(value, tuple):
+        return type(value).__name__, [fingerprint(entry) for entry in value]
+    return repr(value)
+
+
+def travelled(episode: Episode) -> Episode:
+    pipe = BytesIO()
+    write_message(pipe, *pack_episode(episode))
+    pipe.seek(0)
+    return unpack_episode(*read_message(pipe))
+
+
+def test_fingerprints_differ_in_the_last_bit_of_any_array() -> None:
+    episode = Episode(seed=(1,), status="completed", speeds=np.ones((3, 2)))
+    changed = np.ones((3, 2))
+    changed[2, 1] = np.nextafter(1.0, 2.0)
+    assert fingerprint(replace(episode, speeds=changed)) != fingerprint(episode)
+    assert fingerprint(replace(episode, speeds=np.ones((2, 3)))) != fingerprint(episode)
+
+
+@pytest.mark.parametrize(
+    ("scenario", "driver"),
+    [
+        (RING, IDM()),
+        (replace(RING, warmup=30), Human()),
+        (replace(RING, actuation="raw"), Constant(1.0)),
+        (replace(RING, cavs=3), PISaturation()),
+        (replace(RING, cavs=2, steps_per_decision=2), ResidualDriver(IDM(), random_network(), 1.0, hold=4)),
+    ],
+)
+def test_an_episode_arrives_as_it_was_sent(scenario: Ring, driver: Driver, simulation: Simulation) -> None:
+    episode = run_episode(
+        scenario, driver, (1, 2), explore=True, full=scenario.cavs == 3, simulation=simulation
+    )
+    assert len(episode.trajectories) == scenario.cavs
+    assert fingerprint(travelled(episode)) == fingerprint(episode)
+
+
+def test_numbers_that_json_does_not_know_arrive() -> None:
+    episode = Episode(
+        seed=(0,),
+        status="completed",
+        speeds=np.array([[np.nan, np.inf, -0.0]]),
+        limit_speed=float("inf"),
+        drawn={"length": float("nan")},
+    )
+    assert fingerprint(travelled(episode)) == fingerprint(episode)
+
+
+def test_a_failed_episode_arrives_with_its_reason() -> None:
+    episode = failed_episode((3, 4), "lost the map: 'Straße'\nline 2", "InputError")
+    arrived = travelled(episode)
+    assert fingerprint(arrived) == fingerprint(episode)
+    assert (arrived.status, arrived.ok, arrived.steps) == ("failed", False, 0)
+    assert (arrived.seed, arrived.error) == ((3, 4), "InputError")
+
+
+def test_only_a_failed_episode_is_not_ok() -> None:
+    found = {status: Episode(seed=(0,), status=status).ok for status in ("completed", "collision", "failed")}
+    assert found == {"completed": True, "collision": True, "failed": False}
+
+
+def test_what_a_held_residual_earned_is_the_sum_over_its_decisions(simulation: Simulation) -> None:
+    driver = ResidualDriver(IDM(), random_network(), 1.0, hold=7)
+    trajectory: Trajectory = run_episode(RING, driver, (0,), simulation=simulation).trajectories[0]
+    reward = trajectory.terms["speed"] + trajectory.terms["acceleration"]
+    np.testing.assert_array_equal(trajectory.reward, reward)
+    residuals, earned = trajectory.looks
+    assert len(residuals) == len(earned) == 9  # 8 whole holds and one of 4 decisions
+    for look in range(9):
+        held = slice(7 * look, 7 * (look + 1))
+        np.testing.assert_array_equal(trajectory.residual[held], residuals[look])
+        assert earned[look] == pytest.approx(reward[held].sum(), abs=1e-12)
+    assert len(trajectory.observations) == 10
