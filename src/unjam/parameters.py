@@ -66,6 +66,25 @@ def parse_assignments(texts: list[str], field: str) -> dict[str, Any]:
     return values
 
 
+def split_parameters(text: str) -> tuple[str, dict[str, Any]]:
+    """Split `name:key=value,key=value` (or `path.py:name:key=value`) into the name and the parameters."""
+    head, _, tail = text.rpartition(":")
+    if not head or "=" not in tail:
+        return text, {}
+    return head, parse_assignments(_split_commas(tail), "driver")
+
+
+def _split_commas(text: str) -> list[str]:
+    """Split at commas outside brackets: `gaps=[1,2,3],window=38` has two parts."""
+    parts, depth, start = [], 0, 0
+    for index, letter in enumerate(text):
+        depth += (letter in "[(") - (letter in "])")
+        if letter == "," and depth == 0:
+            parts.append(text[start:index])
+            start = index + 1
+    return [*parts, text[start:]]
+
+
 def merge(values: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
     """Return `values` with `changes`; tables are merged key by key."""
     merged = dict(values)

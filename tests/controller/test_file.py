@@ -23,14 +23,13 @@ from unjam.drivers import IDM, FollowerStopper, PISaturation, ResidualDriver
 from unjam.drivers.check import random_state
 from unjam.drivers.driver import Driver
 from unjam.drivers.from_file import FileDriver
-from unjam.drivers.local_state import ObservationPart
-from unjam.drivers.mixed import Mixed
 from unjam.drivers.network import network_arrays
+from unjam.drivers.observation import FeatureName, observation_size
 from unjam.drivers.registry import recipe_of
-from unjam.drivers.residual import observation_size
+from unjam.drivers.wrappers import Mixed
 from unjam.errors import InputError
 
-ALL_PARTS: tuple[ObservationPart, ...] = (
+ALL_PARTS: tuple[FeatureName, ...] = (
     *("local", "expert_acceleration", "expert_memory", "loop_length", "place", "route_position"),
 )
 ABOUT = {"scenario": "ring", "iteration": 3}
@@ -41,7 +40,7 @@ def residual(
     seed: int = 0,
     hold: int = 1,
     outputs: int = 1,
-    parts: tuple[ObservationPart, ...] = ALL_PARTS,
+    parts: tuple[FeatureName, ...] = ALL_PARTS,
 ) -> ResidualDriver:
     network = random_network(observation_size(parts, expert), seed, outputs=outputs)
     return ResidualDriver(expert, network, 1.0, parts, hold)

@@ -9,8 +9,8 @@ from unjam.controller.manifest import description
 from unjam.drivers import IDM, Driver, FollowerStopper, LocalState, Pacer, PISaturation
 from unjam.drivers.check import random_state
 from unjam.drivers.from_file import FileDriver
-from unjam.drivers.mixed import Mixed
-from unjam.drivers.residual import observed
+from unjam.drivers.observation import observed
+from unjam.drivers.wrappers import Mixed
 
 DRIVERS: dict[str, Driver] = {
     "expert": PISaturation(window=20),

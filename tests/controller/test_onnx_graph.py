@@ -28,10 +28,10 @@ from unjam.drivers import (
     ResidualDriver,
 )
 from unjam.drivers.from_file import FileDriver
-from unjam.drivers.mixed import Mixed
 from unjam.drivers.network import Network
+from unjam.drivers.observation import observation_size
 from unjam.drivers.registry import named_driver
-from unjam.drivers.residual import observation_size
+from unjam.drivers.wrappers import Mixed
 from unjam.errors import InputError, MissingPartError
 from unjam.learners.policy import ResidualPolicy
 from unjam.learners.settings import PolicySettings

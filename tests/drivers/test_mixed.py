@@ -5,8 +5,8 @@ import torch
 from unjam.controller import make_driver
 from unjam.drivers import IDM, FollowerStopper, PISaturation
 from unjam.drivers.check import random_state
-from unjam.drivers.mixed import Mixed
 from unjam.drivers.registry import describe, driver_from_recipe, recipe_of
+from unjam.drivers.wrappers import Mixed
 from unjam.errors import InputError
 from unjam.scenarios import Merge, Ring
 from unjam.worlds.drive import run_episode

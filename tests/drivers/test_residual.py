@@ -7,7 +7,7 @@ from unjam.drivers import IDM, LocalState, PISaturation, ResidualDriver, check_d
 from unjam.drivers.check import random_state
 from unjam.drivers.driver import single_row
 from unjam.drivers.network import Network
-from unjam.drivers.residual import observation_size
+from unjam.drivers.observation import observation_size
 
 ALL_PARTS = ("local", "expert_acceleration", "expert_memory", "loop_length", "place", "route_position")
 

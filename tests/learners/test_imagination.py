@@ -11,7 +11,8 @@ from tests.conftest import random_network
 from tests.learners.task import same
 from unjam.drivers import PISaturation
 from unjam.drivers.network import Network
-from unjam.drivers.residual import ResidualDriver, observation_size
+from unjam.drivers.observation import observation_size
+from unjam.drivers.residual import ResidualDriver
 from unjam.learners.algorithms import LEARNERS, OnPolicy
 from unjam.learners.episodic import Episodic, Iteration, Training
 from unjam.learners.imagination import Imagination, virtual_rows

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from unjam.drivers import PISaturation, ResidualDriver
-from unjam.drivers.residual import observation_size
+from unjam.drivers.observation import observation_size
 from unjam.learners.policy import ResidualPolicy, policy_spaces
 from unjam.learners.settings import PolicySettings
 from unjam.scenarios import Ring

@@ -13,8 +13,7 @@ from tests.conftest import random_network
 from tests.virtual.little_world import RING, LittleWorld, actual_data
 from unjam.drivers import IDM, Constant, Driver, LocalState, PISaturation, ResidualDriver
 from unjam.drivers.from_file import FileDriver
-from unjam.drivers.local_state import ObservationPart
-from unjam.drivers.residual import observation_size
+from unjam.drivers.observation import FeatureName, observation_size
 from unjam.errors import UnjamError
 from unjam.virtual.data import ActualData
 from unjam.virtual.model import EnvironmentModel, torch_generator
@@ -27,9 +26,9 @@ from unjam.virtual.rollout import (
     rollout_length,
 )
 from unjam.virtual.settings import VirtualSettings
-from unjam.virtual.world import BOUNDS, Step, VirtualWorld
+from unjam.virtual.world import BOUNDS, Step, VirtualDynamics
 
-PARTS: tuple[ObservationPart, ...] = ("local", "expert_acceleration", "expert_memory")
+PARTS: tuple[FeatureName, ...] = ("local", "expert_acceleration", "expert_memory")
 
 
 def residual_driver(expert: Driver, hold: int = 1, limit: float = 1.0) -> ResidualDriver:
@@ -181,7 +180,7 @@ def run(noisy: tuple[ResidualDriver, ActualData, EnvironmentModel], seed: int) -
     generator = torch_generator((seed,), "cpu")
     looks = draw_starts(data, 200, 1, (seed,))
     starts = begin(data, looks, driver.expert, "cpu")
-    return imagine(driver, VirtualWorld(model, RING, "", generator), starts, 23, generator)
+    return imagine(driver, VirtualDynamics(model, RING, "", generator), starts, 23, generator)
 
 
 def test_the_same_seed_gives_the_same_bits(
@@ -266,7 +265,7 @@ def test_drives_on_a_gpu_as_on_the_processor(
     found = []
     for device in ("cpu", "cuda"):
         generator = torch_generator((1,), device)
-        world = VirtualWorld(model.to(device), RING, "", generator, noise=False)
+        world = VirtualDynamics(model.to(device), RING, "", generator, noise=False)
         found.append(imagine(driver, world, begin(data, data.looks(), driver.expert, device), 20, None))
     model.to("cpu")
     assert_close(found[1].rewards.cpu(), found[0].rewards, atol=1e-3, rtol=1e-3)

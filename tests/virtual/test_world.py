@@ -18,7 +18,7 @@ from unjam.scenarios import Ring
 from unjam.virtual.base import base_reward, base_step
 from unjam.virtual.model import NUMBERS, TARGETS, EnvironmentModel, torch_generator
 from unjam.virtual.settings import VirtualSettings
-from unjam.virtual.world import BOUNDS, VirtualWorld, reward_on_tensors
+from unjam.virtual.world import BOUNDS, VirtualDynamics, reward_on_tensors
 from unjam.worlds.reward import Outcome, make_reward
 
 RING = Ring()
@@ -43,8 +43,8 @@ def some_state(rows: int, seed: int = 1) -> LocalState:
     return LocalState(*(torch.tensor(v).float() for v in random_state(np.random.default_rng(seed), rows)))
 
 
-def world(of: EnvironmentModel, noise: bool = False, ring: Ring = RING, seed: int = 3) -> VirtualWorld:
-    return VirtualWorld(of, ring, "", torch_generator((seed,), "cpu"), noise)
+def world(of: EnvironmentModel, noise: bool = False, ring: Ring = RING, seed: int = 3) -> VirtualDynamics:
+    return VirtualDynamics(of, ring, "", torch_generator((seed,), "cpu"), noise)
 
 
 @pytest.mark.parametrize("ring", [RING, replace(RING, simulation_step=0.2, steps_per_decision=5)])

@@ -19,7 +19,7 @@ from unjam.drivers import (
     ResidualDriver,
 )
 from unjam.drivers.from_file import FileDriver
-from unjam.drivers.local_state import local_vector
+from unjam.drivers.observation import local_vector
 from unjam.errors import EpisodeError, InputError
 from unjam.scenarios import Ring
 from unjam.worlds.drive import run_episode

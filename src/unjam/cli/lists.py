@@ -85,8 +85,8 @@ def _draw(scenario: Any, name: str, path: Path) -> None:
     from unjam.files import check_folder, write_whole
     from unjam.reports.road_picture import draw_road
     from unjam.scenarios.road import ClosedRoad
+    from unjam.worlds.sumo import make_traffic
     from unjam.worlds.sumo.simulation import Simulation
-    from unjam.worlds.sumo.stepping import make_traffic
 
     check_folder(path)
     with Simulation() as simulation:
@@ -104,7 +104,7 @@ def _draw(scenario: Any, name: str, path: Path) -> None:
 
 
 def _common_facts(scenario: Any) -> list[tuple[str, str]]:
-    from unjam.drivers.local_state import OBSERVED
+    from unjam.drivers.observation import FEATURES
 
     step = scenario.simulation_step
     return [
@@ -115,7 +115,7 @@ def _common_facts(scenario: Any) -> list[tuple[str, str]]:
         ),
         ("people", scenario.people_in_words),
         ("action", f"acceleration within ±{scenario.action_limit:g} m/s2, {scenario.actuation}"),
-        ("observation", "; ".join(map(str, OBSERVED["local"]))),
+        ("observation", "; ".join(map(str, FEATURES["local"].numbers or ()))),
         ("reward", scenario.reward),
     ]
 

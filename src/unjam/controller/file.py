@@ -15,8 +15,9 @@ from unjam import __version__
 from unjam.controller.archive import MANIFEST, WEIGHTS, pack_parts, unpack_parts
 from unjam.controller.manifest import FORMAT, READABLE, description
 from unjam.drivers.driver import Driver
+from unjam.drivers.observation import observation_size
 from unjam.drivers.registry import driver_from_recipe, files_of, recipe_of
-from unjam.drivers.residual import ResidualDriver, observation_size
+from unjam.drivers.residual import ResidualDriver
 from unjam.errors import InputError
 from unjam.files import to_json
 

@@ -6,8 +6,9 @@ import numpy as np
 
 from unjam.drivers.driver import Driver
 from unjam.drivers.local_state import STATE_UNITS
-from unjam.drivers.mixed import Mixed
-from unjam.drivers.residual import ResidualDriver, observed
+from unjam.drivers.observation import observed
+from unjam.drivers.residual import ResidualDriver
+from unjam.drivers.wrappers import Mixed
 
 FORMAT = 2
 """schema version of the manifest"""

@@ -7,8 +7,8 @@ from pathlib import Path
 from unjam.controller.file import SUFFIX, load_controller
 from unjam.drivers.driver import Driver
 from unjam.drivers.from_file import is_file_reference
-from unjam.drivers.mixed import Mixed
 from unjam.drivers.registry import DRIVERS, named_driver
+from unjam.drivers.wrappers import Mixed
 from unjam.errors import wrong_name
 
 SHIPPED = "unjam:"

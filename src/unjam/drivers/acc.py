@@ -19,6 +19,7 @@ class ACC(Driver):
     48:285-300, Eq. 4 and 5.
     """
 
+    name: ClassVar[str] = "acc"
     plain_numbers: ClassVar[bool] = True
     tensors: ClassVar[bool] = True
 
@@ -51,6 +52,7 @@ class LACC(Driver):
     `LACController`, which also subtracts a vehicle length from the gap (here `standstill_gap`).
     """
 
+    name: ClassVar[str] = "lacc"
     plain_numbers: ClassVar[bool] = True
     tensors: ClassVar[bool] = True
 

@@ -18,6 +18,7 @@ class BCM(Driver):
     Source: Horn and Wang 2017, IEEE Trans. Intell. Transp. Syst. 19(10); defaults as Flow's `BCMController`.
     """
 
+    name: ClassVar[str] = "bcm"
     plain_numbers: ClassVar[bool] = True
     tensors: ClassVar[bool] = True
 

@@ -7,6 +7,7 @@ import numpy as np
 from unjam.drivers.driver import Memory
 from unjam.drivers.local_state import LocalState
 from unjam.errors import InputError
+from unjam.tree import leaves, mapped
 
 TOLERANCE = 1e-12
 
@@ -44,7 +45,7 @@ def check_driver(driver: Any, rows: int = 8, steps: int = 50, seed: int = 0) -> 
         if not np.array_equal(acceleration, again):
             raise InputError(f"driver: step {step}: the same state and memory gave another acceleration")
         for row in range(rows):
-            one = LocalState(*(values[row : row + 1] for values in state))
+            one = state.each(lambda values: values[row : row + 1])  # noqa: B023
             alone, single[row] = driver.act(one, single[row])
             if not abs(float(np.asarray(alone)[0]) - float(acceleration[row])) <= TOLERANCE:
                 raise InputError(
@@ -76,10 +77,11 @@ def random_state(generator: np.random.Generator, rows: int) -> LocalState:
 
 
 def _copy(memory: Memory) -> Memory:
-    return {key: np.array(value) for key, value in memory.items()}
+    return mapped(np.array, memory)
 
 
 def _equal(memory: Memory, other: Memory) -> bool:
-    return memory.keys() == other.keys() and all(
-        np.array_equal(np.asarray(memory[key]), other[key], equal_nan=True) for key in memory
+    found, before = dict(leaves(memory)), dict(leaves(other))
+    return found.keys() == before.keys() and all(
+        np.array_equal(np.asarray(found[path]), before[path], equal_nan=True) for path in found
     )

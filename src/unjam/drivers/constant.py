@@ -14,6 +14,7 @@ from unjam.physics.arrays import Array
 class Constant(Driver):
     """Asks for the same acceleration in every step; only the shield keeps it from the car ahead."""
 
+    name: ClassVar[str] = "constant"
     plain_numbers: ClassVar[bool] = True
     tensors: ClassVar[bool] = True
 

@@ -1,13 +1,42 @@
-"""What a driver is."""
+"""What a driver is: it decides what its vehicles shall do, from what they perceive and what it remembers."""
 
 from array import array
-from typing import Any, ClassVar
+from collections.abc import Callable
+from dataclasses import asdict, fields, is_dataclass
+from typing import Any, ClassVar, NamedTuple
 
+import numpy as np
+
+from unjam.drivers.command import Command
 from unjam.drivers.local_state import LocalState, Observed
 from unjam.physics.arrays import Array
+from unjam.tree import Arrays, mapped
 
 Memory = dict[str, Any]
-"""What a driver remembers from one step to the next: arrays whose first axis is the CAV's row."""
+"""What a driver remembers from one decision to the next: arrays whose first axis is the CAV's row, by name. A
+driver that holds another one keeps that one's memory within its own."""
+
+Recipe = dict[str, Any]
+"""What a driver is made from, as JSON; the weights of its networks travel beside it as arrays."""
+
+Noise = Callable[[], Array]
+"""answers standard normal noise, one number for each row, for one look of a network"""
+
+
+class Decision(NamedTuple):
+    """One decision, taken apart; every array has a row per CAV, plain numbers have none."""
+
+    command: Command
+    """what is asked for"""
+    expert: Array
+    """the expert's share of the acceleration, within the limits [m/s2], shape (n,)"""
+    residual: Array
+    """the network's share with its exploration noise, not limited [m/s2], shape (n,); zero without one"""
+    observation: Array | None
+    """what the network saw, shape (n, inputs); empty for a single CAV whose residual is being held; None
+    without a network"""
+    memory: Memory
+    """after the decision"""
 
 
 class Driver:
@@ -20,6 +49,9 @@ class Driver:
     Your own driver need not inherit from this class; `act` and `initial_memory` are enough, and a plain
     function `state -> acceleration` does where nothing is remembered. `unjam.check_driver` tests it.
     """
+
+    name: ClassVar[str] = ""
+    """what `--driver` calls it; empty where it cannot be named"""
 
     plain_numbers: ClassVar[bool] = False
     """True where `act` also takes a single CAV in plain numbers (see `single_row` for its memory): it then
@@ -38,6 +70,9 @@ class Driver:
     native: ClassVar[bool] = False
     """True where the simulator itself drives (a human driver): `act` is then not asked."""
 
+    hold: int = 1
+    """decisions for which one residual is held"""
+
     def initial_memory(self, n: int) -> Memory:
         """Return the memory of `n` CAVs before their first step: NumPy arrays of shape (n, ...)."""
         return {}
@@ -52,17 +87,67 @@ class Driver:
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
         """Return the wanted acceleration [m/s2], shape (n,), and the memory after this step.
 
-        The road clips the acceleration to its action limit. `state` and `memory` are left as they are.
+        The road keeps the acceleration within its limits. `state` and `memory` are left as they are.
         """
         raise NotImplementedError
+
+    def decide(self, state: LocalState, memory: Memory, noise: Noise | None = None) -> Decision:
+        """Return the decision taken apart; with `noise`, what was learned explores."""
+        acceleration, after = self.act(state, memory)
+        return Decision(Command(acceleration), acceleration, 0.0, None, after)
+
+    def observation(self, state: LocalState, memory: Memory) -> Array | None:
+        """Return what a network would see now, (n, inputs), whether or not it is asked; None without one."""
+        return None
 
     def memory_features(self, memory: Memory) -> Array | None:
         """Return what a residual network may see of `memory`, (n, m), about unit size; None: nothing."""
         return None
 
+    # What a driver says of itself: to the registry, to workers, to the file that is shipped.
+
+    @property
+    def inner(self) -> dict[str, "Driver"]:
+        """The drivers that it holds, by what the weights of their networks are prefixed with."""
+        return {}
+
+    def describe(self) -> str:
+        """Return it in a few words: its name and the parameters that differ from the defaults."""
+        if not self.name:
+            return type(self).__name__
+        default = {field.name: field.default for field in fields(self)}  # pyright: ignore[reportArgumentType]
+        parameters = self.recipe()["parameters"]
+        changed = {
+            key: value for key, value in parameters.items() if value != default[key] and key != "time_step"
+        }
+        return ":".join([self.name, *listed(changed)])
+
+    def recipe(self) -> Recipe:
+        """Return what it is made from; its networks' weights are `arrays`."""
+        parameters = asdict(self) if is_dataclass(self) else {}
+        return {"kind": "named", "name": self.name, "parameters": parameters}
+
+    def arrays(self) -> Arrays:
+        """Return the weights of its networks, those of the drivers that it holds with their prefix."""
+        return {
+            f"{prefix}{key}": array
+            for prefix, held in self.inner.items()
+            for key, array in held.arrays().items()
+        }
+
+
+def listed(parameters: dict[str, Any]) -> list[str]:
+    """Return parameters as `key=value,key=value` in a list of one; empty where there are none."""
+    return [",".join(f"{key}={value}" for key, value in parameters.items())] if parameters else []
+
 
 def single_row(memory: Memory) -> Memory:
     """Return the memory of one CAV in plain numbers: floats, and Python's own arrays of them."""
-    return {
-        key: value[0].item() if value.ndim == 1 else array("d", value[0]) for key, value in memory.items()
-    }
+    return mapped(lambda rows: rows[0].item() if rows.ndim == 1 else array("d", rows[0]), memory)
+
+
+def carried(memory: Memory, kept: Any, newcomers: Memory, new: int) -> Memory:
+    """Return the rows `kept` of a memory and, behind them, the last `new` of `newcomers`."""
+    if not new:
+        return mapped(lambda rows: rows[kept], memory)
+    return mapped(lambda rows, fresh: np.concatenate([rows[kept], fresh[-new:]]), memory, newcomers)

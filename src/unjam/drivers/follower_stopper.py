@@ -22,6 +22,7 @@ class FollowerStopper(Driver):
     Source: Stern et al. 2018, Transp. Res. C 89:205-221, section 3.1.
     """
 
+    name: ClassVar[str] = "follower-stopper"
     plain_numbers: ClassVar[bool] = True
     tensors: ClassVar[bool] = True
 

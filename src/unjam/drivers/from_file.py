@@ -1,8 +1,9 @@
-"""Drivers and rewards in the user's own Python file, given as `path.py:name`.
+"""What users bring in their own Python files, given as `path.py:name`: drivers, features, rewards.
 
 Such a file is code and is run as such: use only files that you trust.
 """
 
+import hashlib
 import importlib.util
 import inspect
 import sys
@@ -14,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from unjam.drivers.driver import Driver, Memory
+from unjam.drivers.driver import Driver, Memory, Recipe, listed
 from unjam.drivers.local_state import LocalState
 from unjam.errors import InputError
 from unjam.physics.arrays import Array
@@ -25,39 +26,75 @@ def is_file_reference(text: str) -> bool:
     return ".py:" in text
 
 
-def load_object(path: Path, name: str) -> Any:
-    """Return the object `name` of the Python file at `path`, running the file.
+@dataclass(frozen=True)
+class FileReference:
+    """A name in a Python file."""
 
-    Raises:
-        InputError: the file is missing or fails when run, or has no such name.
-    """
-    path = path.resolve()
-    if not path.is_file():
-        raise InputError(f"driver file: {str(path)!r} is not a file")
-    module_name = f"unjam_user_{path.stem}_{abs(hash(str(path))):x}"
-    spec = importlib.util.spec_from_file_location(module_name, path)
-    if spec is None or spec.loader is None:
-        raise InputError(f"driver file: {str(path)!r} is not a Python file")
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[module_name] = module
-    sys.path.insert(0, str(path.parent))  # so that the file may import its neighbours
-    try:
-        spec.loader.exec_module(module)
-    except Exception as error:  # whatever the user's code raises is the user's to mend
-        raise InputError(f"{path.name}: {type(error).__name__} when loading it: {error}") from error
-    finally:
-        sys.path.remove(str(path.parent))
-    if not hasattr(module, name):
-        public = ", ".join(key for key in vars(module) if not key.startswith("_")) or "nothing"
-        raise InputError(f"{path.name}: has no {name!r}; it has: {public}")
-    return getattr(module, name)
+    path: Path
+    """resolved"""
+    name: str
 
+    @classmethod
+    def of(cls, text: str) -> "FileReference":
+        """Return what `path.py:name` refers to."""
+        path, _, name = text.rpartition(":")
+        return cls(Path(path).resolve(), name)
 
-def user_error(error: Exception, path: Path, name: str) -> InputError:
-    """Return what went wrong in `name` of the user's file, with the last line of that file that ran."""
-    lines = [str(frame.lineno) for frame in extract_tb(error.__traceback__) if frame.filename == str(path)]
-    place = f" (line {lines[-1]})" if lines else ""
-    return InputError(f"{path.name}:{name}: {type(error).__name__}: {error}{place}")
+    def __str__(self) -> str:
+        return f"{self.path.name}:{self.name}"
+
+    def recipe(self) -> Recipe:
+        """Return where the code is, and its hash."""
+        sha256 = hashlib.sha256(self.path.read_bytes()).hexdigest()
+        return {"kind": "file", "path": str(self.path), "name": self.name, "sha256": sha256}
+
+    def load(self) -> Any:
+        """Return what has the name, running the file.
+
+        Raises:
+            InputError: the file is missing or fails when run, or has no such name.
+        """
+        path = self.path
+        if not path.is_file():
+            raise InputError(f"driver file: {str(path)!r} is not a file")
+        module_name = f"unjam_user_{path.stem}_{abs(hash(str(path))):x}"
+        spec = importlib.util.spec_from_file_location(module_name, path)
+        if spec is None or spec.loader is None:
+            raise InputError(f"driver file: {str(path)!r} is not a Python file")
+        module = importlib.util.module_from_spec(spec)
+        sys.modules[module_name] = module
+        sys.path.insert(0, str(path.parent))  # so that the file may import its neighbours
+        try:
+            spec.loader.exec_module(module)
+        except Exception as error:  # whatever the user's code raises is the user's to mend
+            raise InputError(f"{path.name}: {type(error).__name__} when loading it: {error}") from error
+        finally:
+            sys.path.remove(str(path.parent))
+        if not hasattr(module, self.name):
+            public = ", ".join(key for key in vars(module) if not key.startswith("_")) or "nothing"
+            raise InputError(f"{path.name}: has no {self.name!r}; it has: {public}")
+        return getattr(module, self.name)
+
+    def function(self, of: str) -> Callable[..., Any]:
+        """Return the function of that name, which takes `of`; raise `InputError` where it is none."""
+        found = self.load()
+        if not callable(found) or inspect.isclass(found):
+            raise InputError(f"{self}: is not a function of {of}")
+        return found
+
+    def ask(self, function: Callable[..., Any], *arguments: Any) -> Any:
+        """Return what the user's function answers.
+
+        Raises:
+            InputError: it fails; with the last line of the file that ran.
+        """
+        try:
+            return function(*arguments)
+        except Exception as error:
+            frames = extract_tb(error.__traceback__)
+            lines = [str(frame.lineno) for frame in frames if frame.filename == str(self.path)]
+            place = f" (line {lines[-1]})" if lines else ""
+            raise InputError(f"{self}: {type(error).__name__}: {error}{place}") from error
 
 
 @dataclass(frozen=True)
@@ -65,18 +102,22 @@ class FileDriver(Driver):
     """The driver `name` of the user's file: a function of the state, a class, or an instance of one."""
 
     path: Path
-    name: str
+    name: str  # pyright: ignore[reportIncompatibleVariableOverride]
     parameters: dict[str, Any] = field(default_factory=dict)
     time_step: float = 0.1
-    inner: Any = field(init=False, repr=False, compare=False)
+    held: Any = field(init=False, repr=False, compare=False)
+    """what the file has, as a driver"""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "path", self.path.resolve())
-        object.__setattr__(self, "inner", self._build())
+        object.__setattr__(self, "held", self._build())
+
+    @property
+    def _reference(self) -> FileReference:
+        return FileReference(self.path, self.name)
 
     def _build(self) -> Any:
-        found = load_object(self.path, self.name)
-        where = f"{self.path.name}:{self.name}"
+        found, where = self._reference.load(), self._reference
         if inspect.isclass(found):
             arguments = dict(self.parameters)
             if "time_step" in inspect.signature(found).parameters:
@@ -97,11 +138,11 @@ class FileDriver(Driver):
 
     def initial_memory(self, n: int) -> Memory:
         """Return what the user's driver remembers before its first step."""
-        return self.inner.initial_memory(n)
+        return self.held.initial_memory(n)
 
     def recall(self, memory: Memory, history: LocalState) -> Memory:
         """Return what the user's driver makes of the warm-up, if it has `recall`."""
-        recall = getattr(self.inner, "recall", None)
+        recall = getattr(self.held, "recall", None)
         return recall(memory, history) if recall else memory
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
@@ -111,15 +152,20 @@ class FileDriver(Driver):
         """
         if np.size(state.speed) == 0:
             return np.zeros(0), memory
-        try:
-            return self.inner.act(state, memory)
-        except Exception as error:
-            raise user_error(error, self.path, self.name) from error
+        return self._reference.ask(self.held.act, state, memory)
 
     def memory_features(self, memory: Memory) -> Array | None:
         """Return the user's features of the memory, if the driver has any."""
-        features = getattr(self.inner, "memory_features", None)
+        features = getattr(self.held, "memory_features", None)
         return features(memory) if features else None
+
+    def describe(self) -> str:
+        """Return the names of file and driver, and the parameters that were given."""
+        return ":".join([str(self._reference), *listed(self.parameters)])
+
+    def recipe(self) -> Recipe:
+        """Return where the code is, and its hash."""
+        return {**self._reference.recipe(), "parameters": self.parameters, "time_step": self.time_step}
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,7 @@ class IDM(IDMParameters, Driver):
     Source: Treiber, Hennecke, Helbing 2000; paper Eq. 5-6 with the parameters of Table B1.
     """
 
+    name: ClassVar[str] = "idm"
     plain_numbers: ClassVar[bool] = True
     tensors: ClassVar[bool] = True
 
@@ -37,6 +38,7 @@ class Human(Driver):
     With this driver the traffic is all-human. It is the simulator that drives.
     """
 
+    name: ClassVar[str] = "human"
     native: ClassVar[bool] = True
     plain_numbers: ClassVar[bool] = True
     tensors: ClassVar[bool] = True

@@ -28,6 +28,7 @@ class JamAbsorber(Driver):
     out": Nishi et al. 2013, Transp. Res. B 50:116-129.
     """
 
+    name: ClassVar[str] = "jam-absorber"
     plain_numbers: ClassVar[bool] = True
     tensors: ClassVar[bool] = True
     observed_memory: ClassVar[tuple[Observed, ...]] = (Observed("it waits for a jam to go", 1.0, ""),)

@@ -18,6 +18,7 @@ class OVM(Driver):
     Source: Bando et al. 1995, Phys. Rev. E 51:1035, with relative speed; defaults as Flow's `OVMController`.
     """
 
+    name: ClassVar[str] = "ovm"
     plain_numbers: ClassVar[bool] = True
     tensors: ClassVar[bool] = True
 

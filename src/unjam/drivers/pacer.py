@@ -28,6 +28,7 @@ class Pacer(Driver):
     pace that varies over the lap. It must know where it is on the road.
     """
 
+    name: ClassVar[str] = "pacer"
     plain_numbers: ClassVar[bool] = True
     tensors: ClassVar[bool] = True
     needs_loop: ClassVar[bool] = True

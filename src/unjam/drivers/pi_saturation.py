@@ -24,6 +24,7 @@ class PISaturation(Driver):
     Source: Stern et al. 2018, Transp. Res. C 89:205-221; paper Eq. 9-11.
     """
 
+    name: ClassVar[str] = "pi"
     plain_numbers: ClassVar[bool] = True
     tensors: ClassVar[bool] = True
     observed_memory: ClassVar[tuple[Observed, ...]] = (

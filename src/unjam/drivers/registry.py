@@ -1,7 +1,7 @@
-"""All drivers by name, and how a driver is written down so that another process can make it again."""
+"""All drivers by name, and every driver from how it is written down, so that another process can make it."""
 
-import hashlib
-from dataclasses import asdict, fields, is_dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import fields
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -12,20 +12,21 @@ from pydantic.dataclasses import dataclass
 from unjam.drivers.acc import ACC, LACC
 from unjam.drivers.bilateral import BCM
 from unjam.drivers.constant import Constant
-from unjam.drivers.driver import Driver
+from unjam.drivers.driver import Driver, Recipe
 from unjam.drivers.follower_stopper import FollowerStopper
-from unjam.drivers.from_file import FileDriver, is_file_reference
+from unjam.drivers.from_file import FileDriver, FileReference, is_file_reference
 from unjam.drivers.idm import IDM, Human
 from unjam.drivers.jam_absorber import JamAbsorber
-from unjam.drivers.local_state import ObservationPart
-from unjam.drivers.mixed import Mixed
-from unjam.drivers.network import network_arrays, network_from_arrays
+from unjam.drivers.network import network_from_arrays
+from unjam.drivers.observation import FeatureName
 from unjam.drivers.ovm import OVM
 from unjam.drivers.pacer import Pacer
 from unjam.drivers.pi_saturation import PISaturation
 from unjam.drivers.residual import ResidualDriver
+from unjam.drivers.wrappers import Impaired, Mixed
 from unjam.errors import wrong
-from unjam.parameters import STRICT, Count, NotNegative, Positive, build, parse_assignments
+from unjam.parameters import STRICT, Count, NotNegative, Positive, build, split_parameters
+from unjam.tree import Arrays
 
 DRIVERS: dict[str, type[Driver]] = {
     "human": Human,
@@ -41,34 +42,12 @@ DRIVERS: dict[str, type[Driver]] = {
     "constant": Constant,
 }
 
-Recipe = dict[str, Any]
-"""What a driver is made from, as JSON; the weights of its networks travel beside it as arrays."""
-
 
 def driver_names() -> str:
     """Return what `--driver` allows, for messages."""
     return ", ".join(
         [*DRIVERS, "path.py:name", "a run folder", "a .unjam file", "unjam:ring-best", "several joined by +"]
     )
-
-
-def split_parameters(text: str) -> tuple[str, dict[str, Any]]:
-    """Split `name:key=value,key=value` (or `path.py:name:key=value`) into the name and the parameters."""
-    head, _, tail = text.rpartition(":")
-    if not head or "=" not in tail:
-        return text, {}
-    return head, parse_assignments(_split_commas(tail), "driver")
-
-
-def _split_commas(text: str) -> list[str]:
-    """Split at commas outside brackets: `gaps=[1,2,3],window=38` has two parts."""
-    parts, depth, start = [], 0, 0
-    for index, letter in enumerate(text):
-        depth += (letter in "[(") - (letter in "])")
-        if letter == "," and depth == 0:
-            parts.append(text[start:index])
-            start = index + 1
-    return [*parts, text[start:]]
 
 
 def named_driver(text: str, time_step: float) -> Driver:
@@ -81,8 +60,8 @@ def named_driver(text: str, time_step: float) -> Driver:
     """
     name, parameters = split_parameters(text)
     if is_file_reference(name):
-        path, _, attribute = name.rpartition(":")
-        return FileDriver(Path(path), attribute, parameters, time_step)
+        reference = FileReference.of(name)
+        return FileDriver(reference.path, reference.name, parameters, time_step)
     if name not in DRIVERS:
         raise wrong("driver", name, driver_names())
     return _make(name, parameters, time_step)
@@ -90,7 +69,7 @@ def named_driver(text: str, time_step: float) -> Driver:
 
 def _make(name: str, parameters: dict[str, Any], time_step: float) -> Driver:
     kind = DRIVERS[name]
-    if is_dataclass(kind) and any(field.name == "time_step" for field in fields(kind)):
+    if any(field.name == "time_step" for field in fields(kind)):  # pyright: ignore[reportArgumentType]
         parameters = {"time_step": time_step, **parameters}
     return build(kind, parameters, f"driver {name}")
 
@@ -102,114 +81,110 @@ class _ResidualRecipe:
     kind: Literal["residual"]
     expert: dict[str, Any]
     action_limit: Positive
-    parts: Annotated[tuple[ObservationPart, ...], Field(min_length=1)]
+    parts: Annotated[tuple[FeatureName, ...], Field(min_length=1)]
     hold: Count
     authority: Positive
     exploration_std: NotNegative
+    files: list[dict[str, Any]] = Field(default_factory=list)
 
 
-def recipe_of(driver: Driver, prefix: str = "") -> tuple[Recipe, dict[str, np.ndarray]]:
-    """Return the recipe of a driver and the arrays of its networks; `driver_from_recipe` undoes it."""
-    if isinstance(driver, ResidualDriver):
-        expert, arrays = recipe_of(driver.expert, f"{prefix}expert.")
-        network = {f"{prefix}{name}": array for name, array in network_arrays(driver.network).items()}
-        recipe = {
-            "kind": "residual",
-            "expert": expert,
-            "action_limit": driver.action_limit,
-            "parts": list(driver.parts),
-            "hold": driver.hold,
-            "authority": driver.network.authority,
-            "exploration_std": driver.network.exploration_std,
-        }
-        return recipe, {**arrays, **network}
-    if isinstance(driver, Mixed):
-        parts = [recipe_of(part, f"{prefix}{number}.") for number, part in enumerate(driver.drivers)]
-        arrays = {name: array for _, own in parts for name, array in own.items()}
-        return {"kind": "mixed", "drivers": [recipe for recipe, _ in parts]}, arrays
-    if isinstance(driver, FileDriver):
-        recipe = {
-            "kind": "file",
-            "path": str(driver.path),
-            "name": driver.name,
-            "sha256": hashlib.sha256(driver.path.read_bytes()).hexdigest(),
-            "parameters": driver.parameters,
-            "time_step": driver.time_step,
-        }
-        return recipe, {}
-    for name, kind in DRIVERS.items():
-        if type(driver) is kind:
-            return {"kind": "named", "name": name, "parameters": asdict(driver)}, {}  # pyright: ignore[reportArgumentType]
-    raise wrong("driver", type(driver).__name__, f"{driver_names()} (put your class in a file: path.py:name)")
+def _named(recipe: Recipe, arrays: Arrays, prefix: str) -> Driver:
+    if recipe["name"] not in DRIVERS:
+        raise wrong("driver recipe", recipe["name"], ", ".join(DRIVERS))
+    return build(DRIVERS[recipe["name"]], recipe["parameters"], f"driver {recipe['name']}")
+
+
+def _from_file(recipe: Recipe, arrays: Arrays, prefix: str) -> Driver:
+    return FileDriver(Path(recipe["path"]), recipe["name"], recipe["parameters"], recipe["time_step"])
+
+
+def _mixed(recipe: Recipe, arrays: Arrays, prefix: str) -> Driver:
+    parts = enumerate(recipe["drivers"])
+    return Mixed(tuple(driver_from_recipe(part, arrays, f"{prefix}{number}.") for number, part in parts))
+
+
+def _impaired(recipe: Recipe, arrays: Arrays, prefix: str) -> Driver:
+    worse = {key: float(recipe[key]) for key in ("delay", "gap_noise", "time_step")}
+    return Impaired(driver_from_recipe(recipe["driver"], arrays, f"{prefix}inner."), **worse)
+
+
+def _residual(recipe: Recipe, arrays: Arrays, prefix: str) -> Driver:
+    found, expert = build(_ResidualRecipe, recipe, "driver recipe"), f"{prefix}expert."
+    own = {
+        name.removeprefix(prefix): array
+        for name, array in arrays.items()
+        if name.startswith(prefix) and not name.startswith(expert)
+    }
+    return ResidualDriver(
+        driver_from_recipe(found.expert, arrays, expert),
+        network_from_arrays(own, found.authority, found.exploration_std),
+        found.action_limit,
+        found.parts,
+        found.hold,
+    )
+
+
+RECIPES: dict[str, Callable[[Recipe, Arrays, str], Driver]] = {
+    "named": _named,
+    "file": _from_file,
+    "residual": _residual,
+    "mixed": _mixed,
+    "impaired": _impaired,
+}
+"""how each kind of recipe becomes a driver again, the prefix being that of its networks' weights"""
+
+
+def recipe_of(driver: Driver) -> tuple[Recipe, Arrays]:
+    """Return the recipe of a driver and the arrays of its networks; `driver_from_recipe` undoes it.
+
+    Raises:
+        InputError: no other process could make such a driver.
+    """
+    recipe = driver.recipe()
+    for part in _within(recipe):
+        if part["kind"] == "named" and not part["name"]:
+            allowed = f"{driver_names()} (put your class in a file: path.py:name)"
+            raise wrong("driver", type(driver).__name__, allowed)
+    return recipe, driver.arrays()
+
+
+def driver_from_recipe(recipe: Recipe, arrays: Arrays, prefix: str = "") -> Driver:
+    """Return the driver that `recipe_of` wrote down; raise `InputError` where the recipe is not valid."""
+    kind = recipe.get("kind") if isinstance(recipe, dict) else recipe
+    if kind not in RECIPES:
+        raise wrong("driver recipe", kind, ", ".join(RECIPES))
+    return RECIPES[kind](recipe, arrays, prefix)
 
 
 def files_of(recipe: Any) -> list[Recipe]:
-    """Return the recipes of the users' own files within `recipe`: their drivers are Python code."""
-    if not isinstance(recipe, dict):
-        return []
-    parts = recipe.get("drivers", [])
-    inner = [recipe.get("expert"), *(parts if isinstance(parts, list) else [])]
-    own = [recipe] if recipe.get("kind") == "file" else []
-    return own + [found for part in inner for found in files_of(part)]
+    """Return what within `recipe` refers to the users' own files: it is Python code."""
+    return [part for part in _within(recipe) if part["kind"] == "file"]
 
 
-def driver_from_recipe(recipe: Recipe, arrays: dict[str, np.ndarray], prefix: str = "") -> Driver:
-    """Return the driver that `recipe_of` wrote down; raise `InputError` where the recipe is not valid."""
-    kind = recipe.get("kind") if isinstance(recipe, dict) else recipe
-    if kind == "named" and recipe["name"] in DRIVERS:
-        return build(DRIVERS[recipe["name"]], recipe["parameters"], f"driver {recipe['name']}")
-    if kind == "file":
-        return FileDriver(Path(recipe["path"]), recipe["name"], recipe["parameters"], recipe["time_step"])
-    if kind == "mixed":
-        parts = enumerate(recipe["drivers"])
-        made = (driver_from_recipe(part, arrays, f"{prefix}{number}.") for number, part in parts)
-        return Mixed(tuple(made))
-    if kind == "residual":
-        expert_prefix = f"{prefix}expert."
-        own = {
-            name.removeprefix(prefix): array
-            for name, array in arrays.items()
-            if name.startswith(prefix) and not name.startswith(expert_prefix)
-        }
-        found = build(_ResidualRecipe, recipe, "driver recipe")
-        return ResidualDriver(
-            driver_from_recipe(found.expert, arrays, expert_prefix),
-            network_from_arrays(own, found.authority, found.exploration_std),
-            found.action_limit,
-            found.parts,
-            found.hold,
-        )
-    raise wrong("driver recipe", kind, "named, file, residual, mixed")
+def _within(recipe: Any) -> Iterator[Recipe]:
+    """Yield a recipe and all that it holds."""
+    if isinstance(recipe, dict):
+        if "kind" in recipe:
+            yield recipe
+        for part in recipe.values():
+            yield from _within(part)
+    elif isinstance(recipe, list):
+        for part in recipe:
+            yield from _within(part)
 
 
 def describe(driver: Driver) -> str:
-    """Return a driver in a few words: its name and the parameters that differ from the defaults."""
-    if isinstance(driver, ResidualDriver):
-        return f"{describe(driver.expert)} + residual"
-    if isinstance(driver, Mixed):
-        return "+".join(map(describe, driver.drivers))
-    if isinstance(driver, FileDriver):
-        return ":".join([driver.path.name, driver.name, *_listed(driver.parameters)])
-    recipe, _ = recipe_of(driver)
-    default = {field.name: field.default for field in fields(driver)}  # pyright: ignore[reportArgumentType]
-    changed = {
-        key: value
-        for key, value in recipe["parameters"].items()
-        if value != default[key] and key != "time_step"
-    }
-    return ":".join([recipe["name"], *_listed(changed)])
-
-
-def _listed(parameters: dict[str, Any]) -> list[str]:
-    return [",".join(f"{key}={value}" for key, value in parameters.items())] if parameters else []
+    """Return a driver in a few words."""
+    return driver.describe()
 
 
 def free_label(driver: Driver, taken: dict[str, Driver]) -> str:
     """Return the description of a driver, numbered where another driver has it already."""
-    label, number = describe(driver), 1
+    recipe_of(driver)  # what no worker could make has no place among others
+    label, number = driver.describe(), 1
     while label in taken and not _same(taken[label], driver):
         number += 1
-        label = f"{describe(driver)} ({number})"
+        label = f"{driver.describe()} ({number})"
     return label
 
 

@@ -9,21 +9,54 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from unjam.controller import make_driver
+from unjam.drivers.command import Command, Limits
 from unjam.drivers.constant import Constant
-from unjam.drivers.local_state import ObservationPart
-from unjam.drivers.residual import observation_size, observe
+from unjam.drivers.driver import Decision, Driver, Memory, Noise
+from unjam.drivers.local_state import LocalState
+from unjam.drivers.observation import FeatureName, Seen, observation_size, observe
 from unjam.errors import EpisodeError, UnjamError
-from unjam.physics.arrays import clip
 from unjam.scenarios.registry import make_scenario
+from unjam.worlds.drive import Drive
 from unjam.worlds.reward import Outcome, make_reward, time_headway
+from unjam.worlds.sumo import make_traffic
 from unjam.worlds.sumo.simulation import Backend, Simulation, libsumo_is_taken
-from unjam.worlds.sumo.stepping import make_traffic
 from unjam.worlds.sumo.traffic import Traffic
 
 Observations = NDArray[np.float32]
 
 LARGEST_OBSERVATION = 50.0
 """bound of every number of an observation; larger ones are cut"""
+
+
+class Outside(Driver):
+    """An expert to whose accelerations somebody outside adds: `actions`, set before each decision."""
+
+    def __init__(self, expert: Driver, names: Sequence[FeatureName], limits: Limits) -> None:
+        """Let `expert` drive within `limits`; features `names` are what is shown outside."""
+        self.expert, self.names, self.limits = expert, tuple(names), limits
+        self.actions: Any = np.zeros(0)
+        """[m/s2], shape (CAVs,)"""
+
+    def initial_memory(self, n: int) -> Memory:
+        """Return the expert's."""
+        return self.expert.initial_memory(n)
+
+    def recall(self, memory: Memory, history: LocalState) -> Memory:
+        """Return what the expert makes of the warm-up."""
+        return self.expert.recall(memory, history)
+
+    def observation(self, state: LocalState, memory: Memory) -> Any:
+        """Return what is shown outside now, shape (CAVs, numbers), and keep what the expert wants."""
+        wanted, self._after = self.expert.act(state, memory)
+        self._wanted = self.limits.keep(wanted)
+        return observe(self.names, Seen(state, self._wanted, self.expert, self._after))
+
+    def decide(self, state: LocalState, memory: Memory, noise: Noise | None = None) -> Decision:
+        """Return the sum of what the expert wanted when it was looked at and what was added since."""
+        if not len(state.speed):
+            return Decision(Command(np.zeros(0)), np.zeros(0), np.zeros(0), None, memory)
+        command = Command(self.limits.keep(self._wanted + self.actions))
+        return Decision(command, self._wanted, self.actions, None, self._after)
 
 
 @dataclass(frozen=True)
@@ -54,7 +87,7 @@ class SteppedRoad:
         changes: dict[str, Any],
         reward: str = "",
         expert: str = "",
-        observe_parts: Sequence[ObservationPart] = ("local",),
+        observe_parts: Sequence[FeatureName] = ("local",),
         backend: Backend = "libsumo",
     ) -> None:
         """Prepare a road; SUMO is opened by the first `reset`.
@@ -72,15 +105,15 @@ class SteppedRoad:
         """
         self.scenario = make_scenario(scenario, changes)
         self._reward = make_reward(reward or self.scenario.reward)
-        self._expert = make_driver(expert, self.scenario.decision_step) if expert else Constant()
-        self._parts = tuple(observe_parts)
+        driver = make_driver(expert, self.scenario.decision_step) if expert else Constant()
+        self._driver = Outside(driver, observe_parts, self.scenario.limits)
         self._backend: Backend = backend
         self._simulation: Simulation | None = None
         self._traffic: Traffic | None = None
+        self._numbers = observation_size(self._driver.names, driver)
         self._seed: int | None = None
         self._episodes = 0
         """started since that seed was given"""
-        self._numbers = observation_size(self._parts, self._expert)
 
     @property
     def observation_space(self) -> spaces.Box:
@@ -91,8 +124,8 @@ class SteppedRoad:
     @property
     def action_space(self) -> spaces.Box:
         """Of one CAV: acceleration [m/s2]."""
-        limit = np.full(1, self.scenario.action_limit, np.float32)
-        return spaces.Box(-limit, limit, dtype=np.float32)
+        low, high = (np.full(1, limit, np.float32) for limit in self.scenario.limits)
+        return spaces.Box(low, high, dtype=np.float32)
 
     def reset(self, seed: int | None, generator: np.random.Generator) -> Observations:
         """Start an episode, run its warm-up, and return the first observations.
@@ -106,10 +139,8 @@ class SteppedRoad:
         numbers = (self._seed, self._episodes) if self._episodes else (self._seed,)
         self._episodes += 1
         self._traffic = traffic = make_traffic(self.scenario, numbers, self._open())
-        history = traffic.start(controlled=True)
-        self._memory = self._expert.initial_memory(len(traffic.cavs))
-        if history is not None and self.scenario.recall_warmup:
-            self._memory = self._expert.recall(self._memory, history)
+        self._drive = Drive(traffic, self._driver)
+        self._decisions = iter(self._drive)
         self._await_cav()
         if not traffic.cavs:
             raise EpisodeError(f"no CAV entered the road in {traffic.decisions} decisions")
@@ -120,31 +151,28 @@ class SteppedRoad:
 
         Where nobody is left, the road goes on without CAVs until the next one enters.
         """
-        traffic, before = self.traffic, list(self.traffic.cavs)
-        limit = self.scenario.action_limit
-        applied = clip(self._wanted + np.asarray(actions, np.float64), -limit, limit)
-        traffic.advance(applied)
-        self._memory = traffic.carry(self._after, self._expert)
-        stayed, speeds, state = list(traffic.stayed), np.array(traffic.speeds), traffic.local_state()
-        headways = time_headway(state.leader_gap, state.speed)[: len(stayed)]
-        outcome = Outcome(speeds[None], applied[stayed][None], headways[None], np.array([traffic.crashed]))
+        traffic, before, seen = self.traffic, list(self.traffic.cavs), self._seen
+        self._driver.actions = np.asarray(actions, np.float64)
+        done = next(self._decisions)
+        assert done is not None
+        kept = range(len(before)) if traffic.kept is None else list(traffic.kept)
+        speeds, state = np.array(traffic.speeds), traffic.perceive()
+        headways = time_headway(state.leader_gap, state.speed)[: len(kept)]
+        applied = np.asarray(done.command.acceleration)[list(kept)]
+        outcome = Outcome(speeds[None], applied[None], headways[None], np.array([traffic.crashed]))
         terms = {name: float(values[0]) for name, values in self._reward(outcome).items()}
-        left = {name: self._seen[row] for row, name in enumerate(before) if row not in stayed}
+        left = {name: seen[row] for row, name in enumerate(before) if row not in kept}
         terminated = traffic.crashed
         self._await_cav()  # a crash of people meanwhile ends the episode, but is nobody's doing
-        truncated = not terminated and (self._ended() or traffic.crashed or not traffic.cavs)
+        truncated = not terminated and (traffic.ended or not traffic.cavs)
         observations = self._look()
         return Step(list(traffic.cavs), observations, left, sum(terms.values()), terms, terminated, truncated)
-
-    def _ended(self) -> bool:
-        return self.traffic.decisions >= self.scenario.horizon or self.traffic.over
 
     def _await_cav(self) -> None:
         """Let the road go on until a CAV is on it, or none will be before the episode ends."""
         traffic = self.traffic
-        while traffic.expects_cavs and not (traffic.cavs or self._ended() or traffic.crashed):
-            traffic.advance(np.zeros(0))
-            self._memory = traffic.carry(self._memory, self._expert)
+        while traffic.expects_cavs and not (traffic.cavs or traffic.ended):
+            next(self._decisions)
 
     @property
     def traffic(self) -> Traffic:
@@ -158,12 +186,8 @@ class SteppedRoad:
         return self._traffic
 
     def _look(self) -> Observations:
-        """Return what each CAV observes now, and keep what its expert wants."""
-        state = self.traffic.local_state()
-        limit = self.scenario.action_limit
-        wanted, self._after = self._expert.act(state, self._memory)
-        self._wanted = clip(wanted, -limit, limit)
-        seen = observe(self._parts, state, self._wanted, self._expert, self._after)
+        """Return what each CAV observes now."""
+        seen = self._driver.observation(self.traffic.perceive(), self._drive.memory)
         self._seen = seen.clip(-LARGEST_OBSERVATION, LARGEST_OBSERVATION).astype(np.float32)
         return self._seen
 

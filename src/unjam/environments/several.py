@@ -7,7 +7,7 @@ import numpy as np
 from gymnasium import spaces
 from pettingzoo import ParallelEnv
 
-from unjam.drivers.local_state import ObservationPart
+from unjam.drivers.observation import FeatureName
 from unjam.environments.road import SteppedRoad
 
 
@@ -26,7 +26,7 @@ class ParallelRoad(ParallelEnv[str, Any, Any]):
         scenario: str = "ring",
         reward: str = "",
         expert: str = "",
-        observe: Sequence[ObservationPart] = ("local",),
+        observe: Sequence[FeatureName] = ("local",),
         **changes: Any,
     ) -> None:
         """Prepare the environment; the arguments are those of `RoadEnv`."""

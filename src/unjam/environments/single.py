@@ -7,7 +7,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from unjam.drivers.local_state import ObservationPart
+from unjam.drivers.observation import FeatureName
 from unjam.environments.road import SteppedRoad
 from unjam.errors import InputError
 from unjam.reports.road_picture import draw_road
@@ -49,7 +49,7 @@ class RoadEnv(gymnasium.Env[Observation, Observation]):
         scenario: str = "ring",
         reward: str = "",
         expert: str = "",
-        observe: Sequence[ObservationPart] = ("local",),
+        observe: Sequence[FeatureName] = ("local",),
         render_mode: str | None = None,
         **changes: Any,
     ) -> None:

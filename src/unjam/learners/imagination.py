@@ -23,7 +23,7 @@ from unjam.virtual.model import EnvironmentModel, torch_generator
 from unjam.virtual.people import calibrated_people
 from unjam.virtual.rollout import Rollouts, begin, imagine, return_bound, rollout_length
 from unjam.virtual.settings import VirtualSettings
-from unjam.virtual.world import VirtualWorld
+from unjam.virtual.world import VirtualDynamics
 from unjam.worlds.record import Episode
 
 FIT, STARTS, NOISE, EXPLORATION = 2, 3, 4, 5
@@ -108,7 +108,7 @@ class Imagination:
         generator = np.random.default_rng(np.random.SeedSequence(list(seeds[0])))
         looks = looks[generator.integers(len(looks), size=count)]
         device = self.settings.device
-        world = VirtualWorld(
+        world = VirtualDynamics(
             self.model, self.scenario, self._reward, torch_generator(seeds[1], device), self.settings.noise
         )
         starts = begin(self.data, looks, self._expert, device)

@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
-from unjam.drivers.local_state import ObservationPart
+from unjam.drivers.observation import FeatureName
 from unjam.parameters import STRICT, Count, CountOrNone, NotNegative, Positive
 
 Discount = Annotated[float, Field(gt=0, lt=1)]
@@ -18,7 +18,7 @@ class PolicySettings:
 
     hidden: Annotated[tuple[Count, ...], Field(min_length=1)] = (64, 64)
     """units of the hidden layers, of the policy and of the value network"""
-    observe: Annotated[tuple[ObservationPart, ...], Field(min_length=1)] = (
+    observe: Annotated[tuple[FeatureName, ...], Field(min_length=1)] = (
         "local",
         "expert_acceleration",
         "expert_memory",

@@ -9,7 +9,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from unjam.reports.figures import colour_table
 from unjam.scenarios.scenario import VEHICLE_LENGTH
-from unjam.worlds.sumo.places import places_along
+from unjam.worlds.sumo.neighbours import places_along
 from unjam.worlds.sumo.traffic import Scene
 
 SIZE = 640

@@ -10,16 +10,19 @@ from pydantic.dataclasses import dataclass
 
 from unjam.parameters import STRICT, Count, NotNegative
 from unjam.physics.idm import equilibrium_speed
-from unjam.scenarios.closed_road import (
+from unjam.scenarios.road import (
+    ClosedRoad,
     Edge,
+    Network,
+    Node,
+    Place,
     cavs_among,
     check_counts,
-    loop_traffic,
+    loop_entries,
     part_of_range,
     vehicle_names,
     words_of_range,
 )
-from unjam.scenarios.road import ClosedRoad, PlainNetwork
 from unjam.scenarios.scenario import VEHICLE_LENGTH, Actuation, People, Scenario
 
 CROSSING_RADIUS = 3.1
@@ -84,14 +87,11 @@ class FigureEight(Scenario):
         positions = _on_edges(np.arange(self.vehicles, dtype=np.float64) * spacing, edges)
         bottom, top, _, right, left, _ = edges
         people = self.draw_people(ids, generator)
+        routes, entries = loop_entries(edges, ids, positions, self.seconds, self.top_speed)
         return ClosedRoad(
-            network=PlainNetwork(
-                _nodes(radius),
-                _edges(radius, self.top_speed),
-                ("--no-turnarounds", "true"),
-                _CONNECTIONS,
-            ),
-            traffic=loop_traffic(self, edges, ids, positions, people),
+            network=_network(radius, self.top_speed),
+            routes=routes,
+            entries=entries,
             vehicle_ids=ids,
             cav_ids=cavs_among(ids),
             start_positions=positions,
@@ -139,11 +139,6 @@ class FigureEight(Scenario):
         ]
 
 
-_CONNECTIONS = (
-    '<connections><connection from="bottom" to="top"/><connection from="right" to="left"/></connections>'
-)
-
-
 def loop_length(radius: float) -> float:
     """Return the length of a lap [m], ways across the junctions included."""
     return _edge_length(radius) + 2 * (CROSSING_LINK + INNER_LINK + OUTER_LINK)
@@ -153,7 +148,7 @@ def _edge_length(radius: float) -> float:
     return 4 * radius + 3 * pi * radius
 
 
-def _loop(radius: float) -> list[Edge]:
+def _loop(radius: float) -> list[Place]:
     """Return the edges in driving order; between them lie the links of the junctions."""
     arc = 1.5 * pi * radius
     edges, start = [], 0.0
@@ -165,12 +160,12 @@ def _loop(radius: float) -> list[Edge]:
         ("left", radius, OUTER_LINK),
         ("lower_ring", arc, OUTER_LINK),
     ):
-        edges.append(Edge(name, start, float(length)))
+        edges.append(Place(name, start, float(length)))
         start += length + link
     return edges
 
 
-def _on_edges(positions: np.ndarray, edges: list[Edge]) -> np.ndarray:
+def _on_edges(positions: np.ndarray, edges: list[Place]) -> np.ndarray:
     """Return positions moved off the junctions' links, to the end of the edge before."""
     ends = np.array([edge.start + edge.length for edge in edges])
     starts = np.array([edge.start for edge in edges])
@@ -178,36 +173,22 @@ def _on_edges(positions: np.ndarray, edges: list[Edge]) -> np.ndarray:
     return np.minimum(positions, ends[edge])
 
 
-def _nodes(radius: float) -> str:
-    places = {"right": (radius, 0), "top": (0, radius), "left": (-radius, 0), "bottom": (0, -radius)}
-    lines = ["<nodes>", f'<node id="center" x="0" y="0" type="priority" radius="{CROSSING_RADIUS}"/>']
-    lines += [f'<node id="at_{name}" x="{x}" y="{y}" type="priority"/>' for name, (x, y) in places.items()]
-    return "\n".join([*lines, "</nodes>"])
-
-
-def _edges(radius: float, speed: float) -> str:
-    arms = (
-        ("bottom", "at_bottom", "center", MAJOR),
-        ("top", "center", "at_top", MAJOR),
-        ("right", "at_right", "center", MINOR),
-        ("left", "center", "at_left", MINOR),
+def _network(radius: float, speed: float) -> Network:
+    places = {"right": (radius, 0.0), "top": (0.0, radius), "left": (-radius, 0.0), "bottom": (0.0, -radius)}
+    center = Node("center", 0.0, 0.0, priority=True, radius=CROSSING_RADIUS)
+    nodes = (center, *(Node(f"at_{name}", x, y, priority=True) for name, (x, y) in places.items()))
+    arc = 1.5 * pi * radius
+    edges = (
+        Edge("bottom", "at_bottom", "center", float(radius), MAJOR),
+        Edge("top", "center", "at_top", float(radius), MAJOR),
+        Edge("right", "at_right", "center", float(radius), MINOR),
+        Edge("left", "center", "at_left", float(radius), MINOR),
+        Edge("upper_ring", "at_top", "at_right", arc, MAJOR, tuple(map(tuple, _upper_arc(radius).tolist()))),
+        Edge(
+            "lower_ring", "at_left", "at_bottom", arc, MAJOR, tuple(map(tuple, _lower_arc(radius).tolist()))
+        ),
     )
-    lines = ["<edges>"]
-    for name, begin, end, priority in arms:
-        lines.append(
-            f'<edge id="{name}" from="{begin}" to="{end}" numLanes="1" speed="{speed}" '
-            f'length="{float(radius)!r}" priority="{priority}"/>'
-        )
-    for name, begin, end, points in (
-        ("upper_ring", "at_top", "at_right", _upper_arc(radius)),
-        ("lower_ring", "at_left", "at_bottom", _lower_arc(radius)),
-    ):
-        shape = " ".join(f"{x:.6f},{y:.6f}" for x, y in points)
-        lines.append(
-            f'<edge id="{name}" from="{begin}" to="{end}" numLanes="1" speed="{speed}" '
-            f'length="{1.5 * pi * radius!r}" priority="{MAJOR}" shape="{shape}"/>'
-        )
-    return "\n".join([*lines, "</edges>"])
+    return Network(nodes, edges, speed, connections=(("bottom", "top"), ("right", "left")))
 
 
 def _upper_arc(radius: float) -> np.ndarray:
@@ -220,7 +201,7 @@ def _lower_arc(radius: float) -> np.ndarray:
     return radius * np.column_stack([np.cos(angles) - 1, np.sin(angles) - 1])
 
 
-def _outline(radius: float, edges: list[Edge]) -> np.ndarray:
+def _outline(radius: float, edges: list[Place]) -> np.ndarray:
     """Return the centre line: rows (coordinate along the lap, x, y)."""
     bottom, top, upper, right, left, lower = edges
     rows = [

@@ -13,8 +13,8 @@ from unjam.parameters import STRICT, Count, CountOrNone, NotNegative, Positive
 from unjam.physics.arrays import at_least
 from unjam.physics.idm import IDMParameters, idm_acceleration
 from unjam.physics.kinematics import next_position, next_speed
-from unjam.scenarios.road import MergingRoad, Origin, PlainNetwork
-from unjam.scenarios.scenario import VEHICLE_LENGTH, People, Scenario, cav_type, human_types
+from unjam.scenarios.road import Edge, Entry, MergingRoad, Network, Node, Origin, Route
+from unjam.scenarios.scenario import VEHICLE_LENGTH, People, Scenario
 
 INFLOW_EDGE, BEFORE, AFTER, RAMP = 100.0, 500.0, 100.0, 100.0
 """lengths of the edges on which vehicles enter, of the highway before and after the ramp, of the ramp [m]"""
@@ -86,17 +86,11 @@ class Merge(Scenario):
         """Return the road with all vehicles that may enter; random is which of them are CAVs."""
         chosen = self._chosen(generator)
         origins: dict[str, Origin] = {}
-        entering: list[tuple[float, str]] = []
+        entries: list[Entry] = []
 
-        def enter(name: str, time: float, route: str, place: float, speed: float, origin: Origin) -> None:
-            origins[name] = origin
-            entering.append(
-                (
-                    time,
-                    f'<vehicle id="{name}" type="human" route="{route}" depart="{time:.2f}" '
-                    f'departPos="{place!r}" departSpeed="{speed}" departLane="0"/>',
-                )
-            )
+        def enter(entry: Entry, origin: Origin) -> None:
+            origins[entry.name] = origin
+            entries.append(entry)
 
         begin = -(BEFORE + JUNCTION_WAYS[HIGHWAY])
         start = begin - ENTRANCE_WAY - INFLOW_EDGE
@@ -105,30 +99,22 @@ class Merge(Scenario):
             on_inflow = beyond < 0
             edge, place = ("inflow_highway", along) if on_inflow else ("highway", beyond)
             origin = Origin(HIGHWAY, place + (start if on_inflow else begin))
-            enter(f"human_s{index}", 0.0, f"from_{edge}", place, 0.0, origin)
+            enter(Entry(f"human_s{index}", f"from_{edge}", place), origin)
         for index, time in enumerate(self._times(self.inflow)):
             name = f"{'cav' if index in chosen else 'human'}_{index}"
-            enter(name, time, "from_inflow_highway", 0.0, HIGHWAY_SPEED, Origin(HIGHWAY, start))
+            enter(Entry(name, "from_inflow_highway", 0.0, HIGHWAY_SPEED, time), Origin(HIGHWAY, start))
         start = -(INFLOW_EDGE + ENTRANCE_WAY + RAMP + JUNCTION_WAYS[ON_RAMP])
         for index, time in enumerate(self._times(self.ramp_flow)):
-            enter(f"human_r{index}", time, "from_inflow_ramp", 0.0, RAMP_SPEED, Origin(ON_RAMP, start))
-        entering.sort(key=lambda entry: entry[0])  # as SUMO wants it
-        routes = [
-            '<route id="from_inflow_highway" edges="inflow_highway highway after"/>',
-            '<route id="from_highway" edges="highway after"/>',
-            '<route id="from_inflow_ramp" edges="inflow_ramp ramp after"/>',
-        ]
-        vehicles = [vehicle for _, vehicle in entering]
-        people = self.draw_people(tuple(origins), generator)
-        traffic = ["<routes>", *human_types(self, people), cav_type(self), *routes, *vehicles, "</routes>"]
+            enter(Entry(f"human_r{index}", "from_inflow_ramp", 0.0, RAMP_SPEED, time), Origin(ON_RAMP, start))
         return MergingRoad(
-            network=PlainNetwork(_NODES, _edges(self.top_speed), ("--no-turnarounds", "true")),
-            traffic="\n".join(traffic),
+            network=Network(_NODES, _EDGES, self.top_speed),
+            routes=_ROUTES,
+            entries=tuple(sorted(entries, key=lambda entry: entry.time)),
             limit_speed=self.limit(),
             origins=origins,
             cav_ids=frozenset(name for name in origins if name.startswith("cav")),
             junctions=JUNCTION_WAYS,
-            people=people,
+            people=self.draw_people(tuple(origins), generator),
         )
 
     def _times(self, flow: float) -> list[float]:
@@ -205,31 +191,24 @@ def _undisturbed_speed(flow: float, length: float, humans: IDMParameters, step: 
     return length / ((len(own) - 1) * step)
 
 
-_RAMP_BEGIN, _RAMP_ENTRANCE = (f"{-length * cos(JOINS_IN):.6f}" for length in (RAMP, RAMP + INFLOW_EDGE))
-_NODES = "\n".join(
-    [
-        "<nodes>",
-        f'<node id="highway_entrance" x="{-INFLOW_EDGE - BEFORE}" y="0"/>',
-        f'<node id="highway_begin" x="{-BEFORE}" y="0"/>',
-        f'<node id="ramp_entrance" x="{_RAMP_ENTRANCE}" y="{_RAMP_ENTRANCE}"/>',
-        f'<node id="ramp_begin" x="{_RAMP_BEGIN}" y="{_RAMP_BEGIN}"/>',
-        f'<node id="meeting" x="0" y="0" type="priority" radius="{JUNCTION_RADIUS}"/>',
-        f'<node id="exit" x="{AFTER}" y="0"/>',
-        "</nodes>",
-    ]
+_RAMP_BEGIN, _RAMP_ENTRANCE = (-length * cos(JOINS_IN) for length in (RAMP, RAMP + INFLOW_EDGE))
+_NODES = (
+    Node("highway_entrance", -INFLOW_EDGE - BEFORE, 0.0),
+    Node("highway_begin", -BEFORE, 0.0),
+    Node("ramp_entrance", _RAMP_ENTRANCE, _RAMP_ENTRANCE),
+    Node("ramp_begin", _RAMP_BEGIN, _RAMP_BEGIN),
+    Node("meeting", 0.0, 0.0, priority=True, radius=JUNCTION_RADIUS),
+    Node("exit", AFTER, 0.0),
 )
-
-
-def _edges(speed: float) -> str:
-    lines = ["<edges>"]
-    for name, begin, end, length in (
-        ("inflow_highway", "highway_entrance", "highway_begin", INFLOW_EDGE),
-        ("highway", "highway_begin", "meeting", BEFORE),
-        ("inflow_ramp", "ramp_entrance", "ramp_begin", INFLOW_EDGE),
-        ("ramp", "ramp_begin", "meeting", RAMP),
-        ("after", "meeting", "exit", AFTER),
-    ):
-        lines.append(
-            f'<edge id="{name}" from="{begin}" to="{end}" numLanes="1" speed="{speed}" length="{length}"/>'
-        )
-    return "\n".join([*lines, "</edges>"])
+_EDGES = (
+    Edge("inflow_highway", "highway_entrance", "highway_begin", INFLOW_EDGE),
+    Edge("highway", "highway_begin", "meeting", BEFORE),
+    Edge("inflow_ramp", "ramp_entrance", "ramp_begin", INFLOW_EDGE),
+    Edge("ramp", "ramp_begin", "meeting", RAMP),
+    Edge("after", "meeting", "exit", AFTER),
+)
+_ROUTES = (
+    Route("from_inflow_highway", ("inflow_highway", "highway", "after")),
+    Route("from_highway", ("highway", "after")),
+    Route("from_inflow_ramp", ("inflow_ramp", "ramp", "after")),
+)

@@ -10,18 +10,14 @@ from pydantic.dataclasses import dataclass
 
 from unjam.errors import InputError
 from unjam.parameters import STRICT, build
-from unjam.scenarios.road import OwnRoad, SumoConfiguration
-from unjam.scenarios.scenario import Scenario, obedient_layer, type_xml
-from unjam.sumo_files import SumoFiles, read_sumo_files
+from unjam.scenarios.road import OwnRoad
+from unjam.scenarios.scenario import Scenario
+from unjam.sumo_files import read_sumo_files
 
-CAV_TYPES = "cav_of_{}"
-"""the type of a CAV whose own type is `{}`"""
 LONGEST = 3600.0
 """seconds of an episode where the configuration names no end"""
 CARS = ("passenger", "private", "hov", "taxi", "evehicle", "delivery", "truck", "trailer", "bus", "coach")
 """SUMO's vehicle classes that a share picks from"""
-KEPT = ("vClass", "length", "width", "height", "maxSpeed", "speedFactor", "guiShape", "emissionClass")
-"""attributes of a vehicle type that a CAV takes over, beside those of changing lanes"""
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -75,8 +71,7 @@ class OwnNetwork(Scenario):
         """Return the network; random is which vehicles the share picks."""
         files = read_sumo_files(Path(self.file))
         return OwnRoad(
-            network=SumoConfiguration(files.path, files.additional_files),
-            traffic=_cav_types(self, files),
+            files=files,
             limit_speed=float("nan"),
             cav_share=self.cav_share,
             cav_types=self.cav_types,
@@ -134,17 +129,3 @@ def own_network(file: str, changes: dict[str, Any]) -> OwnNetwork:
 def is_car(attributes: dict[str, str]) -> bool:
     """Return whether a share may pick vehicles of a type; SUMO's default class is a passenger car."""
     return attributes.get("vClass", "passenger") in CARS
-
-
-def _cav_types(scenario: OwnNetwork, files: SumoFiles) -> str:
-    """Return the XML of a CAV type beside each of the user's types: as large, but driven by commands."""
-    lines = ["<additional>"]
-    for name, attributes in files.types.items():
-        kept = {
-            key: value
-            for key, value in attributes.items()
-            if key in KEPT or key.startswith("lc") or key == "laneChangeModel"
-        }
-        calm = {"id": CAV_TYPES.format(name), "sigma": 0.0, "speedDev": 0.0}
-        lines.append(type_xml({**kept, **calm, **obedient_layer(scenario.simulation_step)}))
-    return "\n".join([*lines, "</additional>"])

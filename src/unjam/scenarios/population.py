@@ -20,7 +20,7 @@ from unjam.drivers.network import Network, network_arrays, network_from_arrays
 from unjam.errors import InputError
 from unjam.files import to_json, write_whole
 from unjam.parameters import build
-from unjam.physics.arrays import Array, namespace
+from unjam.physics.arrays import Array, clip, namespace
 from unjam.physics.idm import PARAMETER_NAMES, IDMParameters
 
 FORMAT = 1
@@ -79,6 +79,20 @@ class Population:
 def residual_inputs(speed: Array, leader_speed: Array, gap: Array) -> Array:
     """Return what a residual sees, shape (..., 3), SI units: RESIDUAL_INPUTS."""
     return namespace(gap).stack([speed, leader_speed - speed, gap], -1)
+
+
+def as_calibrated(
+    population: Population | None, acceleration: Array, speed: Array, leader_speed: Array, gap: Array
+) -> Array:
+    """Return IDM accelerations with what a population adds to them: its residual and its limits [m/s2].
+
+    Shapes: all arrays (n,). Without a population the accelerations are as they were.
+    """
+    if population is None:
+        return acceleration
+    if population.residual is not None:
+        acceleration = acceleration + population.residual(residual_inputs(speed, leader_speed, gap))
+    return clip(acceleration, *population.limits)
 
 
 def write_population(path: Path, population: Population) -> None:

@@ -9,16 +9,19 @@ from pydantic.dataclasses import dataclass
 
 from unjam.parameters import STRICT, Count
 from unjam.physics.idm import equilibrium_speed
-from unjam.scenarios.closed_road import (
+from unjam.scenarios.road import (
+    ClosedRoad,
     Edge,
+    Network,
+    Node,
+    Place,
     cavs_among,
     check_counts,
-    loop_traffic,
+    loop_entries,
     part_of_range,
     vehicle_names,
     words_of_range,
 )
-from unjam.scenarios.road import ClosedRoad, PlainNetwork
 from unjam.scenarios.scenario import VEHICLE_LENGTH, Scenario
 
 EDGES = 4
@@ -59,13 +62,13 @@ class Ring(Scenario):
         ids = vehicle_names(self.vehicles, self.cavs)
         positions = np.arange(self.vehicles, dtype=np.float64) * (length / self.vehicles)
         people = self.draw_people(ids, generator)
+        each = length / EDGES
+        places = [Place(f"edge_{index}", index * each, each) for index in range(EDGES)]
+        routes, entries = loop_entries(places, ids, positions, self.seconds, self.top_speed)
         return ClosedRoad(
-            network=PlainNetwork(
-                _nodes(length),
-                _edges(length, self.top_speed),
-                ("--no-internal-links", "true", "--no-turnarounds", "true"),
-            ),
-            traffic=loop_traffic(self, _loop(length), ids, positions, people),
+            network=_network(length, self.top_speed),
+            routes=routes,
+            entries=entries,
             vehicle_ids=ids,
             cav_ids=cavs_among(ids),
             start_positions=positions,
@@ -107,39 +110,24 @@ class Ring(Scenario):
         return "-".join(speeds)
 
 
-def _point(angle: float, radius: float) -> tuple[float, float]:
-    return radius * float(np.cos(angle)), radius * float(np.sin(angle))
+def _on_circle(angles: np.ndarray, length: float) -> np.ndarray:
+    return length / (2 * np.pi) * np.column_stack([np.cos(angles), np.sin(angles)])
 
 
-def _nodes(length: float) -> str:
-    radius = length / (2 * np.pi)
-    lines = ["<nodes>"]
+def _network(length: float, speed: float) -> Network:
+    """Return a circle of equal edges."""
+    corners = _on_circle(2 * np.pi * np.arange(EDGES) / EDGES, length)
+    nodes = tuple(Node(f"node_{index}", x, y, priority=True) for index, (x, y) in enumerate(corners.tolist()))
+    edges = []
     for index in range(EDGES):
-        x, y = _point(2 * np.pi * index / EDGES, radius)
-        lines.append(f'<node id="node_{index}" x="{x:.6f}" y="{y:.6f}" type="priority"/>')
-    return "\n".join([*lines, "</nodes>"])
-
-
-def _loop(length: float) -> list[Edge]:
-    each = length / EDGES
-    return [Edge(f"edge_{index}", index * each, each) for index in range(EDGES)]
-
-
-def _edges(length: float, speed: float) -> str:
-    radius = length / (2 * np.pi)
-    lines = ["<edges>"]
-    for index in range(EDGES):
-        angles = 2 * np.pi * (index + np.linspace(0, 1, 41)) / EDGES
-        shape = " ".join(f"{x:.6f},{y:.6f}" for x, y in (_point(angle, radius) for angle in angles))
-        lines.append(
-            f'<edge id="edge_{index}" from="node_{index}" to="node_{(index + 1) % EDGES}" numLanes="1" '
-            f'speed="{speed}" length="{length / EDGES!r}" shape="{shape}"/>'
+        line = _on_circle(2 * np.pi * (index + np.linspace(0, 1, 41)) / EDGES, length)
+        begin, end = nodes[index].name, nodes[(index + 1) % EDGES].name
+        edges.append(
+            Edge(f"edge_{index}", begin, end, length / EDGES, shape=tuple(map(tuple, line.tolist())))
         )
-    return "\n".join([*lines, "</edges>"])
+    return Network(nodes, tuple(edges), speed, links=False)
 
 
 def _outline(length: float) -> np.ndarray:
     coordinates = np.linspace(0, length, 161)
-    angles = 2 * np.pi * coordinates / length
-    radius = length / (2 * np.pi)
-    return np.column_stack([coordinates, radius * np.cos(angles), radius * np.sin(angles)])
+    return np.column_stack([coordinates, _on_circle(2 * np.pi * coordinates / length, length)])

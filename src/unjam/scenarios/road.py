@@ -1,45 +1,84 @@
-"""One episode's road and traffic, as a scenario draws it."""
+"""One episode's road and traffic, as a scenario draws it: geometry, vehicles, demand."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from unjam.physics.idm import IDMParameters
+from unjam.sumo_files import SumoFiles
+
+
+class Node(NamedTuple):
+    """Where edges begin, end and meet."""
+
+    name: str
+    x: float
+    """[m]"""
+    y: float
+    """[m]"""
+    priority: bool = False
+    """whether priorities of the edges decide who goes first"""
+    radius: float | None = None
+    """of its junction [m]; None: the simulator's"""
+
+
+class Edge(NamedTuple):
+    """A stretch of road between two nodes, with one lane."""
+
+    name: str
+    begin: str
+    end: str
+    length: float
+    """[m]"""
+    priority: int | None = None
+    """larger goes first where edges meet"""
+    shape: tuple[tuple[float, float], ...] = ()
+    """points of its line (x, y) [m]; empty: straight"""
 
 
 @dataclass(frozen=True)
-class PlainNetwork:
-    """Nodes and edges, of which netconvert makes SUMO's network file."""
+class Network:
+    """Nodes and edges."""
 
-    nodes: str
-    """XML of the nodes"""
-    edges: str
-    """XML of the edges"""
-    netconvert_options: tuple[str, ...]
-    connections: str = ""
-    """XML of the connections; empty: all that are possible"""
+    nodes: tuple[Node, ...]
+    edges: tuple[Edge, ...]
+    speed: float
+    """what every edge allows [m/s]"""
+    links: bool = True
+    """whether ways across junctions have a length of their own"""
+    connections: tuple[tuple[str, str], ...] = ()
+    """pairs of edges that follow each other; empty: all that are possible"""
 
 
-@dataclass(frozen=True)
-class SumoConfiguration:
-    """The user's own network and traffic."""
+class Route(NamedTuple):
+    """Edges one after the other."""
 
-    path: Path
-    """a .sumocfg file"""
-    additional_files: tuple[Path, ...]
-    """those that it names; a command line that adds one must repeat them"""
+    name: str
+    edges: tuple[str, ...]
+    laps: int = 1
+    """how often they are driven"""
+
+
+class Entry(NamedTuple):
+    """A vehicle that enters."""
+
+    name: str
+    route: str
+    position: float
+    """of its front bumper on the first edge [m]"""
+    speed: float = 0.0
+    """[m/s]"""
+    time: float = 0.0
+    """[s]"""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Road:
-    """One episode's road and traffic, ready to be written as SUMO's input files."""
+    """One episode's road and traffic."""
 
-    network: PlainNetwork | SumoConfiguration
-    traffic: str
-    """XML of vehicle types, and of routes and vehicles where they are not the user's"""
     limit_speed: float
     """speed that the traffic cannot exceed in the long run [m/s]: the scenario's own limit; NaN: unknown"""
     drawn: dict[str, float] = field(default_factory=dict)
@@ -49,10 +88,19 @@ class Road:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ClosedRoad(Road):
+class BuiltRoad(Road):
+    """A road that is built for the episode, and who enters it."""
+
+    network: Network
+    routes: tuple[Route, ...]
+    entries: tuple[Entry, ...]
+    """in order of time"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ClosedRoad(BuiltRoad):
     """A loop with one lane: nobody enters, nobody leaves, nobody overtakes."""
 
-    network: PlainNetwork
     vehicle_ids: tuple[str, ...]
     """all vehicles, in the order in which they stand along the road"""
     cav_ids: tuple[str, ...]
@@ -77,10 +125,9 @@ class Origin(NamedTuple):
 
 
 @dataclass(frozen=True, kw_only=True)
-class MergingRoad(Road):
+class MergingRoad(BuiltRoad):
     """A main road that a ramp joins, with one lane each; vehicles come and go."""
 
-    network: PlainNetwork
     origins: dict[str, Origin]
     """of all vehicles that may enter"""
     cav_ids: frozenset[str]
@@ -94,7 +141,8 @@ class MergingRoad(Road):
 class OwnRoad(Road):
     """A network of the user's own, with all its traffic."""
 
-    network: SumoConfiguration
+    files: SumoFiles
+    """what its files say"""
     cav_share: float
     """share of the vehicles that become CAVs"""
     cav_types: tuple[str, ...]
@@ -103,3 +151,65 @@ class OwnRoad(Road):
     """vehicle types that the share may pick"""
     cav_seed: int
     """which vehicles the share picks"""
+
+
+class Place(NamedTuple):
+    """Where along a closed road an edge lies."""
+
+    name: str
+    start: float
+    """[m]"""
+    length: float
+    """[m]"""
+
+
+def vehicle_names(vehicles: int, cavs: int) -> tuple[str, ...]:
+    """Return the ids of all vehicles in road order; CAVs are evenly spread, the first is one of them."""
+    chosen = {round(index * vehicles / cavs) for index in range(cavs)}
+    return tuple(f"{'cav' if index in chosen else 'human'}_{index}" for index in range(vehicles))
+
+
+def cavs_among(ids: Sequence[str]) -> tuple[str, ...]:
+    """Return the ids of the CAVs."""
+    return tuple(name for name in ids if name.startswith("cav"))
+
+
+def check_counts(name: str, drawn: tuple[int, int], vehicles: int, cavs: int) -> None:
+    """Raise `ValueError` where a range is the wrong way round, or there are more CAVs than vehicles."""
+    low, high = drawn
+    if high < low:
+        raise ValueError(f"{name}: {high} m is not allowed as the largest; allowed: >= {low} m")
+    if cavs > vehicles:
+        raise ValueError(f"cavs: {cavs} is not allowed; allowed: <= vehicles, {vehicles}")
+
+
+def part_of_range(whole: tuple[int, int], index: int, count: int) -> tuple[int, int]:
+    """Return one of `count` equal parts of a range of integers, both ends included."""
+    low, high = whole
+    borders = np.linspace(low, high + 1, count + 1).astype(int)
+    first, last = int(borders[index]), int(borders[index + 1]) - 1
+    return first, max(first, last)
+
+
+def words_of_range(whole: tuple[int, int]) -> str:
+    """Return `220-270`, or `230` where both ends are the same."""
+    return "-".join(str(end) for end in dict.fromkeys(whole))
+
+
+def loop_entries(
+    places: Sequence[Place], ids: Sequence[str], positions: NDArray[np.float64], seconds: float, speed: float
+) -> tuple[tuple[Route, ...], tuple[Entry, ...]]:
+    """Return routes and vehicles that stand at `positions` along a closed road.
+
+    Routes are as long as anybody can drive in `seconds` at `speed` [m/s].
+    """
+    laps = int(seconds * speed / sum(place.length for place in places)) + 2
+    routes = [
+        Route(f"from_{place.name}", tuple(other.name for other in (*places[first:], *places[:first])), laps)
+        for first, place in enumerate(places)
+    ]
+    entries = []
+    for name, position in zip(ids, positions, strict=True):
+        edge = max((place for place in places if place.start <= position), key=lambda place: place.start)
+        entries.append(Entry(name, f"from_{edge.name}", min(float(position) - edge.start, edge.length)))
+    return tuple(routes), tuple(entries)

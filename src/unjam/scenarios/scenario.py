@@ -3,13 +3,13 @@
 from collections.abc import Sequence
 from dataclasses import field
 from functools import cached_property
-from typing import Annotated, Any, ClassVar, Literal
-from xml.sax.saxutils import quoteattr
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
+from unjam.drivers.command import Limits
 from unjam.parameters import STRICT, Count, CountOrNone, NotNegative, Positive
 from unjam.physics.idm import IDMParameters
 from unjam.scenarios.population import Population, read_population
@@ -17,12 +17,6 @@ from unjam.scenarios.road import Road
 
 VEHICLE_LENGTH = 5.0
 """[m], of every vehicle"""
-
-SMALLEST_CAV_GAP = 0.5
-"""gap that SUMO keeps for a CAV [m]"""
-
-CAV_COLOUR = "215,38,61"
-"""red, in SUMO's window"""
 
 Actuation = Literal["shielded", "raw", "flow"]
 """How SUMO carries out a CAV's command.
@@ -101,6 +95,16 @@ class Scenario:
         scale = self.simulation_step**0.5 if self.noise_scaling == "sqrt-step" else 1.0
         return self.noise * scale
 
+    @property
+    def seconds(self) -> float:
+        """How long an episode lasts at most, warm-up included [s]."""
+        return self.simulation_step * (self.warmup + self.horizon * self.steps_per_decision)
+
+    @property
+    def limits(self) -> Limits:
+        """Accelerations that a CAV may ask for."""
+        return Limits.symmetric(self.action_limit)
+
     @cached_property
     def calibrated(self) -> Population | None:
         """The people of `population`, read once."""
@@ -155,96 +159,3 @@ class Scenario:
     def facts(self) -> list[tuple[str, str]]:
         """Return what a reader wants to know of this road, as (name, value) pairs."""
         raise NotImplementedError
-
-
-def vehicle_type(name: str, scenario: Scenario, **attributes: Any) -> str:
-    """Return the XML of a vehicle type: SUMO's defaults of chance switched off, the rest as given."""
-    common = {
-        "id": name,
-        "length": VEHICLE_LENGTH,
-        "speedFactor": 1.0,
-        "speedDev": 0.0,  # without it SUMO draws factors between 0.8 and 1.2
-        "sigma": 0.0,
-        "impatience": scenario.impatience,
-        "emissionClass": scenario.emission_class,
-    }
-    return type_xml({**common, **attributes})
-
-
-def type_xml(attributes: dict[str, Any]) -> str:
-    """Return the XML of a vehicle type."""
-    pairs = " ".join(f"{key}={quoteattr(str(value))}" for key, value in attributes.items())
-    return f"<vType {pairs}/>"
-
-
-def human_types(scenario: Scenario, people: dict[str, IDMParameters]) -> list[str]:
-    """Return the XML of the human drivers: SUMO's own IDM with the scenario's parameters, or each its own.
-
-    Under commanded people lies Flow's layer: quick, and with no gap of its own.
-    """
-    own = people if scenario.people == "native" else {}
-    return [
-        vehicle_type("human", scenario, **_human_layer(scenario, scenario.humans)),
-        *(vehicle_type(f"of_{name}", scenario, **_human_layer(scenario, one)) for name, one in own.items()),
-    ]
-
-
-def human_type_of(name: str, scenario: Scenario, people: dict[str, IDMParameters]) -> str:
-    """Return which of `human_types` a vehicle has, as attributes of its XML.
-
-    SUMO would not let a driver who keeps a large distance begin closer than that.
-    """
-    own = name in people and scenario.people == "native"
-    checks = ' insertionChecks="none"' if own else ""
-    return f'type="{f"of_{name}" if own else "human"}"{checks}'
-
-
-def _human_layer(scenario: Scenario, humans: IDMParameters) -> dict[str, Any]:
-    population = scenario.calibrated
-    layer = {
-        "carFollowModel": "IDM",
-        "accel": humans.max_acceleration,
-        "decel": humans.comfortable_deceleration,
-        "tau": humans.time_headway,
-        "delta": humans.exponent,
-        "minGap": humans.minimum_gap,
-        "maxSpeed": humans.desired_speed,
-    }
-    if scenario.people == "commanded":
-        layer |= {"accel": 2.6, "decel": 4.5, "tau": 1.0, "minGap": scenario.people_gap}
-        if population:  # the layer may not hold back who keeps less than a second
-            layer |= {"tau": min(1.0, population.quickest), "maxSpeed": population.fastest}
-    return layer
-
-
-def cav_type(scenario: Scenario) -> str:
-    """Return the XML of the CAVs: a type that executes any safe command exactly.
-
-    Where the actuation is Flow's, it is the human type instead; with a gap, or it would creep up until it
-    touches.
-    """
-    if scenario.actuation == "flow":
-        layer = _human_layer(scenario, scenario.humans)
-        smallest = max(layer["minGap"], SMALLEST_CAV_GAP)
-        return vehicle_type("cav", scenario, color=CAV_COLOUR, **{**layer, "minGap": smallest})
-    layer = obedient_layer(scenario.simulation_step)
-    return vehicle_type("cav", scenario, **layer, maxSpeed=scenario.top_speed)
-
-
-def obedient_layer(simulation_step: float) -> dict[str, Any]:
-    """Return the attributes of a type that executes any safe command exactly.
-
-    With SUMO's safe-speed check on, a Krauss vehicle with a reaction time of one step and a small minimum
-    gap is the one that stays out of the way until the command would lead to a crash.
-    """
-    limits = 20.0  # [m/s2] far beyond what a CAV asks for, so that only safety clips a command
-    return {
-        "color": CAV_COLOUR,
-        "carFollowModel": "Krauss",
-        "accel": limits,
-        "decel": limits,
-        "emergencyDecel": limits,
-        "apparentDecel": limits,
-        "tau": simulation_step,
-        "minGap": SMALLEST_CAV_GAP,
-    }

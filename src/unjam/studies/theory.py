@@ -14,7 +14,8 @@ from matplotlib.figure import Figure
 
 from unjam.drivers.constant import Constant
 from unjam.drivers.network import Network
-from unjam.drivers.residual import ResidualDriver, observation_size
+from unjam.drivers.observation import observation_size
+from unjam.drivers.residual import ResidualDriver
 from unjam.files import to_json, write_whole
 from unjam.measures.statistics import estimate
 from unjam.reports.figures import INK, LINES, STYLE

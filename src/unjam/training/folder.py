@@ -6,8 +6,8 @@ from typing import Any
 
 from unjam.controller import make_driver
 from unjam.drivers.driver import Driver
+from unjam.drivers.observation import observation_size
 from unjam.drivers.registry import describe
-from unjam.drivers.residual import observation_size
 from unjam.errors import InputError
 from unjam.files import make_folder, to_json, write_whole
 from unjam.manifest import manifest, package_versions

@@ -10,7 +10,8 @@ import numpy as np
 from unjam.controller import controller_bytes
 from unjam.drivers.driver import Driver
 from unjam.drivers.network import Network
-from unjam.drivers.residual import ResidualDriver, observation_size
+from unjam.drivers.observation import observation_size
+from unjam.drivers.residual import ResidualDriver
 from unjam.files import append_line, to_json, write_whole
 from unjam.learners.algorithms import LEARNERS
 from unjam.learners.episodic import Iteration, Training

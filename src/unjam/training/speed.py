@@ -27,11 +27,11 @@ from unjam.virtual.data import ActualData
 from unjam.virtual.model import EnvironmentModel, torch_generator
 from unjam.virtual.rollout import begin, draw_starts, imagine
 from unjam.virtual.settings import VirtualSettings
-from unjam.virtual.world import VirtualWorld
+from unjam.virtual.world import VirtualDynamics
 from unjam.worlds.drive import drive_traffic, run_episode
 from unjam.worlds.record import Episode
+from unjam.worlds.sumo import make_traffic
 from unjam.worlds.sumo.simulation import Simulation
-from unjam.worlds.sumo.stepping import make_traffic
 
 ROUNDS = 7
 TRACI_STEPS = 200
@@ -177,7 +177,7 @@ def _virtual_rate(
     data.add([episode], scenario)
     model = EnvironmentModel(VirtualSettings(), len(scenario.drawn_ranges), (0,))
     generator = torch_generator((0,), "cpu")
-    world = VirtualWorld(model, scenario, "", generator)
+    world = VirtualDynamics(model, scenario, "", generator)
     looks = draw_starts(data, rows, 1, (0,))
 
     def run() -> None:

@@ -12,9 +12,9 @@ from unjam.drivers.ovm import OVM
 from unjam.physics.arrays import Array, as_column, at_least, namespace, stack_columns
 from unjam.physics.idm import idm_acceleration
 from unjam.physics.kinematics import next_position, next_speed
+from unjam.scenarios.population import as_calibrated
 from unjam.scenarios.scenario import Scenario
 from unjam.worlds.reward import Outcome, Reward, time_headway
-from unjam.worlds.sumo.people import as_calibrated
 
 BASES: dict[str, Callable[[Scenario], Driver] | None] = {
     "idm": lambda scenario: IDM(**asdict(scenario.humans)),

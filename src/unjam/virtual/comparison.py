@@ -1,13 +1,16 @@
 """Virtual beside actual: the same accelerations from the same start, and the same policy in the loop."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from unjam.drivers.constant import Constant
+from unjam.drivers.driver import Driver, Memory
 from unjam.drivers.local_state import LocalState
 from unjam.drivers.residual import ResidualDriver
 from unjam.scenarios.scenario import Scenario
@@ -15,8 +18,9 @@ from unjam.virtual.data import ActualData, Transitions
 from unjam.virtual.fitting import answers_of, changes_of, inputs_of, targets_of
 from unjam.virtual.model import NUMBERS, EnvironmentModel, torch_generator
 from unjam.virtual.model_error import OneStepErrors
-from unjam.virtual.rollout import begin, imagine
-from unjam.virtual.world import VirtualWorld, World
+from unjam.virtual.rollout import ImaginedWorld, Starts, begin, imagine
+from unjam.virtual.world import Dynamics, VirtualDynamics
+from unjam.worlds.drive import Drive
 from unjam.worlds.record import Floats
 
 
@@ -53,6 +57,18 @@ def recorded(data: ActualData, looks: NDArray[np.int64], decisions: int) -> dict
     return {name: np.stack([getattr(states, name)[at] for states, at in windows]) for name in NUMBERS}
 
 
+@dataclass(frozen=True)
+class Replayed(Driver):
+    """Accelerations that were recorded, one decision after the other."""
+
+    accelerations: Tensor
+    """[m/s2], shape (H, rows)"""
+
+    def act(self, state: LocalState, memory: Memory) -> tuple[Tensor, Memory]:
+        """Return those of this decision."""
+        return self.accelerations[memory["decision"]], {"decision": memory["decision"] + 1}
+
+
 @torch.no_grad()
 def replay(
     model: EnvironmentModel, data: ActualData, looks: NDArray[np.int64], decisions: int, scenario: Scenario
@@ -73,15 +89,17 @@ def replay(
     starts = begin(data, looks, Constant(), device)
     members = torch.arange(model.members, device=device)
     generator = torch_generator((0,), device)  # nothing is drawn from it
-    world = VirtualWorld(model, scenario, "", generator, noise=False, members=members)
-    state = LocalState(*(values.repeat(model.members) for values in starts.state))
-    drawn = starts.drawn.repeat(model.members, 1)
+    dynamics = VirtualDynamics(model, scenario, "", generator, noise=False, members=members)
     applied = np.stack([data.recordings[place].applied[at : at + decisions] for place, at in looks])
-    found: dict[str, list[Floats]] = {name: [] for name in NUMBERS}
-    for column in torch.as_tensor(applied.T, dtype=torch.float32, device=device):
-        state = world.step(state, column.repeat(model.members), drawn).state
-        for name in NUMBERS:
-            found[name].append(getattr(state, name).view(model.members, -1).cpu().numpy())
+    columns = torch.as_tensor(applied.T, dtype=torch.float32, device=device).repeat(1, model.members)
+    drawn, state = starts.drawn.repeat(model.members, 1), starts.state.each(lambda v: v.repeat(model.members))
+    world = ImaginedWorld(dynamics, Starts(state, {}, drawn, looks), decisions, scenario.limits, None)
+    for _ in Drive(world, Replayed(columns), memory={"decision": 0}):
+        pass
+    found = {
+        name: [getattr(each, name).view(model.members, -1).cpu().numpy() for each in world.states[1:]]
+        for name in NUMBERS
+    }
     return {name: np.stack(values, -1) for name, values in found.items()}
 
 
@@ -109,7 +127,7 @@ class ReturnGap(NamedTuple):
 
 def return_gap(
     driver: ResidualDriver,
-    world: World,
+    dynamics: Dynamics,
     data: ActualData,
     looks: NDArray[np.int64],
     decisions: int,
@@ -123,7 +141,7 @@ def return_gap(
 
     Args:
         driver: the full policy.
-        world: the virtual environment.
+        dynamics: of the virtual environment.
         data: actual data.
         looks: where to begin, rows (recording, decision); at least `decisions` recorded ones must follow.
         decisions: rounded down to whole looks of the policy.
@@ -131,7 +149,7 @@ def return_gap(
         device: where the world is.
     """
     starts = begin(data, looks, driver.expert, device)
-    rollouts = imagine(driver, world, starts, decisions, torch_generator(seed, device))
+    rollouts = imagine(driver, dynamics, starts, decisions, torch_generator(seed, device))
     driven = decisions // driver.hold * driver.hold
     virtual = rollouts.rewards.sum(1).double().cpu().numpy()
     actual = np.array([data.recordings[place].reward[at : at + driven].sum() for place, at in looks])

@@ -1,7 +1,7 @@
 """D_a, the actual data: what the virtual environment learns from, and where its rollouts begin."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, fields
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -10,31 +10,20 @@ from numpy.typing import NDArray
 from unjam.drivers.local_state import LocalState
 from unjam.errors import InputError
 from unjam.scenarios.scenario import Scenario
-from unjam.worlds.record import Episode, Floats
+from unjam.tree import Arrays, pack, unpack
+from unjam.worlds.record import Episode, Floats, Trajectory
 
 GOLDEN_RATIO = (5**0.5 - 1) / 2
 """multiples of it, modulo 1, cover the unit interval evenly from the first on, and have no period"""
 
 
 @dataclass(frozen=True)
-class Recording:
-    """What is kept of one trajectory; T decisions."""
+class Recording(Trajectory):
+    """A trajectory that is kept, with where it comes from."""
 
-    states: LocalState
-    """shape (T + 1,)"""
-    applied: Floats
-    """[m/s2], shape (T,)"""
-    reward: Floats
-    """shape (T,)"""
-    memory: dict[str, Floats]
-    """what the expert remembered before the first decision, without the axis of rows"""
-    hold: int
-    """decisions for which one residual was held"""
-    terminated: bool
-    """whether a collision ended it"""
-    drawn: Floats
+    drawn: Floats = field(default_factory=lambda: np.zeros(0))
     """what its episode has drawn, scaled, shape (m,)"""
-    episode: int
+    episode: int = 0
     """number of the episode that it comes from"""
 
 
@@ -58,15 +47,9 @@ class Transitions(NamedTuple):
 
     def chosen(self, rows: NDArray[np.int64]) -> "Transitions":
         """Return the decisions with these indices."""
-        return Transitions(
-            states=LocalState(*(values[rows] for values in self.states)),
-            applied=self.applied[rows],
-            drawn=self.drawn[rows],
-            following=LocalState(*(values[rows] for values in self.following)),
-            reward=self.reward[rows],
-            crashed=self.crashed[rows],
-            held_out=self.held_out[rows],
-        )
+        states, following = (each.each(lambda values: values[rows]) for each in (self.states, self.following))
+        others = (self.reward[rows], self.crashed[rows], self.held_out[rows])
+        return Transitions(states, self.applied[rows], self.drawn[rows], following, *others)
 
 
 class ActualData:
@@ -87,19 +70,9 @@ class ActualData:
         """Keep the trajectories of `episodes`, and forget the oldest episodes beyond the size."""
         for episode in episodes:
             drawn = np.array(scenario.drawn_scaled(episode.drawn)) if episode.ok else np.zeros(0)
-            self.recordings += [
-                Recording(
-                    states=trajectory.states,
-                    applied=trajectory.applied,
-                    reward=trajectory.reward,
-                    memory=trajectory.memory,
-                    hold=trajectory.hold,
-                    terminated=trajectory.terminated,
-                    drawn=drawn,
-                    episode=self.episodes,
-                )
-                for trajectory in episode.trajectories
-            ]
+            for each in episode.trajectories:
+                kept = {part.name: getattr(each, part.name) for part in fields(Trajectory)}
+                self.recordings.append(Recording(**kept, drawn=drawn, episode=self.episodes))
             self.episodes += 1
         while self.recordings:
             oldest = self.recordings[0].episode
@@ -118,10 +91,10 @@ class ActualData:
             raise InputError("virtual environment: there are no actual decisions to learn from")
         recordings = self.recordings
         return Transitions(
-            states=_joined([_between(r.states, 0, -1) for r in recordings]),
+            states=_joined([r.states.each(lambda values: values[:-1]) for r in recordings]),
             applied=np.concatenate([r.applied for r in recordings]),
             drawn=np.concatenate([np.tile(r.drawn, (len(r.reward), 1)) for r in recordings]),
-            following=_joined([_between(r.states, 1, None) for r in recordings]),
+            following=_joined([r.states.each(lambda values: values[1:]) for r in recordings]),
             reward=np.concatenate([r.reward for r in recordings]),
             crashed=np.concatenate([_crashes(r) for r in recordings]),
             held_out=np.concatenate(self.held_out(holdout)),
@@ -169,40 +142,20 @@ def _crashes(recording: Recording) -> NDArray[np.bool_]:
     return crashed
 
 
-def _between(states: LocalState, start: int, end: int | None) -> LocalState:
-    return LocalState(*(values[start:end] for values in states))
-
-
 def _joined(parts: Sequence[LocalState]) -> LocalState:
-    return LocalState(*(np.concatenate(values) for values in zip(*parts, strict=True)))
+    first, *others = parts
+    return first.each(lambda *values: np.concatenate(values), *others)
 
 
-_RECORDING_ARRAYS = ("applied", "reward", "drawn")
-
-
-def pack_data(data: ActualData) -> tuple[dict[str, Any], dict[str, Floats]]:
+def pack_data(data: ActualData) -> tuple[dict[str, Any], Arrays]:
     """Return the actual data as JSON and arrays; `unpack_data` undoes it exactly."""
-    arrays: dict[str, Floats] = {}
-    about = []
-    for index, recording in enumerate(data.recordings):
-        arrays |= {f"{index}.{name}": getattr(recording, name) for name in _RECORDING_ARRAYS}
-        arrays |= {f"{index}.states.{name}": array for name, array in recording.states._asdict().items()}
-        arrays |= {f"{index}.memory.{name}": array for name, array in recording.memory.items()}
-        about.append({name: getattr(recording, name) for name in ("hold", "terminated", "episode")})
-        about[-1]["memory"] = list(recording.memory)
-    return {"rows": data.rows, "episodes": data.episodes, "recordings": about}, arrays
+    recordings, arrays = pack(data.recordings)
+    return {"rows": data.rows, "episodes": data.episodes, "recordings": recordings}, arrays
 
 
-def unpack_data(facts: dict[str, Any], arrays: dict[str, Floats]) -> ActualData:
+def unpack_data(facts: dict[str, Any], arrays: Arrays) -> ActualData:
     """Return the actual data that `pack_data` packed."""
     data = ActualData(facts["rows"])
     data.episodes = facts["episodes"]
-    data.recordings = [
-        Recording(
-            **{name: arrays[f"{index}.{name}"] for name in _RECORDING_ARRAYS},
-            states=LocalState(*(arrays[f"{index}.states.{name}"] for name in LocalState._fields)),
-            **{**about, "memory": {name: arrays[f"{index}.memory.{name}"] for name in about["memory"]}},
-        )
-        for index, about in enumerate(facts["recordings"])
-    ]
+    data.recordings = unpack(list[Recording], facts["recordings"], arrays)
     return data

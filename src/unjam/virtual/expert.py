@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from math import inf
 from typing import Any, ClassVar
 
 import numpy as np
@@ -10,9 +11,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from unjam.drivers.check import check_acceleration
+from unjam.drivers.command import Limits
 from unjam.drivers.driver import Driver, Memory
 from unjam.drivers.local_state import LocalState
+from unjam.tree import mapped
 from unjam.virtual.data import Recording
+from unjam.worlds.drive import Drive
+from unjam.worlds.world import RecordedWorld
 
 
 @dataclass(frozen=True)
@@ -35,7 +40,7 @@ class ThroughNumPy(Driver):
         Raises:
             InputError: the acceleration is not finite or of a wrong shape.
         """
-        numbers = LocalState(*(values.double().cpu().numpy() for values in state))
+        numbers = state.each(lambda values: values.double().cpu().numpy())
         answer, memory = self.driver.act(numbers, memory)
         acceleration = check_acceleration(answer, len(state.speed), "virtual environment")
         return self._tensor(acceleration), memory
@@ -51,16 +56,14 @@ class ThroughNumPy(Driver):
 
 def on_tensors(driver: Driver, device: torch.device | str) -> Driver:
     """Return a driver that takes tensors on `device`: the same, or the same through NumPy."""
-    return driver if getattr(driver, "tensors", False) else ThroughNumPy(driver, torch.device(device))
+    return driver if driver.tensors else ThroughNumPy(driver, torch.device(device))
 
 
 def memory_on(driver: Driver, memory: Memory, device: torch.device | str) -> Memory:
     """Return NumPy `memory` as a driver of `on_tensors` takes it, in single precision on `device`."""
     if isinstance(driver, ThroughNumPy):
         return memory
-    return {
-        key: torch.as_tensor(values, dtype=torch.float32, device=device) for key, values in memory.items()
-    }
+    return mapped(lambda values: torch.as_tensor(values, dtype=torch.float32, device=device), memory)
 
 
 def remembered(expert: Driver, recordings: Sequence[Recording], looks: NDArray[np.int64]) -> Memory:
@@ -74,23 +77,23 @@ def remembered(expert: Driver, recordings: Sequence[Recording], looks: NDArray[n
     """
     places, rows = np.unique(looks[:, 0], return_inverse=True)
     used = [recordings[place] for place in places]
-    memory = {key: np.stack([recording.memory[key] for recording in used]) for key in used[0].memory}
-    found = {key: np.empty((len(looks), *values.shape[1:])) for key, values in memory.items()}
+    memory = mapped(lambda *each: np.stack(each), *(recording.memory for recording in used))
+    found = mapped(lambda values: np.empty((len(looks), *values.shape[1:])), memory)
     if not found:
         return found
     last = int(looks[:, 1].max())
-    steps = [np.arange(last + 1).clip(0, len(recording.applied)) for recording in used]
-    states = [
-        LocalState(*(values[at] for values in recording.states))
-        for recording, at in zip(used, steps, strict=True)
-    ]
-    all_states = LocalState(*(np.stack(values, 1) for values in zip(*states, strict=True)))
+    steps = [np.arange(last).clip(0, len(recording.applied)) for recording in used]
+    states = [kept.states.each(lambda values: values[at]) for kept, at in zip(used, steps, strict=True)]  # noqa: B023
     order = np.argsort(looks[:, 1], kind="stable")
     bounds = np.searchsorted(looks[order, 1], np.arange(last + 2))
-    for decision in range(last + 1):
+
+    def note(decision: int, memory: Memory) -> None:
         here = order[bounds[decision] : bounds[decision + 1]]
-        for key, values in memory.items():
-            found[key][here] = values[rows[here]]
-        if decision < last:
-            _, memory = expert.act(LocalState(*(values[decision] for values in all_states)), memory)
+        if len(here):
+            mapped(lambda into, values: into.__setitem__(here, values[rows[here]]), found, memory)
+
+    note(0, memory)
+    world = RecordedWorld(states[0].each(lambda *each: np.stack(each, 1), *states[1:]), Limits(-inf, inf))
+    for decision, done in enumerate(Drive(world, expert, memory=memory), start=1):
+        note(decision, done.memory if done else memory)
     return found

@@ -1,7 +1,7 @@
 """Virtual rollouts: how long they may be (Eq. 15), and driving them with the full policy."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import floor, isfinite
 from typing import NamedTuple
 
@@ -10,16 +10,18 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from unjam.drivers.command import Command, Limits
 from unjam.drivers.driver import Driver, Memory
 from unjam.drivers.local_state import LocalState
-from unjam.drivers.residual import ResidualDriver, observe
+from unjam.drivers.residual import AGE, EXPERT, RESIDUAL, ResidualDriver
 from unjam.errors import UnjamError
-from unjam.physics.arrays import clip
 from unjam.virtual.data import ActualData
 from unjam.virtual.expert import memory_on, on_tensors, remembered
 from unjam.virtual.settings import VirtualSettings
-from unjam.virtual.world import BOUNDS, World
+from unjam.virtual.world import BOUNDS, Dynamics
+from unjam.worlds.drive import drive
 from unjam.worlds.record import Floats
+from unjam.worlds.world import Driven, OnProgress
 
 
 def rollout_length(eps_m: float, settings: VirtualSettings) -> int:
@@ -98,7 +100,7 @@ def begin(data: ActualData, looks: NDArray[np.int64], expert: Driver, device: to
     drawn = np.stack([data.recordings[place].drawn for place in looks[:, 0]])
     memory = remembered(expert, data.recordings, looks)
     return Starts(
-        state=LocalState(*(_tensor(values, device) for values in data.states_at(looks))),
+        state=data.states_at(looks).each(lambda values: _tensor(values, device)),
         memory=memory_on(on_tensors(expert, device), memory, device),
         drawn=_tensor(drawn, device),
         looks=looks,
@@ -109,10 +111,105 @@ def _tensor(values: Floats, device: torch.device | str) -> Tensor:
     return torch.as_tensor(values, dtype=torch.float32, device=device)
 
 
+class ImaginedWorld:
+    """The virtual environment as a world to drive in: n rows from actual states, so many decisions of each.
+
+    Rows that have crashed are driven on, but count no more.
+    """
+
+    single, entered, kept = False, 0, None
+
+    def __init__(
+        self,
+        dynamics: Dynamics,
+        starts: Starts,
+        decisions: int,
+        limits: Limits,
+        generator: torch.Generator | None,
+    ) -> None:
+        """Begin at `starts`; `generator` is of the exploration noise."""
+        self.limits, self.rows = limits, len(starts.state.speed)
+        self.states = [starts.state]
+        """one after the other, the last being the present one"""
+        self._dynamics, self._starts, self._decisions, self._generator = (
+            dynamics,
+            starts,
+            decisions,
+            generator,
+        )
+        like = starts.state.speed
+        self._running, self._ran, self._rewards = torch.ones_like(like), [], []
+        # Single precision counts to 2^24 only.
+        self._lived = torch.zeros((), dtype=torch.float64, device=like.device)
+        self._bounded = torch.zeros(len(BOUNDS), dtype=torch.float64, device=like.device)
+
+    def start(self, controlled: bool, on_progress: OnProgress | None = None) -> None:
+        """Begin; what the driver remembers was recorded with the starts."""
+
+    @property
+    def ended(self) -> bool:
+        """Whether all decisions are made."""
+        return len(self._rewards) >= self._decisions
+
+    def perceive(self) -> LocalState:
+        """Return the states now, tensors of shape (n,)."""
+        return self.states[-1]
+
+    def advance(self, command: Command | None) -> None:
+        """Make one virtual decision in each row."""
+        assert command is not None
+        applied = self.limits.keep(command.acceleration)
+        found = self._dynamics.step(self.states[-1], applied, self._starts.drawn)
+        self.states.append(found.state)
+        self._ran.append(self._running)
+        self._rewards.append(found.reward * self._running)
+        self._bounded += (found.bounded * self._running).sum(1)
+        self._lived += self._running.sum()
+        self._running = self._running * ~found.crashed
+
+    def noise(self) -> Tensor:
+        """Return standard normal noise, shape (n,)."""
+        like = self.states[-1].speed
+        return torch.randn(len(like), generator=self._generator, device=like.device)
+
+    def record(self, driven: Driven) -> Rollouts:
+        """Return what happened, look by look.
+
+        Raises:
+            UnjamError: something of it is not finite.
+        """
+        hold, nothing = driven.hold, self.states[0].speed.new_zeros((self.rows, 0))
+        looks = range(0, len(self._rewards), hold)
+        actions = [driven.decisions[look][1] for look in looks]
+        rewards, made = [], torch.zeros_like(self._running)
+        for look in looks:
+            earned = torch.zeros_like(self._running)
+            for reward in self._rewards[look : look + hold]:
+                earned += reward
+            rewards.append(earned)
+            made += self._ran[look]
+        seen = [*(driven.decisions[look][2] for look in looks), driven.last_observation]
+        rollouts = Rollouts(
+            observations=torch.stack(seen, 1),
+            actions=torch.stack(actions, 1) if actions else nothing,
+            rewards=torch.stack(rewards, 1) if rewards else nothing,
+            made=made.long(),
+            terminated=self._running == 0.0,
+            drawn=self._starts.drawn,
+            start=self._starts.looks,
+            decisions=int(self._lived.item()),
+            bounded=dict(zip(BOUNDS, (self._bounded / self._lived.clip(1.0)).tolist(), strict=True)),
+        )
+        for name in ("observations", "actions", "rewards"):
+            if not getattr(rollouts, name).isfinite().all():
+                raise UnjamError(f"virtual environment: {name} of a rollout are not finite")
+        return rollouts
+
+
 @torch.no_grad()
 def imagine(
     driver: ResidualDriver,
-    world: World,
+    dynamics: Dynamics,
     starts: Starts,
     decisions: int,
     generator: torch.Generator | None,
@@ -120,66 +217,23 @@ def imagine(
     """Drive with the full policy, expert plus residual, for `decisions` from actual states.
 
     `decisions` is rounded down to whole looks of the network; the expert decides in each of them, and what
-    it remembers is rolled forward. Rows that have crashed are driven on, but count no more.
+    it remembers is rolled forward.
 
     Args:
         driver: expert, network, and for how long a residual is held.
-        world: the virtual environment.
+        dynamics: of the virtual environment.
         starts: where to begin.
         decisions: k*.
         generator: of the exploration noise; None: no exploration.
 
     Raises:
-        UnjamError: the world gave something that is not finite.
+        UnjamError: the virtual environment gave something that is not finite.
         InputError: so did a driver of the user's.
     """
-    state, memory, like = starts.state, starts.memory, starts.state.speed
-    expert, limit = on_tensors(driver.expert, like.device), driver.action_limit
-    n, looks = len(like), decisions // driver.hold
-    observations, actions, rewards = [], [], []
-    running, made = torch.ones_like(like), torch.zeros_like(like)
-    lived = torch.zeros((), dtype=torch.float64, device=like.device)  # single precision counts to 2^24 only
-    bounded = torch.zeros(len(BOUNDS), dtype=torch.float64, device=like.device)
-    for _ in range(looks):
-        made += running
-        earned, residual = torch.zeros_like(like), None
-        for _ in range(driver.hold):
-            wanted, memory = expert.act(state, memory)
-            wanted = clip(wanted, -limit, limit)
-            if residual is None:
-                seen = observe(driver.parts, state, wanted, expert, memory)
-                residual = _residual(driver, seen, generator)
-                observations.append(seen)
-                actions.append(residual)
-            step = world.step(state, clip(wanted + residual, -limit, limit), starts.drawn)
-            state = step.state
-            earned += step.reward * running
-            bounded += (step.bounded * running).sum(1)
-            lived += running.sum()
-            running = running * ~step.crashed
-        rewards.append(earned)
-    wanted, memory = expert.act(state, memory)
-    observations.append(observe(driver.parts, state, clip(wanted, -limit, limit), expert, memory))
-    rollouts = Rollouts(
-        observations=torch.stack(observations, 1),
-        actions=torch.stack(actions, 1) if looks else like.new_zeros((n, 0)),
-        rewards=torch.stack(rewards, 1) if looks else like.new_zeros((n, 0)),
-        made=made.long(),
-        terminated=running == 0.0,
-        drawn=starts.drawn,
-        start=starts.looks,
-        decisions=int(lived.item()),
-        bounded=dict(zip(BOUNDS, (bounded / lived.clip(1.0)).tolist(), strict=True)),
-    )
-    for name in ("observations", "actions", "rewards"):
-        if not getattr(rollouts, name).isfinite().all():
-            raise UnjamError(f"virtual environment: {name} of a rollout are not finite")
-    return rollouts
-
-
-def _residual(driver: ResidualDriver, seen: Tensor, generator: torch.Generator | None) -> Tensor:
-    """Return the network's residual, with exploration noise where there is a generator of it."""
-    if generator is None:
-        return driver.network(seen)
-    noise = torch.randn(len(seen), generator=generator, device=seen.device)
-    return driver.network.explore(seen, noise)
+    like = starts.state.speed
+    driver = replace(driver, expert=on_tensors(driver.expert, like.device))
+    memory: Memory = {EXPERT: starts.memory}
+    if driver.hold > 1:
+        memory |= {RESIDUAL: torch.zeros_like(like), AGE: 0.0}  # all rows begin with a look
+    world = ImaginedWorld(dynamics, starts, decisions // driver.hold * driver.hold, driver.limits, generator)
+    return drive(world, driver, generator is not None, memory)

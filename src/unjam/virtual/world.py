@@ -28,7 +28,7 @@ BOUNDS = ("speed", "gap", "reward")
 """what is kept within physical bounds"""
 
 
-class Step(NamedTuple):
+class Outcomes(NamedTuple):
     """What a virtual decision led to; n rows of torch tensors."""
 
     state: LocalState
@@ -39,10 +39,10 @@ class Step(NamedTuple):
     """which of BOUNDS had to be enforced, shape (3, n)"""
 
 
-class World(Protocol):
-    """What a policy can drive in, row by row."""
+class Dynamics(Protocol):
+    """What a decision leads to, row by row."""
 
-    def step(self, state: LocalState, applied: Tensor, drawn: Tensor) -> Step:
+    def step(self, state: LocalState, applied: Tensor, drawn: Tensor) -> Outcomes:
         """Return what `applied` [m/s2], shape (n,), leads to; `drawn`, (n, m), is what the episode drew."""
         ...
 
@@ -64,7 +64,7 @@ def reward_on_tensors(text: str) -> Reward:
     return asked
 
 
-class VirtualWorld:
+class VirtualDynamics:
     """IDM plus residual networks; Eq. 4, for state and reward.
 
     In each step a random member of the ensemble answers for each row. Noise is an error that the model made
@@ -95,7 +95,7 @@ class VirtualWorld:
         self._generator = generator
         self._fixed_members = members
 
-    def step(self, state: LocalState, applied: Tensor, drawn: Tensor) -> Step:
+    def step(self, state: LocalState, applied: Tensor, drawn: Tensor) -> Outcomes:
         """Return what `applied` leads to: next state, reward, and whether that is a crash."""
         scenario = self._scenario
         known = base_step(self._base, scenario, state, applied)
@@ -126,7 +126,7 @@ class VirtualWorld:
         bounded = torch.stack(
             [(speeds != wanted_speeds).any(0), (gaps != wanted_gaps).any(0), left_of_reward != left[-1]]
         )
-        return Step(following, earned + left_of_reward * ~crashed, crashed, bounded)
+        return Outcomes(following, earned + left_of_reward * ~crashed, crashed, bounded)
 
     def _left(self, state: LocalState, applied: Tensor, drawn: Tensor, expected_gaps: Tensor) -> Tensor:
         """Return what the networks add to the base, with noise, shape (n, 6).

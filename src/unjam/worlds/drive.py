@@ -1,28 +1,109 @@
-"""An episode is a pure function: `run_episode(scenario, driver, seed) -> Episode`."""
+"""Driving: the one loop in which a driver and a world meet; and an episode, a pure function of its seed."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from itertools import repeat
-from typing import Any
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 
-from unjam.drivers.driver import Driver, Memory, single_row
-from unjam.drivers.residual import ResidualDriver
+from unjam.drivers.driver import Decision, Driver, Memory, carried, single_row
+from unjam.drivers.residual import EXPERT
 from unjam.errors import InputError
-from unjam.physics.arrays import Array
 from unjam.scenarios.scenario import Scenario
-from unjam.worlds.record import Episode, Floats, Trajectory, outcome_of
+from unjam.tree import mapped
+from unjam.worlds.record import Episode, Floats, outcome_of
 from unjam.worlds.reward import Reward, make_reward
+from unjam.worlds.sumo import make_traffic
 from unjam.worlds.sumo.simulation import Simulation
-from unjam.worlds.sumo.stepping import make_traffic
-from unjam.worlds.sumo.traffic import Stay, Traffic, TrafficLog
+from unjam.worlds.world import Driven, OnProgress, Recorded, World
 
 PROGRESS_STEPS = 10
 """decisions between two reports of progress"""
 
-Progress = Callable[[int], None]
-"""told now and then how many decisions have been made"""
+
+class Drive:
+    """A driver in a world, decision by decision: iterate over it."""
+
+    def __init__(
+        self,
+        world: World[Recorded],
+        driver: Driver,
+        explore: bool = False,
+        memory: Memory | None = None,
+        on_progress: OnProgress | None = None,
+    ) -> None:
+        """Start the world; nothing is decided yet.
+
+        Args:
+            world: where.
+            driver: of every CAV.
+            explore: whether what was learned adds its exploration noise.
+            memory: what the driver remembers already; None: nothing but what the world began with.
+            on_progress: called now and then with the number of decisions made.
+        """
+        self.world, self.driver, self._on_progress = world, driver, on_progress
+        self._noise = world.noise if explore else None
+        history = world.start(not driver.native, on_progress)
+        self.memory = driver.initial_memory(world.rows) if memory is None else memory
+        if history is not None:
+            self.memory = driver.recall(self.memory, history)
+        self.memories: list[Memory] = []
+        """of each CAV by itself before its first decision, in order of entry"""
+        self._note_newcomers()
+        if world.single:
+            self.memory = single_row(self.memory)
+
+    def __iter__(self) -> Iterator[Decision | None]:
+        """Yield each decision once it is carried out; None where the simulator itself drives."""
+        world, driver, noise, made = self.world, self.driver, self._noise, 0
+        perceive, decide, advance = world.perceive, driver.decide, world.advance
+        while not world.ended:
+            if driver.native:
+                decision = None
+                advance(None)
+            else:
+                decision = decide(perceive(), self.memory, noise)
+                self.memory = decision.memory
+                advance(decision.command)
+            self._carry()
+            made += 1
+            if self._on_progress is not None and made % PROGRESS_STEPS == 0:
+                self._on_progress(made)
+            yield decision
+
+    def _carry(self) -> None:
+        """Give each CAV that is on the road now a row of memory, newcomers at the end."""
+        kept, entered = self.world.kept, self.world.entered
+        if kept is not None:
+            new = self.world.rows - len(kept)
+            fresh = self.driver.initial_memory(entered) if new else {}
+            self.memory = carried(self.memory, kept, fresh, new)
+        if entered > len(self.memories):
+            self._note_newcomers()
+
+    def _note_newcomers(self) -> None:
+        """Add the memory of each CAV that has just entered: the last rows."""
+        rows = self.world.rows
+        for row in range(rows - self.world.entered + len(self.memories), rows):
+            self.memories.append(mapped(lambda values: np.array(values[row], np.float64), self.memory))  # noqa: B023
+
+
+def drive(
+    world: World[Recorded],
+    driver: Driver,
+    explore: bool = False,
+    memory: Memory | None = None,
+    on_progress: OnProgress | None = None,
+) -> Recorded:
+    """Drive to the end, and return the world's record of it; arguments as `Drive` takes them."""
+    driving = Drive(world, driver, explore, memory, on_progress)
+    decisions = [
+        decision[1:4] for decision in driving if decision is not None and decision.observation is not None
+    ]
+    last = driver.observation(world.perceive(), driving.memory) if decisions else None
+    if last is None:
+        return world.record(Driven())
+    memories = [each[EXPERT] for each in driving.memories]
+    return world.record(Driven(decisions, last, memories, driver.hold))
 
 
 def run_episode(
@@ -33,7 +114,7 @@ def run_episode(
     explore: bool = False,
     full: bool = False,
     simulation: Simulation | None = None,
-    progress: Progress | None = None,
+    progress: OnProgress | None = None,
 ) -> Episode:
     """Run one episode and return all of it.
 
@@ -62,12 +143,10 @@ def run_episode(
         with Simulation() as simulation:
             return run_episode(scenario, driver, seed, reward, explore, full, simulation, progress)
     traffic = make_traffic(scenario, seed, simulation, driver.plain_numbers, full)
-    log = drive_traffic(traffic, driver, explore, progress)
+    episode = drive(traffic, driver, explore, on_progress=progress)
     if traffic.entered == 0 and not driver.native:
-        raise InputError(
-            f"no CAV was on the road in {traffic.decisions} decisions: let more vehicles be CAVs"
-        )
-    return _episode(traffic, seed, earned, log)
+        raise InputError(f"no CAV was on the road in {episode.steps} decisions: let more vehicles be CAVs")
+    return rewarded(episode, earned)
 
 
 def can_drive(driver: Driver, scenario: Scenario) -> bool:
@@ -75,140 +154,17 @@ def can_drive(driver: Driver, scenario: Scenario) -> bool:
     return scenario.closed or not driver.needs_loop
 
 
-@dataclass(frozen=True)
-class ResidualLog:
-    """What a residual driver decided in an episode."""
-
-    decisions: list[tuple[Array, Array, Array, Array]]
-    """each `Decision` but its memory, which is large"""
-    last_observation: Array
-    memories: list[Memory]
-    """before the first decision, of each CAV by itself, in order of entry"""
-    hold: int
-
-
-def drive_traffic(
-    traffic: Traffic, driver: Driver, explore: bool, progress: Progress | None = None
-) -> ResidualLog | None:
-    """Drive to the end; return what a residual driver decided, None of any other."""
-    history = traffic.start(controlled=not driver.native, progress=progress)
-    memory = driver.initial_memory(len(traffic.cavs))
-    if history is not None and traffic.scenario.recall_warmup:
-        memory = driver.recall(memory, history)
-    residual = driver if isinstance(driver, ResidualDriver) else None
-    memories: list[Memory] = []
-    _note_newcomers(memories, memory, traffic)
-    if traffic.single:
-        memory = single_row(memory)
-    noise = traffic.exploration_noise() if explore else repeat(None)
-    decisions = []
-    for step in range(1, traffic.scenario.horizon + 1):
-        if residual is not None:
-            decision = residual.decide(traffic.local_state(), memory, next(noise))
-            memory = decision.memory
-            decisions.append(decision[:-1])
-            traffic.advance(decision.acceleration)
-        elif driver.native:
-            traffic.advance(None)
-        else:
-            acceleration, memory = driver.act(traffic.local_state(), memory)
-            traffic.advance(acceleration)
-        memory = traffic.carry(memory, driver)
-        if traffic.entered > len(memories):
-            _note_newcomers(memories, memory, traffic)
-        if progress is not None and step % PROGRESS_STEPS == 0:
-            progress(step)
-        if traffic.crashed or traffic.over:
-            break
-    if residual is None:
-        return None
-    last = residual.observation(traffic.local_state(), memory)
-    return ResidualLog(decisions, last, list(map(residual.expert_memory, memories)), residual.hold)
-
-
-def _note_newcomers(memories: list[Memory], memory: Memory, traffic: Traffic) -> None:
-    """Add the memory of each CAV that has just entered: the last rows of `memory`."""
-    count = len(traffic.cavs)
-    for row in range(count - traffic.entered + len(memories), count):
-        memories.append({name: np.array(values[row], np.float64) for name, values in memory.items()})
-
-
-def _episode(traffic: Traffic, seed: Sequence[int], reward: Reward, log: ResidualLog | None) -> Episode:
-    """Put the record of finished traffic in order."""
-    found = traffic.log()
-    outcome = outcome_of(found.speeds.T, found.stays, traffic.crashed)
-    terms = _checked(reward(outcome), traffic.decisions)
-    return Episode(
-        seed=tuple(seed),
-        status="collision" if traffic.crashed else "completed",
-        step=traffic.scenario.decision_step,
-        warmup=traffic.scenario.warmup,
-        drawn=traffic.road.drawn,
-        vehicle_ids=found.vehicle_ids,
-        cav_ids=found.cav_ids,
-        collisions=traffic.collisions,
-        speeds=np.ascontiguousarray(found.speeds.T),
-        positions=np.ascontiguousarray(found.positions.T),
-        gaps=np.ascontiguousarray(found.gaps.T),
-        fuel=found.fuel,
-        terms=terms,
-        trajectories=_trajectories(traffic, found, terms, log),
-        **found.pictured,
+def rewarded(episode: Episode, reward: Reward) -> Episode:
+    """Return an episode with what was earned in it; raise `InputError` where a term is not finite."""
+    # Columns one behind the other: sums over vehicles are rounded in the order of memory.
+    speeds = np.asfortranarray(episode.speeds)
+    outcome = outcome_of(speeds, episode.trajectories, episode.status == "collision")
+    terms = _checked(reward(outcome), episode.steps)
+    trajectories = tuple(
+        replace(each, terms={name: values[each.during] for name, values in terms.items()})
+        for each in episode.trajectories
     )
-
-
-def _trajectories(
-    traffic: Traffic, found: TrafficLog, terms: dict[str, Floats], log: ResidualLog | None
-) -> tuple[Trajectory, ...]:
-    """Return the trajectory of each stay."""
-    trajectories = []
-    for stay in found.stays:
-        during = slice(stay.start, stay.start + len(stay.applied))
-        decided = {
-            "observations": np.zeros((1, 0)),
-            "expert": stay.applied,
-            "residual": np.zeros_like(stay.applied),
-            "memory": {},
-            "hold": 1,
-        }
-        if log is not None:
-            decided = _decided(log, stay, traffic.single)
-        trajectories.append(
-            Trajectory(
-                vehicle=stay.vehicle,
-                start=stay.start,
-                states=stay.states,
-                applied=stay.applied,
-                shield=stay.shield,
-                terms={name: values[during] for name, values in terms.items()},
-                terminated=traffic.crashed and during.stop == traffic.decisions,
-                **decided,
-            )
-        )
-    return tuple(trajectories)
-
-
-def _decided(log: ResidualLog, stay: Stay, single: bool) -> dict[str, Any]:
-    """Return what a residual driver decided during a stay, as entries of its trajectory."""
-    steps = range(stay.start, stay.start + len(stay.applied))
-    seen = [decision[3] for decision in log.decisions] + [log.last_observation]
-    looks = [*steps[:: log.hold], steps.stop]
-    if single:
-        experts, residuals = (np.array([decision[part] for decision in log.decisions]) for part in (1, 2))
-        observations = [seen[step] for step in looks]
-    else:
-        experts, residuals = (
-            np.array([log.decisions[step][part][row] for step, row in zip(steps, stay.rows, strict=False)])
-            for part in (1, 2)
-        )
-        observations = [seen[step][stay.rows[step - stay.start]] for step in looks]
-    return {
-        "observations": np.array(observations, np.float64).reshape(len(looks), -1),
-        "expert": experts,
-        "residual": residuals,
-        "memory": log.memories[stay.number],
-        "hold": log.hold,
-    }
+    return replace(episode, terms=terms, trajectories=trajectories)
 
 
 def _checked(terms: dict[str, Floats], rows: int) -> dict[str, Floats]:

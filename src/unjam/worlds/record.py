@@ -1,7 +1,8 @@
 """What happened in an episode, and how it travels between processes."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -9,6 +10,7 @@ from numpy.typing import NDArray
 
 from unjam.drivers.local_state import LocalState
 from unjam.worlds.reward import Outcome, time_headway
+from unjam.worlds.world import Driven
 
 Floats = NDArray[np.float64]
 
@@ -33,26 +35,79 @@ class Trajectory:
     """the acceleration that was commanded, within the action limit [m/s2]"""
     shield: Floats
     """braking that SUMO's safety check added to the command [m/s2]; zero where it let it pass"""
-    terms: dict[str, Floats]
-    """terms of the reward by name"""
-    memory: dict[str, Floats]
+    memory: dict[str, Any]
     """what the expert remembered before the first decision, without the axis of rows; empty without a
     network"""
     hold: int
     """decisions for which one residual was held"""
     terminated: bool
     """whether a collision ended it; otherwise it was cut by the horizon or by leaving the road"""
+    terms: dict[str, Floats] = field(default_factory=dict)
+    """terms of the reward by name"""
 
     @property
+    def during(self) -> slice:
+        """Its decisions among those of the episode."""
+        return slice(self.start, self.start + len(self.applied))
+
+    @cached_property
     def reward(self) -> Floats:
         """What each decision earned: the sum of the terms."""
         return np.sum(list(self.terms.values()), axis=0)
 
     @property
-    def looks(self) -> tuple[Floats, Floats]:
+    def choices(self) -> tuple[Floats, Floats]:
         """The residuals that the network chose, and what was earned while each was held; shape (looks,)."""
         starts = np.arange(0, len(self.residual), self.hold)
         return self.residual[starts], np.add.reduceat(self.reward, starts)
+
+
+def trajectory(
+    vehicle: str,
+    number: int,
+    start: int,
+    rows: NDArray[np.intp] | None,
+    states: LocalState,
+    applied: Floats,
+    shield: Floats,
+    terminated: bool,
+    driven: Driven,
+) -> Trajectory:
+    """Return the trajectory of a stay, with what the driver decided in it.
+
+    Args:
+        vehicle: its name.
+        number: it was the so many-th CAV to enter, from 0.
+        start: decision of the episode at which it began.
+        rows: its row among the CAVs at each moment, shape (T + 1,); None: decisions are plain numbers.
+        states: what it perceived, shape (T + 1,).
+        applied: its commands; of humans what they did [m/s2], shape (T,).
+        shield: hardest braking that was added to each command [m/s2], shape (T,).
+        terminated: whether a collision ended it.
+        driven: all that the driver decided.
+    """
+    about = (vehicle, start, states)
+    if not driven.decisions:
+        nothing = np.zeros((1, 0)), applied, np.zeros_like(applied)
+        return Trajectory(*about, *nothing, applied, shield, {}, 1, terminated)
+    steps = range(start, start + len(applied))
+    experts, residuals = (
+        np.array(
+            [
+                driven.decisions[step][part]
+                if rows is None
+                else driven.decisions[step][part][rows[step - start]]
+                for step in steps
+            ]
+        )
+        for part in (0, 1)
+    )
+    seen = [decision[2] for decision in driven.decisions] + [driven.last_observation]
+    looks = [*steps[:: driven.hold], steps.stop]
+    found: Any = [seen[step] if rows is None else seen[step][rows[step - start]] for step in looks]
+    observations = np.array(found, np.float64).reshape(len(looks), -1)
+    decided = observations, experts, residuals
+    return Trajectory(*about, *decided, applied, shield, driven.memories[number], driven.hold, terminated)
 
 
 @dataclass(frozen=True)
@@ -128,78 +183,19 @@ def failed_episode(seed: tuple[int, ...], reason: str, error: str) -> Episode:
     return Episode(seed=seed, status="failed", reason=reason, error=error)
 
 
-def outcome_of(speeds: Floats, stays: Sequence[Any], crashed: bool) -> Outcome:
+def outcome_of(speeds: Floats, trajectories: Sequence[Trajectory], crashed: bool) -> Outcome:
     """Return what a reward function sees of a whole episode.
 
     Args:
         speeds: of all vehicles, shape (T + 1, N).
-        stays: of CAVs: each with its first decision, states and commands; or trajectories.
+        trajectories: of CAVs.
         crashed: whether the last decision ended in a collision.
     """
     steps = len(speeds) - 1
-    accelerations, headways = (np.full((steps, len(stays)), np.nan) for _ in range(2))
-    for column, stay in enumerate(stays):
-        during = slice(stay.start, stay.start + len(stay.applied))
-        accelerations[during, column] = stay.applied
-        headways[during, column] = time_headway(stay.states.leader_gap[1:], stay.states.speed[1:])
+    accelerations, headways = (np.full((steps, len(trajectories)), np.nan) for _ in range(2))
+    for column, each in enumerate(trajectories):
+        accelerations[each.during, column] = each.applied
+        headways[each.during, column] = time_headway(each.states.leader_gap[1:], each.states.speed[1:])
     collided = np.zeros(steps, bool)
     collided[-1:] = crashed
     return Outcome(speeds[1:], accelerations, headways, collided)
-
-
-_ARRAYS = ("speeds", "positions", "gaps", "fuel", "outline", "waiting", "lines", "places")
-_TRAJECTORY_ARRAYS = ("observations", "expert", "residual", "applied", "shield")
-
-
-def pack_episode(episode: Episode) -> tuple[dict[str, Any], dict[str, Floats]]:
-    """Return an episode as JSON and arrays; `unpack_episode` undoes it exactly."""
-    arrays = {name: getattr(episode, name) for name in _ARRAYS}
-    facts: dict[str, Any] = {
-        field.name: getattr(episode, field.name)
-        for field in fields(Episode)
-        if field.name not in (*_ARRAYS, "terms", "trajectories")
-    }
-    arrays |= {f"terms.{name}": array for name, array in episode.terms.items()}
-    facts["terms"] = list(episode.terms)
-    facts["trajectories"] = []
-    for index, trajectory in enumerate(episode.trajectories):
-        arrays |= {f"{index}.{name}": getattr(trajectory, name) for name in _TRAJECTORY_ARRAYS}
-        arrays |= {f"{index}.states.{name}": array for name, array in trajectory.states._asdict().items()}
-        arrays |= {f"{index}.terms.{name}": array for name, array in trajectory.terms.items()}
-        arrays |= {f"{index}.memory.{name}": array for name, array in trajectory.memory.items()}
-        facts["trajectories"].append(
-            {
-                "vehicle": trajectory.vehicle,
-                "start": trajectory.start,
-                "terminated": trajectory.terminated,
-                "hold": trajectory.hold,
-                "terms": list(trajectory.terms),
-                "memory": list(trajectory.memory),
-            }
-        )
-    return facts, arrays
-
-
-def unpack_episode(facts: dict[str, Any], arrays: dict[str, Floats]) -> Episode:
-    """Return the episode that `pack_episode` packed."""
-    trajectories = []
-    for index, about in enumerate(facts["trajectories"]):
-        trajectories.append(
-            Trajectory(
-                vehicle=about["vehicle"],
-                start=about["start"],
-                terminated=about["terminated"],
-                hold=about["hold"],
-                states=LocalState(*(arrays[f"{index}.states.{name}"] for name in LocalState._fields)),
-                terms={name: arrays[f"{index}.terms.{name}"] for name in about["terms"]},
-                memory={name: arrays[f"{index}.memory.{name}"] for name in about["memory"]},
-                **{name: arrays[f"{index}.{name}"] for name in _TRAJECTORY_ARRAYS},
-            )
-        )
-    values: dict[str, Any] = {**facts, **{name: arrays[name] for name in _ARRAYS}}
-    values["terms"] = {name: arrays[f"terms.{name}"] for name in facts["terms"]}
-    for name in ("seed", "vehicle_ids", "cav_ids", "branches"):
-        values[name] = tuple(values[name])
-    values["crossings"] = tuple((start, end) for start, end in values["crossings"])
-    values["trajectories"] = tuple(trajectories)
-    return Episode(**values)

@@ -1,12 +1,12 @@
 """Rewards: named terms, and their sum. One place for the actual and the virtual environment."""
 
-import inspect
 from collections.abc import Callable
-from pathlib import Path
+from math import isfinite
 from typing import NamedTuple
 
-from unjam.drivers.from_file import is_file_reference, load_object, user_error
-from unjam.errors import InputError, wrong
+from unjam.drivers.from_file import FileReference, is_file_reference
+from unjam.errors import wrong
+from unjam.parameters import split_parameters
 from unjam.physics.arrays import Array, at_least, namespace
 
 DESIRED_SPEED = 30.0
@@ -81,9 +81,8 @@ def eq16_as_printed(outcome: Outcome) -> dict[str, Array]:
 
 
 def _eq16_costs(outcome: Outcome) -> dict[str, Array]:
-    too_close = at_least(LONGEST_PENALISED_HEADWAY - outcome.headways, 0.0)
     return {
-        "headway": -HEADWAY_WEIGHT * _sum(too_close),
+        "headway": HEADWAY_WEIGHT * too_close(outcome),
         "acceleration": -ACCELERATION_WEIGHT * _sum(abs(outcome.accelerations)),
     }
 
@@ -99,8 +98,7 @@ def released_merge(outcome: Outcome) -> dict[str, Array]:
     there = ~xp.isnan(outcome.speeds)
     missed = _sum((MERGE_SPEED - outcome.speeds) ** 2) / (MERGE_SPEED**2 * at_least(there.sum(-1), 1))
     speed = at_least(1.0 - missed**0.5, 0.0) * there.any(-1) * running
-    too_close = at_least(LONGEST_PENALISED_HEADWAY - outcome.headways, 0.0)
-    headway = -HEADWAY_WEIGHT * _sum(too_close) * running
+    headway = HEADWAY_WEIGHT * too_close(outcome) * running
     return {"speed": speed, "headway": headway, "floor": at_least(-speed - headway, 0.0)}
 
 
@@ -113,6 +111,29 @@ def power(outcome: Outcome) -> dict[str, Array]:
     flow = _sum(outcome.speeds) / (MERGE_SPEED * MERGE_VEHICLES)
     return {"power": flow * _mean(outcome.speeds) / MERGE_SPEED * ~outcome.crashed}
 
+
+def too_close(outcome: Outcome) -> Array:
+    """Term: minus the seconds that CAVs' time headways lack to 1 s."""
+    return -_sum(at_least(LONGEST_PENALISED_HEADWAY - outcome.headways, 0.0))
+
+
+def effort(outcome: Outcome) -> Array:
+    """Term: minus the CAVs' mean squared acceleration [m2/s4]."""
+    return -_mean(outcome.accelerations**2)
+
+
+def unevenness(outcome: Outcome) -> Array:
+    """Term: minus the standard deviation of speed across vehicles [m/s]."""
+    mean = _mean(outcome.speeds)[..., None]
+    return -(_mean((outcome.speeds - mean) ** 2) ** 0.5)
+
+
+TERMS: dict[str, Callable[[Outcome], Array]] = {
+    "headway": too_close,
+    "comfort": effort,
+    "smoothness": unevenness,
+}
+"""what any reward may ask for besides, with a weight"""
 
 REWARDS: dict[str, Reward] = {
     "released": released,
@@ -129,28 +150,48 @@ def time_headway(gap: Array, speed: Array) -> Array:
 
 
 def make_reward(text: str) -> Reward:
-    """Return the reward for a name or for `path.py:name`, a function of the user's own.
+    """Return the reward for a name, with weights of its terms, or for a function of the user's own.
 
-    The user's function takes an `Outcome` and returns its terms by name, or one array.
+    `released:acceleration=2,headway=0.5` is the reward `released` with its term `acceleration` counted twice,
+    and with half of the term `headway` of TERMS besides; `path.py:name` a function that takes an `Outcome`
+    and returns its terms by name, or one array.
 
     Raises:
-        InputError: unknown name, or the file has no such function.
+        InputError: unknown name or term, a weight that is no number, or the file has no such function.
     """
-    if not is_file_reference(text):
-        if text not in REWARDS:
-            raise wrong("reward", text, ", ".join([*REWARDS, "path.py:name"]))
-        return REWARDS[text]
-    file, _, name = text.rpartition(":")
-    path = Path(file).resolve()
-    function = load_object(path, name)
-    if not callable(function) or inspect.isclass(function):
-        raise InputError(f"{path.name}:{name}: is not a function of an Outcome")
+    name, weights = split_parameters(text)
+    for term, weight in weights.items():
+        if isinstance(weight, bool) or not isinstance(weight, int | float) or not isfinite(weight):
+            raise wrong(f"reward {name}: {term}", weight, "a number")
+    if is_file_reference(name):
+        reward = _own_reward(name)
+    elif name in REWARDS:
+        reward = REWARDS[name]
+    else:
+        raise wrong("reward", name, ", ".join([*REWARDS, "path.py:name"]))
+    return _weighted(reward, weights) if weights else reward
 
-    def checked(outcome: Outcome) -> dict[str, Array]:
-        try:
-            terms = function(outcome)
-        except Exception as error:
-            raise user_error(error, path, name) from error
+
+def _own_reward(name: str) -> Reward:
+    reference = FileReference.of(name)
+    function = reference.function("an Outcome")
+
+    def own(outcome: Outcome) -> dict[str, Array]:
+        terms = reference.ask(function, outcome)
         return terms if isinstance(terms, dict) else {"reward": terms}
 
-    return checked
+    return own
+
+
+def _weighted(reward: Reward, weights: dict[str, float]) -> Reward:
+    """Return a reward whose terms count as `weights` says; those that it does not have come from TERMS."""
+
+    def weighted(outcome: Outcome) -> dict[str, Array]:
+        terms = reward(outcome)
+        for name, weight in weights.items():
+            if name not in terms and name not in TERMS:
+                raise wrong("reward: term", name, ", ".join(dict.fromkeys([*terms, *TERMS])))
+            terms[name] = weight * (terms[name] if name in terms else TERMS[name](outcome))
+        return terms
+
+    return weighted

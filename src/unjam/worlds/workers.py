@@ -17,8 +17,9 @@ from unjam.drivers.registry import recipe_of
 from unjam.errors import EpisodeError
 from unjam.scenarios.registry import scenario_recipe
 from unjam.scenarios.scenario import Scenario
-from unjam.worlds.messages import Arrays, read_message, write_message
-from unjam.worlds.record import Episode, failed_episode, unpack_episode
+from unjam.tree import Arrays, unpack
+from unjam.worlds.record import Episode, failed_episode
+from unjam.worlds.worker import read_message, write_message
 
 ATTEMPTS = 3
 """how often an episode is tried before its row says that it failed"""
@@ -192,7 +193,7 @@ class _Worker:
                     raise _WorkerLost(self._why(process))
                 facts, arrays = message
                 if "episode" in facts:
-                    return unpack_episode(facts["episode"], arrays)
+                    return unpack(Episode, facts["episode"], arrays)
                 progress(facts["progress"])
         except queue.Empty:
             self._kill()

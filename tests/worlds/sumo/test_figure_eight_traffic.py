@@ -13,9 +13,9 @@ from unjam.measures.metrics import measure
 from unjam.scenarios.figure_eight import FigureEight
 from unjam.scenarios.scenario import SMALLEST_CAV_GAP
 from unjam.worlds.drive import run_episode
+from unjam.worlds.sumo import make_traffic
 from unjam.worlds.sumo.closed import ClosedTraffic
 from unjam.worlds.sumo.simulation import Simulation
-from unjam.worlds.sumo.stepping import make_traffic
 from unjam.worlds.workers import EpisodeTask, Workers
 
 SEEDS = 5

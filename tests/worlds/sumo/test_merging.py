@@ -15,9 +15,9 @@ from unjam.measures.metrics import measure
 from unjam.scenarios import Merge
 from unjam.worlds.drive import run_episode
 from unjam.worlds.record import Episode
+from unjam.worlds.sumo import make_traffic
 from unjam.worlds.sumo.merging import MergingTraffic
 from unjam.worlds.sumo.simulation import Simulation
-from unjam.worlds.sumo.stepping import make_traffic
 from unjam.worlds.workers import EpisodeTask, Workers
 
 STEP = 0.2

@@ -5,10 +5,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from unjam.scenarios import Ring
+from unjam.worlds.sumo import make_traffic
 from unjam.worlds.sumo.closed import ClosedTraffic
 from unjam.worlds.sumo.neighbours import loop_neighbours, loop_state
 from unjam.worlds.sumo.simulation import Simulation
-from unjam.worlds.sumo.stepping import make_traffic
 
 CAR = 5.0
 

@@ -10,13 +10,13 @@ from tests.conftest import random_network
 from tests.worlds.test_record import fingerprint, travelled
 from unjam.drivers import IDM, Constant, Driver, Human, LocalState, Memory, PISaturation, ResidualDriver
 from unjam.drivers.from_file import FunctionDriver
-from unjam.drivers.local_state import local_vector
+from unjam.drivers.observation import local_vector
 from unjam.errors import InputError
 from unjam.scenarios import Merge
 from unjam.worlds.drive import run_episode
 from unjam.worlds.record import Episode, Trajectory
+from unjam.worlds.sumo import make_traffic
 from unjam.worlds.sumo.simulation import Simulation
-from unjam.worlds.sumo.stepping import make_traffic
 from unjam.worlds.workers import EpisodeTask, Workers
 
 MERGE = Merge(penetration=0.3, horizon=120)

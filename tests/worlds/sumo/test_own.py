@@ -15,9 +15,9 @@ from unjam.errors import InputError
 from unjam.measures.metrics import measure
 from unjam.scenarios import Scenario, make_scenario
 from unjam.worlds.drive import run_episode
+from unjam.worlds.sumo import make_traffic
 from unjam.worlds.sumo.own import OwnTraffic
 from unjam.worlds.sumo.simulation import Simulation
-from unjam.worlds.sumo.stepping import make_traffic
 from unjam.worlds.workers import EpisodeTask, Workers
 
 

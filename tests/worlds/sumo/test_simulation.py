@@ -12,8 +12,8 @@ from unjam.errors import EpisodeError, UnjamError
 from unjam.scenarios import Ring, make_scenario
 from unjam.scenarios.road import ClosedRoad
 from unjam.worlds.drive import run_episode
+from unjam.worlds.sumo import make_traffic
 from unjam.worlds.sumo.simulation import Backend, Simulation
-from unjam.worlds.sumo.stepping import make_traffic
 
 RING = Ring(horizon=100, length=(230, 230))
 

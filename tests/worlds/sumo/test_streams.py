@@ -12,9 +12,9 @@ from unjam.errors import EpisodeError
 from unjam.scenarios import Merge
 from unjam.scenarios.road import Origin
 from unjam.scenarios.scenario import SMALLEST_CAV_GAP
+from unjam.worlds.sumo import make_traffic
 from unjam.worlds.sumo.merging import MergingTraffic
 from unjam.worlds.sumo.simulation import Simulation
-from unjam.worlds.sumo.stepping import make_traffic
 from unjam.worlds.sumo.streams import FAR, Streams
 
 WAYS = (24.0, 23.0)

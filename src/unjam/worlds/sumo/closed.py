@@ -5,28 +5,30 @@ call on 22 numbers then costs more than a list comprehension.
 """
 
 from array import array
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from itertools import compress
 from operator import add
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from unjam.drivers.command import Command
 from unjam.drivers.local_state import LocalState
 from unjam.errors import EpisodeError
-from unjam.physics.arrays import Array, clip
+from unjam.physics.arrays import Array
 from unjam.physics.kinematics import next_position, next_speed
 from unjam.scenarios.road import ClosedRoad
 from unjam.scenarios.scenario import Scenario
-from unjam.worlds.sumo.neighbours import loop_neighbours, loop_state
+from unjam.worlds.record import Episode, trajectory
+from unjam.worlds.sumo.neighbours import loop_neighbours, loop_state, places_along
 from unjam.worlds.sumo.people import drivers_of, wanted_speeds
-from unjam.worlds.sumo.places import places_along
 from unjam.worlds.sumo.simulation import Simulation
-from unjam.worlds.sumo.traffic import Scene, Stay, Traffic, TrafficLog
+from unjam.worlds.sumo.traffic import Scene, Seed, Traffic
+from unjam.worlds.world import Driven, OnProgress
 
 HISTORY = 60.0
 """seconds of the warm-up that a driver may remember"""
-WARMUP_PROGRESS_STEPS = 500
 NOISE_BLOCK = 100
 """steps for which noise is drawn at once"""
 ODOMETER_TOLERANCE = 1e-6
@@ -37,22 +39,16 @@ class ClosedTraffic(Traffic[ClosedRoad]):
     """The actual environment of a closed road."""
 
     def __init__(
-        self,
-        scenario: Scenario,
-        road: ClosedRoad,
-        seeds: Sequence[np.random.SeedSequence],
-        simulation: Simulation,
-        plain_numbers: bool,
-        full: bool,
+        self, scenario: Scenario, road: ClosedRoad, seed: Seed, simulation: Simulation, full: bool
     ) -> None:
         """Put the vehicles on the road; nothing moves yet."""
-        super().__init__(scenario, road, seeds, simulation, full)
+        super().__init__(scenario, road, seed, simulation, full)
         self.entered = len(road.cav_ids)
         self._places = {name: place for place, name in enumerate(road.vehicle_ids)}
         cavs = [self._places[name] for name in road.cav_ids]
-        self.single = plain_numbers and len(cavs) == 1
         self._cavs = cavs
-        self._near = loop_neighbours(cavs[0] if self.single else np.array(cavs), len(road.vehicle_ids))
+        self._near = loop_neighbours(np.array(cavs), len(road.vehicle_ids))
+        self._near_single = loop_neighbours(cavs[0], len(road.vehicle_ids))
         self._commanded = scenario.people == "commanded"
         self._drivers = drivers_of(scenario, road, road.vehicle_ids)
         needed = [range(len(road.vehicle_ids))] if self._commanded else self._near
@@ -64,6 +60,7 @@ class ClosedTraffic(Traffic[ClosedRoad]):
         self._be_human(road.vehicle_ids)
         if self._commanded:
             simulation.command_people(road.vehicle_ids, scenario.right_of_way)
+        self._exploration: Any = None
         self._speeds = simulation.speeds(road.vehicle_ids)
         if simulation.vehicle_count() != len(road.vehicle_ids):
             self._miss()
@@ -84,22 +81,17 @@ class ClosedTraffic(Traffic[ClosedRoad]):
         self._log_applied = array("d")
         self._log_commanded = array("d")
 
-    def start(self, controlled: bool, progress: Callable[[int], None] | None = None) -> LocalState | None:
+    def start(self, controlled: bool, on_progress: OnProgress | None = None) -> LocalState | None:
         """Run the warm-up, then hand the CAVs over."""
         scenario, history = self.scenario, None
-        for step in range(scenario.warmup):
-            self._simulate()
-            if self.crashed:
-                raise EpisodeError(f"collision in step {step} of the all-human warm-up")
-            if progress is not None and step % WARMUP_PROGRESS_STEPS == 0:
-                progress(0)
-        if scenario.warmup:
+        self._warm_up(self._simulate, on_progress)
+        if scenario.warmup and scenario.recall_warmup:
             each = scenario.steps_per_decision
             moments = list(range(scenario.warmup - each, -1, -each))[
                 : round(HISTORY / scenario.decision_step)
             ]
             states = self.states(*self.speeds_and_positions(), np.array(self._cavs))
-            history = LocalState(*(values[:, moments[::-1]] for values in states))
+            history = states.each(lambda values: values[:, moments[::-1]])
         self._controlled = controlled
         if controlled:
             self._simulation.take_control(self.road.cav_ids, scenario.actuation, scenario.right_of_way)
@@ -121,25 +113,23 @@ class ClosedTraffic(Traffic[ClosedRoad]):
         """Return where the front bumpers of all vehicles are now along the road, not wrapped [m]."""
         return self.road.start_positions + np.array(self._simulation.distances(self.road.vehicle_ids))
 
-    def local_state(self) -> LocalState:
+    def perceive(self) -> LocalState:
         """Return what the CAVs perceive now."""
         near = self._near_positions
         if self.single:
-            return loop_state(self._speeds, near, self._near, self.road.loop_length)
+            return loop_state(self._speeds, near, self._near_single, self.road.loop_length)
         positions = np.full(len(self._speeds), np.nan)
         positions[list(near)] = list(near.values())
         return loop_state(np.array(self._speeds), positions, self._near, self.road.loop_length)
 
-    def advance(self, acceleration: Array | None) -> None:
+    def advance(self, command: Command | None) -> None:
         """Simulate one decision."""
         scenario, cavs = self.scenario, self._cavs
         if not self._controlled:
             for _ in range(scenario.steps_per_decision):
                 self._simulate()
         else:
-            values = self._checked(acceleration)
-            limit, step = scenario.action_limit, scenario.simulation_step
-            applied = [clip(value, -limit, limit) for value in values]
+            step, applied = scenario.simulation_step, self._told(command)
             self._log_applied.fromlist(applied)
             for _ in range(scenario.steps_per_decision):
                 speeds = self._speeds
@@ -189,10 +179,12 @@ class ClosedTraffic(Traffic[ClosedRoad]):
         )
         self._simulation.command_speeds(self._human_ids, wanted)
 
-    def exploration_noise(self) -> Iterator[Array]:
-        """Yield standard normal noise, drawn for the whole episode at once."""
-        noise = self._exploration_generator.standard_normal((self.scenario.horizon, len(self._cavs)))
-        return iter(noise[:, 0].tolist() if self.single else noise)
+    def noise(self) -> Array:
+        """Return standard normal noise of this decision, drawn for the whole episode at once."""
+        if self._exploration is None:
+            drawn = self._exploration_generator.standard_normal((self.scenario.horizon, len(self._cavs)))
+            self._exploration = drawn[:, 0].tolist() if self.single else drawn
+        return self._exploration[self.decisions]
 
     def _next_noise(self) -> list[float]:
         """Return by how much noise changes each speed in this step, not at all for CAVs [m/s]."""
@@ -229,33 +221,38 @@ class ClosedTraffic(Traffic[ClosedRoad]):
         near = loop_neighbours(places, len(self.road.vehicle_ids))
         return loop_state(speeds, positions, near, self.road.loop_length)
 
-    def log(self) -> TrafficLog:
+    def record(self, driven: Driven) -> Episode:
         """Return what happened since the start."""
         road, each = self.road, self.scenario.steps_per_decision
         speeds, positions = (values[:, ::each] for values in self.speeds_and_positions())
         states = self.states(speeds, positions, np.arange(len(road.vehicle_ids)))
         applied, shield = self._applied(), self._shield()
-        stays = [
-            Stay(
+        trajectories = tuple(
+            trajectory(
                 vehicle=name,
                 number=row,
                 start=0,
-                rows=np.full(self.decisions + 1, row),
-                states=LocalState(*(np.ascontiguousarray(values[place]) for values in states)),
+                rows=None if self.single else np.full(self.decisions + 1, row),
+                states=states.each(lambda values: np.ascontiguousarray(values[place])),  # noqa: B023
                 applied=np.ascontiguousarray(applied[:, row]),
                 shield=np.ascontiguousarray(shield[:, row]),
+                terminated=self.crashed,
+                driven=driven,
             )
             for row, (name, place) in enumerate(zip(road.cav_ids, self._cavs, strict=True))
-        ]
-        fuel = np.array(self.log_fuel) if self.full else np.zeros((0, 0))
-        pictured = {
-            "limit_speed": road.limit_speed,
-            "loop_length": road.loop_length,
-            "crossings": road.crossings,
-            "outline": road.outline,
-        }
-        return TrafficLog(
-            road.vehicle_ids, road.cav_ids, speeds, positions, states.leader_gap, fuel, stays, pictured
+        )
+        return Episode(
+            **self._facts(),
+            vehicle_ids=road.vehicle_ids,
+            cav_ids=road.cav_ids,
+            speeds=np.ascontiguousarray(speeds.T),
+            positions=np.ascontiguousarray(positions.T),
+            gaps=np.ascontiguousarray(states.leader_gap.T),
+            fuel=np.array(self.log_fuel) if self.full else np.zeros((0, 0)),
+            loop_length=road.loop_length,
+            crossings=road.crossings,
+            outline=road.outline,
+            trajectories=trajectories,
         )
 
     def scene(self) -> Scene:

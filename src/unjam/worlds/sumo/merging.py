@@ -10,14 +10,17 @@ from unjam.drivers.local_state import LocalState
 from unjam.errors import EpisodeError
 from unjam.physics.idm import idm_acceleration, parameter_rows
 from unjam.physics.kinematics import next_speed
+from unjam.scenarios.population import as_calibrated
 from unjam.scenarios.road import MergingRoad
 from unjam.scenarios.scenario import Scenario
+from unjam.worlds.record import Episode
 from unjam.worlds.sumo.network_files import network_file, network_lines
 from unjam.worlds.sumo.open import OpenTraffic
-from unjam.worlds.sumo.people import LEAVE_TO_SUMO, as_calibrated, drivers_of
+from unjam.worlds.sumo.people import LEAVE_TO_SUMO, drivers_of
 from unjam.worlds.sumo.simulation import Simulation
 from unjam.worlds.sumo.streams import Streams
-from unjam.worlds.sumo.traffic import Floats, TrafficLog
+from unjam.worlds.sumo.traffic import Floats, Seed
+from unjam.worlds.world import Driven
 
 BRANCHES = ("highway", "ramp")
 ODOMETER_TOLERANCE = 1e-6
@@ -28,15 +31,10 @@ class MergingTraffic(OpenTraffic[MergingRoad]):
     """The actual environment of a merge."""
 
     def __init__(
-        self,
-        scenario: Scenario,
-        road: MergingRoad,
-        seeds: Sequence[np.random.SeedSequence],
-        simulation: Simulation,
-        full: bool,
+        self, scenario: Scenario, road: MergingRoad, seed: Seed, simulation: Simulation, full: bool
     ) -> None:
         """Put the first vehicles on the road; nothing moves yet."""
-        super().__init__(scenario, road, seeds, simulation, full)
+        super().__init__(scenario, road, seed, simulation, full)
         self._streams = Streams()
 
     def _is_cav(self, name: str) -> bool:
@@ -86,17 +84,17 @@ class MergingTraffic(OpenTraffic[MergingRoad]):
 
     def _states(self, names: Sequence[str]) -> LocalState:
         places = [self._streams.names.index(name) for name in names]
-        return LocalState(*(values[places] for values in self._states_of_all))
+        return self._states_of_all.each(lambda values: values[places])
 
-    def log(self) -> TrafficLog:
+    def record(self, driven: Driven) -> Episode:
         """Return what happened since the start; positions are checked against SUMO's odometer."""
         streams = self._streams
         entered = np.array([self.road.origins[name].position for name in streams.names])
-        driven = np.array(self._simulation.distances(streams.names))
-        error = float(np.abs(entered + driven - streams.positions).max(initial=0.0))
+        odometer = np.array(self._simulation.distances(streams.names))
+        error = float(np.abs(entered + odometer - streams.positions).max(initial=0.0))
         if error > ODOMETER_TOLERANCE:
             raise EpisodeError(f"positions differ from SUMO's odometer by {error:.2g} m")
-        return super().log()
+        return super().record(driven)
 
     def _lines(self) -> Floats:
         return network_lines(network_file(self.road.network))
@@ -104,4 +102,4 @@ class MergingTraffic(OpenTraffic[MergingRoad]):
     def _pictured(self, vehicles: Sequence[str]) -> dict[str, Any]:
         branches = tuple(BRANCHES[self.road.origins[name].branch] for name in vehicles)
         lines = self._lines() if self.full else np.zeros((0, 2))
-        return {"limit_speed": self.road.limit_speed, "branches": branches, "lines": lines}
+        return {"branches": branches, "lines": lines}

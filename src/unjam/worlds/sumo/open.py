@@ -1,19 +1,18 @@
 """Traffic on roads with ends: vehicles come and go, and each stay of a CAV is a trajectory of its own."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
-from unjam.drivers.driver import Driver, Memory
+from unjam.drivers.command import Command
 from unjam.drivers.local_state import LocalState
-from unjam.errors import EpisodeError
-from unjam.physics.arrays import Array, clip
 from unjam.physics.kinematics import next_speed
 from unjam.scenarios.scenario import Scenario
-from unjam.worlds.sumo.closed import WARMUP_PROGRESS_STEPS
+from unjam.worlds.record import Episode, Trajectory, trajectory
 from unjam.worlds.sumo.simulation import Simulation
-from unjam.worlds.sumo.traffic import Floats, RoadKind, Scene, Stay, Traffic, TrafficLog
+from unjam.worlds.sumo.traffic import Floats, RoadKind, Scene, Seed, Traffic
+from unjam.worlds.world import Driven, OnProgress
 
 
 class OpenTraffic(Traffic[RoadKind]):
@@ -24,15 +23,10 @@ class OpenTraffic(Traffic[RoadKind]):
     """
 
     def __init__(
-        self,
-        scenario: Scenario,
-        road: RoadKind,
-        seeds: Sequence[np.random.SeedSequence],
-        simulation: Simulation,
-        full: bool,
+        self, scenario: Scenario, road: RoadKind, seed: Seed, simulation: Simulation, full: bool
     ) -> None:
         """Put the vehicles on the road; nothing moves yet."""
-        super().__init__(scenario, road, seeds, simulation, full)
+        super().__init__(scenario, road, seed, simulation, full)
         self._on_road: dict[str, bool] = {}
         """who is there, in order of entry; true: to be driven by the driver"""
         self._cavs: list[str] = []
@@ -65,19 +59,10 @@ class OpenTraffic(Traffic[RoadKind]):
 
     # What all of them do alike.
 
-    def start(self, controlled: bool, progress: Callable[[int], None] | None = None) -> LocalState | None:
-        """Run the warm-up, then hand the CAVs over; drivers remember nothing of it.
-
-        Returns:
-            None.
-        """
+    def start(self, controlled: bool, on_progress: OnProgress | None = None) -> None:
+        """Run the warm-up, then hand the CAVs over; drivers remember nothing of it."""
         self._follow()
-        for step in range(self.scenario.warmup):
-            self._simulate({})
-            if self.crashed:
-                raise EpisodeError(f"collision in step {step} of the all-human warm-up")
-            if progress is not None and step % WARMUP_PROGRESS_STEPS == 0:
-                progress(0)
+        self._warm_up(lambda: self._simulate({}), on_progress)
         self._controlled = controlled
         self._log_moments: list[tuple[Sequence[str], Sequence[float], Sequence[float], Sequence[float]]] = []
         self._log_cavs: list[list[str]] = []
@@ -87,7 +72,6 @@ class OpenTraffic(Traffic[RoadKind]):
         self._log_places: list[Floats] = []
         self._waiting, self._arrived = [], 0
         self._look()
-        return None
 
     @property
     def cavs(self) -> Sequence[str]:
@@ -95,33 +79,19 @@ class OpenTraffic(Traffic[RoadKind]):
         return self._cavs
 
     @property
-    def stayed(self) -> Sequence[int]:
-        """Rows of the CAVs before the last decision that are on the road after it."""
-        return self._kept
+    def kept(self) -> Sequence[int] | None:
+        """Rows of the CAVs before the last decision that are on the road after it; None: the same ones."""
+        return None if len(self._kept) == self._before == len(self._cavs) else self._kept
 
-    def local_state(self) -> LocalState:
+    def perceive(self) -> LocalState:
         """Return what the CAVs perceive now: arrays of shape (CAVs,)."""
         return self._log_states[-1]
 
-    def carry(self, memory: Memory, driver: Driver) -> Memory:
-        """Return the memory of those who stay and, behind them, of those who have just entered."""
-        new = len(self._cavs) - len(self._kept)
-        if not new and len(self._kept) == self._before:
-            return memory
-        kept = {name: rows[self._kept] for name, rows in memory.items()}
-        if not new:
-            return kept
-        fresh = driver.initial_memory(self.entered)
-        return {name: np.concatenate([rows, fresh[name][-new:]]) for name, rows in kept.items()}
-
-    def advance(self, acceleration: Array | None) -> None:
+    def advance(self, command: Command | None) -> None:
         """Simulate one decision of the CAVs that are on the road, as `Traffic` says."""
         scenario, names = self.scenario, self._cavs
         step = scenario.simulation_step
-        applied: list[float] = []
-        if self._controlled:
-            limit = scenario.action_limit
-            applied = [clip(value, -limit, limit) for value in self._checked(acceleration)]
+        applied = self._told(command) if self._controlled else []
         before = self._log_states[-1].speed
         shield = dict.fromkeys(names, 0.0)
         for _ in range(scenario.steps_per_decision):
@@ -204,32 +174,39 @@ class OpenTraffic(Traffic[RoadKind]):
         """Speeds of all vehicles on the road now [m/s]."""
         return self._log_moments[-1][1]
 
-    def log(self) -> TrafficLog:
+    def record(self, driven: Driven) -> Episode:
         """Return what happened since the start."""
         names = list(dict.fromkeys(name for moment in self._log_moments for name in moment[0]))
         column = {name: index for index, name in enumerate(names)}
-        speeds, positions, gaps = (np.full((len(names), self.decisions + 1), np.nan) for _ in range(3))
-        places = np.full((self.decisions + 1, len(names), 3), np.nan) if self.full else np.zeros((0, 0, 3))
+        shape = (self.decisions + 1, len(names))
+        speeds, positions, gaps = (np.full(shape, np.nan) for _ in range(3))
+        places = np.full((*shape, 3), np.nan) if self.full else np.zeros((0, 0, 3))
+        fuel = np.full((len(self.log_fuel), len(names)), np.nan) if self.full else np.zeros((0, 0))
         for time, (there, *values) in enumerate(self._log_moments):
             columns = [column[name] for name in there]
             for array, row in zip((speeds, positions, gaps), values, strict=True):
-                array[columns, time] = row
+                array[time, columns] = row
             if self.full:
                 places[time, columns] = self._log_places[time]
-        fuel = np.full((len(self.log_fuel), len(names)), np.nan) if self.full else np.zeros((0, 0))
-        for time, rates in enumerate(self.log_fuel):
-            fuel[time, [column[name] for name in self._log_moments[time + 1][0]]] = rates
-        stays = self._stays()
-        pictured = {
-            "arrived": self._arrived,
-            "waiting": np.array(self._waiting, np.float64),
-            "places": places,
-            **self._pictured(names),
-        }
-        cav_ids = tuple(dict.fromkeys(stay.vehicle for stay in stays))
-        return TrafficLog(tuple(names), cav_ids, speeds, positions, gaps, fuel, stays, pictured)
+                if time:
+                    fuel[time - 1, columns] = self.log_fuel[time - 1]
+        trajectories = self._trajectories(driven)
+        facts = {**self._facts(), **self._pictured(names)}
+        return Episode(
+            **facts,
+            vehicle_ids=tuple(names),
+            cav_ids=tuple(dict.fromkeys(each.vehicle for each in trajectories)),
+            speeds=speeds,
+            positions=positions,
+            gaps=gaps,
+            fuel=fuel,
+            arrived=self._arrived,
+            waiting=np.array(self._waiting, np.float64),
+            places=places,
+            trajectories=trajectories,
+        )
 
-    def _stays(self) -> list[Stay]:
+    def _trajectories(self, driven: Driven) -> tuple[Trajectory, ...]:
         """Return the stays of at least one decision, in order of entry."""
         rows: dict[str, list[int]] = {}
         first: dict[str, int] = {}
@@ -237,29 +214,29 @@ class OpenTraffic(Traffic[RoadKind]):
             for row, name in enumerate(names):
                 first.setdefault(name, time)
                 rows.setdefault(name, []).append(row)
-        stays = []
+        found = []
         for number, (name, places) in enumerate(rows.items()):
             start, steps = first[name], len(places) - 1
             if steps == 0:
                 continue
             moments = list(enumerate(places, start))
-            stays.append(
-                Stay(
+            states = zip(*self._log_states, strict=True)
+            found.append(
+                trajectory(
                     vehicle=name,
                     number=number,
                     start=start,
                     rows=np.array(places),
                     states=LocalState(
-                        *(
-                            np.array([values[time][row] for time, row in moments])
-                            for values in zip(*self._log_states, strict=True)
-                        )
+                        *(np.array([values[time][row] for time, row in moments]) for values in states)
                     ),
                     applied=np.array([self._log_applied[time][row] for time, row in moments[:-1]]),
                     shield=np.array([self._log_shield[time][row] for time, row in moments[:-1]]),
+                    terminated=self.crashed and start + steps == self.decisions,
+                    driven=driven,
                 )
             )
-        return stays
+        return tuple(found)
 
     def scene(self) -> Scene:
         """Return this moment as pictures show it."""

@@ -10,30 +10,26 @@ from typing import Any
 import numpy as np
 
 from unjam.drivers.local_state import LARGEST_GAP, LocalState
-from unjam.scenarios.own_network import CAV_TYPES
 from unjam.scenarios.road import OwnRoad
 from unjam.scenarios.scenario import Scenario
-from unjam.sumo_files import read_sumo_files
+from unjam.worlds.record import Episode
 from unjam.worlds.sumo.network_files import edge_lengths, network_lines
 from unjam.worlds.sumo.open import OpenTraffic
 from unjam.worlds.sumo.simulation import Simulation
-from unjam.worlds.sumo.traffic import Floats, TrafficLog
+from unjam.worlds.sumo.traffic import Floats, Seed
+from unjam.worlds.sumo.vehicle_types import CAV_TYPES
+from unjam.worlds.world import Driven
 
 
 class OwnTraffic(OpenTraffic[OwnRoad]):
     """The actual environment of a network of the user's own."""
 
     def __init__(
-        self,
-        scenario: Scenario,
-        road: OwnRoad,
-        seeds: Sequence[np.random.SeedSequence],
-        simulation: Simulation,
-        full: bool,
+        self, scenario: Scenario, road: OwnRoad, seed: Seed, simulation: Simulation, full: bool
     ) -> None:
         """Put the first vehicles on the road; nothing moves yet."""
-        super().__init__(scenario, road, seeds, simulation, full)
-        self._network = read_sumo_files(road.network.path).network
+        super().__init__(scenario, road, seed, simulation, full)
+        self._network = road.files.network
         self._routes: Counter[tuple[str, ...]] = Counter()
         self._log_edges: list[list[tuple[str, float]]] = []
         self._allowed: list[float] = []
@@ -88,9 +84,9 @@ class OwnTraffic(OpenTraffic[OwnRoad]):
         speed = np.array(self._simulation.speeds(names), np.float64)
         return LocalState(speed, leader_speed, leader_gap, follower_speed, follower_gap, unknown, unknown)
 
-    def log(self) -> TrafficLog:
+    def record(self, driven: Driven) -> Episode:
         """Return what happened since the start; positions are those along the route that is driven most."""
-        found = super().log()
+        found = super().record(driven)
         if not self.full or not self._routes:
             return found
         lengths = edge_lengths(self._network)
@@ -104,7 +100,7 @@ class OwnTraffic(OpenTraffic[OwnRoad]):
         positions = np.full_like(found.positions, np.nan)
         for time, ((names, *_), places) in enumerate(zip(self._log_moments, self._log_edges, strict=True)):
             for name, (edge, along) in zip(names, places, strict=True):
-                positions[column[name], time] = begins.get(edge, np.nan) + along
+                positions[time, column[name]] = begins.get(edge, np.nan) + along
         return replace(found, positions=positions)
 
     def _lines(self) -> Floats:

@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 
 from unjam.drivers.idm import SMALLEST_GAP
-from unjam.physics.arrays import Array, at_least, clip
+from unjam.physics.arrays import at_least
 from unjam.physics.idm import IDMParameters, idm_acceleration
 from unjam.physics.kinematics import gap_on_loop
-from unjam.scenarios.population import Population, residual_inputs
+from unjam.scenarios.population import as_calibrated
 from unjam.scenarios.road import ClosedRoad, Road
 from unjam.scenarios.scenario import VEHICLE_LENGTH, Scenario
 
@@ -20,20 +20,6 @@ LEAVE_TO_SUMO = -1.0
 def drivers_of(scenario: Scenario, road: Road, names: Sequence[str]) -> list[IDMParameters]:
     """Return how the human driver of each vehicle drives."""
     return [road.people.get(name, scenario.humans) for name in names]
-
-
-def as_calibrated(
-    population: Population | None, acceleration: Array, speed: Array, leader_speed: Array, gap: Array
-) -> Array:
-    """Return IDM accelerations with what a population adds to them: its residual and its limits [m/s2].
-
-    Shapes: all arrays (n,). Without a population the accelerations are as they were.
-    """
-    if population is None:
-        return acceleration
-    if population.residual is not None:
-        acceleration = acceleration + population.residual(residual_inputs(speed, leader_speed, gap))
-    return clip(acceleration, *population.limits)
 
 
 def wanted_speeds(

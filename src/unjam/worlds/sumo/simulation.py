@@ -16,9 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from unjam.errors import EpisodeError, MissingPartError, UnjamError
-from unjam.scenarios.road import PlainNetwork, Road
-from unjam.scenarios.scenario import Actuation
+from unjam.scenarios.road import BuiltRoad, OwnRoad, Road
+from unjam.scenarios.scenario import Actuation, Scenario
 from unjam.worlds.sumo.network_files import network_file, sumo_program
+from unjam.worlds.sumo.vehicle_types import own_types_xml, traffic_xml
 
 Backend = Literal["libsumo", "traci", "gui"]
 """`libsumo`: in this process; `traci`: SUMO as a child process; `gui`: the same, with its window."""
@@ -85,15 +86,13 @@ class Simulation:
         self.waiting: Callable[[], Sequence[str]] = call("simulation", "getPendingVehicles")
         """who wants to enter and cannot"""
 
-    def load(self, road: Road, step: float, seed: int) -> None:
+    def load(self, scenario: Scenario, road: Road, seed: int) -> None:
         """Start an episode: load network and traffic, and put the vehicles on the road.
 
         Raises:
             EpisodeError: SUMO refuses the files; the message holds its reason.
         """
-        traffic = Path(self._folder.name) / "traffic.rou.xml"
-        traffic.write_text(road.traffic)
-        options = self._options(road, traffic, step, seed)
+        options = [*self._files(scenario, road), *self._options(scenario.simulation_step, seed)]
         try:
             if self._running:
                 self._sumo.load(options)
@@ -118,17 +117,22 @@ class Simulation:
         self._sumo = traci.getConnection(label)
         self._bind()
 
-    def _options(self, road: Road, traffic: Path, step: float, seed: int) -> list[str]:
-        if isinstance(road.network, PlainNetwork):
-            # Vehicles neither vanish from a jam nor give up waiting to enter.
-            patience = ["--time-to-teleport", "-1", "--max-depart-delay", "-1"]
-            files = ["--net-file", str(network_file(road.network)), "--route-files", str(traffic), *patience]
-        else:  # its own words about all that is not named below
-            additional = ",".join(str(path) for path in (*road.network.additional_files, traffic))
-            files = ["--configuration-file", str(road.network.path), "--additional-files", additional]
-            files += ["--verbose", "false"]
+    def _files(self, scenario: Scenario, road: Road) -> list[str]:
+        """Write what SUMO reads of an episode, and return the options that name it."""
+        traffic = Path(self._folder.name) / "traffic.rou.xml"
+        if isinstance(road, OwnRoad):  # its own words about all that is not named here
+            traffic.write_text(own_types_xml(scenario, road))
+            additional = ",".join(str(path) for path in (*road.files.additional_files, traffic))
+            files = ["--configuration-file", str(road.files.path), "--additional-files", additional]
+            return [*files, "--verbose", "false"]
+        assert isinstance(road, BuiltRoad)
+        traffic.write_text(traffic_xml(scenario, road))
+        # Vehicles neither vanish from a jam nor give up waiting to enter.
+        patience = ["--time-to-teleport", "-1", "--max-depart-delay", "-1"]
+        return ["--net-file", str(network_file(road.network)), "--route-files", str(traffic), *patience]
+
+    def _options(self, step: float, seed: int) -> list[str]:
         return [
-            *files,
             *("--step-length", str(step), "--seed", str(seed)),
             *("--no-step-log", "true", "--no-warnings", "true", "--duration-log.disable", "true"),
             *("--error-log", str(self._error_log)),

@@ -1,0 +1,73 @@
+"""What a driver asks of its vehicles, and what of it may reach the road: the one place that clips.
+
+Whatever stands between a driver's wish and the world belongs here: limits now, and whatever else keeps a
+vehicle to what it can and should do.
+"""
+
+from collections.abc import Sequence
+from math import isfinite
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from unjam.errors import InputError
+from unjam.physics.arrays import Array, clip
+
+
+class Command(NamedTuple):
+    """What n CAVs shall do until the next decision; arrays of shape (n,), or plain numbers of one."""
+
+    acceleration: Array
+    """[m/s2]"""
+    speed_cap: Array | None = None
+    """speed not to be exceeded [m/s]; None: none but the road's"""
+    lane: Array | None = None
+    """lane to be on, from 0 at the right; None: the simulator chooses"""
+
+
+class Limits(NamedTuple):
+    """Accelerations that a CAV may ask for on a road."""
+
+    lowest: float
+    """[m/s2]"""
+    highest: float
+    """[m/s2]"""
+
+    def keep(self, acceleration: Array) -> Array:
+        """Return accelerations within the limits, of the same shape; NaN stays NaN."""
+        return clip(acceleration, self.lowest, self.highest)
+
+    @classmethod
+    def symmetric(cls, limit: float) -> "Limits":
+        """Return the limits of so much in either direction [m/s2]."""
+        return cls(-limit, limit)
+
+
+def accelerations(command: Command, limits: Limits, names: Sequence[str], where: str) -> list[float]:
+    """Return what vehicles are told, within the limits, as plain floats [m/s2].
+
+    Args:
+        command: a driver's; its acceleration a number, or one for each vehicle.
+        limits: of the road.
+        names: the vehicles, in order.
+        where: when it was asked for, for messages.
+
+    Raises:
+        InputError: an acceleration is not finite, or there are not as many as vehicles.
+    """
+    found: Any = command.acceleration
+    if type(found) is float and len(names) == 1:
+        values = [found]
+    else:
+        try:
+            array = np.asarray(found, np.float64)
+        except (TypeError, ValueError):
+            raise InputError(f"{where}: acceleration is not numbers: {found!r}") from None
+        if array.shape != (len(names),):
+            allowed = f"({len(names)},), one for each CAV"
+            raise InputError(f"{where}: acceleration has shape {array.shape}; allowed: {allowed}")
+        values = array.tolist()
+    for name, value in zip(names, values, strict=True):
+        if not isfinite(value):
+            raise InputError(f"{where}: acceleration of {name} is {value}; allowed: finite")
+    return [limits.keep(value) for value in values]

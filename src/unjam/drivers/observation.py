@@ -1,0 +1,189 @@
+"""What a network sees: features by name, each a function of what is perceived, decided and remembered.
+
+A feature of your own is `path.py:name`, a function of a `LocalState` that answers an array of shape (n,) or
+(n, m), about unit size.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cache
+from typing import Annotated, Literal, NamedTuple
+
+import numpy as np
+from pydantic import AfterValidator
+
+from unjam.drivers.driver import Driver, Memory, Recipe
+from unjam.drivers.from_file import FileReference, is_file_reference
+from unjam.drivers.local_state import SPEED_SCALE, LocalState, Observed, lap_angle
+from unjam.errors import InputError
+from unjam.physics.arrays import Array, as_column, join_columns, namespace, stack_columns
+
+RELATIVE_SPEED_SCALE = 5.0
+GAP_SCALE = 20.0
+ACCELERATION_SCALE = 1.0
+LOOP_LENGTH_SCALE = 250.0
+ROUTE_POSITION_SCALE = 100.0
+
+
+class Seen(NamedTuple):
+    """What features are made of; n rows."""
+
+    state: LocalState
+    expert_acceleration: Array
+    """within the limits [m/s2], shape (n,)"""
+    expert: Driver
+    memory: Memory
+    """the expert's after its decision: what it will act on next"""
+
+
+@dataclass(frozen=True)
+class Feature:
+    """Some of the numbers that a network sees."""
+
+    look: Callable[[Seen], Array | None]
+    """answers them, about unit size, shape (n, m); a tuple of m for plain numbers; None: there are none"""
+    numbers: tuple[Observed, ...] | None
+    """what they are, in order; None: what the expert remembers is its own to say"""
+    needs: Literal["", "loop", "coordinate"] = ""
+    """what the road must have: `loop` no ends, `coordinate` a position along it"""
+    plain: bool = True
+    """whether it takes plain numbers and tensors; otherwise it is asked through NumPy"""
+
+
+def local_vector(state: LocalState) -> Array:
+    """Return the paper's observation: five numbers a row, divided by fixed physical scales.
+
+    Own speed; relative speed and gap to the leader; relative speed and gap to the follower.
+    Relative speeds are the other's minus the own; gaps are bumper to bumper.
+
+    Returns:
+        Shape (n, 5), no unit; a tuple of five for plain numbers.
+    """
+    return stack_columns(
+        (
+            state.speed / SPEED_SCALE,
+            (state.leader_speed - state.speed) / RELATIVE_SPEED_SCALE,
+            state.leader_gap / GAP_SCALE,
+            (state.follower_speed - state.speed) / RELATIVE_SPEED_SCALE,
+            state.follower_gap / GAP_SCALE,
+        )
+    )
+
+
+def lap_place(state: LocalState) -> Array:
+    """Return cosine and sine of the place on a closed road, 0 to 2 pi from its start.
+
+    Returns:
+        Shape (n, 2), no unit; a tuple of two for plain numbers.
+    """
+    xp, angle = namespace(state.speed), lap_angle(state)
+    return stack_columns((xp.cos(angle), xp.sin(angle)))
+
+
+FEATURES: dict[str, Feature] = {
+    "local": Feature(
+        lambda seen: local_vector(seen.state),
+        (
+            Observed("own speed", SPEED_SCALE, "m/s"),
+            Observed("leader's speed - own", RELATIVE_SPEED_SCALE, "m/s"),
+            Observed("gap to the leader", GAP_SCALE, "m"),
+            Observed("follower's speed - own", RELATIVE_SPEED_SCALE, "m/s"),
+            Observed("gap to the follower", GAP_SCALE, "m"),
+        ),
+    ),
+    "expert_acceleration": Feature(
+        lambda seen: as_column(seen.expert_acceleration / ACCELERATION_SCALE),
+        (Observed("expert's acceleration", ACCELERATION_SCALE, "m/s2"),),
+    ),
+    "expert_memory": Feature(lambda seen: seen.expert.memory_features(seen.memory), None),
+    "loop_length": Feature(
+        lambda seen: as_column(seen.state.loop_length / LOOP_LENGTH_SCALE),
+        (Observed("length of the closed road", LOOP_LENGTH_SCALE, "m"),),
+        needs="loop",
+    ),
+    "place": Feature(
+        lambda seen: lap_place(seen.state),
+        (Observed("cosine of the place on the lap", 1.0, ""), Observed("sine of the same", 1.0, "")),
+        needs="loop",
+    ),
+    "route_position": Feature(
+        lambda seen: as_column(seen.state.route_position / ROUTE_POSITION_SCALE),
+        (Observed("position along the road", ROUTE_POSITION_SCALE, "m"),),
+        needs="coordinate",
+    ),
+}
+"""all that a network can be shown: the paper's five numbers; the expert's acceleration; what the expert
+remembers; the length of the closed road; the place on it; the position along a road with ends"""
+
+
+def _known(name: str) -> str:
+    if name not in FEATURES and not is_file_reference(name):
+        raise ValueError(f"{', '.join(map(repr, FEATURES))} or 'path.py:name'")
+    return name
+
+
+FeatureName = Annotated[str, AfterValidator(_known)]
+"""a key of FEATURES, or `path.py:name`"""
+
+
+def feature(name: str) -> Feature:
+    """Return a feature by name; raise `InputError` where a file of the user's has no such function."""
+    return FEATURES[name] if name in FEATURES else _own_feature(name)
+
+
+@cache
+def _own_feature(name: str) -> Feature:
+    reference = FileReference.of(name)
+    function = reference.function("a LocalState")
+
+    def look(seen: Seen) -> Array:
+        like, state = seen.state.speed, seen.state
+        if not isinstance(like, np.ndarray):  # tensors: users' functions know NumPy alone
+            state = state.each(lambda values: values.double().cpu().numpy())
+        found = np.asarray(reference.ask(function, state), np.float64)
+        found = found[:, None] if found.ndim == 1 else found
+        if isinstance(like, np.ndarray):
+            return found
+        return namespace(like).as_tensor(found, dtype=like.dtype, device=like.device)
+
+    one = np.ones(1)
+    found = look(Seen(LocalState(*([one] * len(LocalState._fields))), one, Driver(), {}))
+    if found.ndim != 2 or len(found) != 1:
+        raise InputError(
+            f"{reference}: answers shape {found.shape} for one CAV; allowed: (n,) or (n, m) for n"
+        )
+    words = (Observed(f"{reference} {number}", 1.0, "") for number in range(found.shape[1]))
+    return Feature(look, tuple(words), plain=False)
+
+
+def observe(names: Sequence[str], seen: Seen) -> Array:
+    """Return what the network sees: the chosen features side by side, shape (n, inputs), no unit."""
+    blocks = [block for name in names if (block := feature(name).look(seen)) is not None]
+    if not blocks:
+        raise InputError("policy.observe: expert_memory alone is not allowed: the expert remembers nothing")
+    return join_columns(blocks)
+
+
+def observed(names: Sequence[str], expert: Driver) -> tuple[Observed, ...]:
+    """Return what the network sees with this expert, in the order of `observe`."""
+    known = sum(len(feature(name).numbers or ()) for name in names)
+    remembered = observation_size(names, expert) - known
+    unnamed = tuple(Observed(f"expert's memory {number}", 1.0, "") for number in range(remembered))
+    own = expert.observed_memory or unnamed
+    return tuple(number for name in names for number in (feature(name).numbers or own))
+
+
+def observation_size(names: Sequence[str], expert: Driver) -> int:
+    """Return how many numbers the network sees with this expert."""
+    one = np.ones(1)
+    state = LocalState(*([one] * len(LocalState._fields)))
+    acceleration, memory = expert.act(state, expert.initial_memory(1))
+    if np.shape(acceleration) != (1,):
+        shape = np.shape(acceleration)
+        raise InputError(f"driver: acceleration has shape {shape}; allowed: one for each CAV")
+    return observe(names, Seen(state, acceleration, expert, memory)).shape[1]
+
+
+def own_files(names: Sequence[str]) -> list[Recipe]:
+    """Return where the code of the users' own features is, and its hash."""
+    return [FileReference.of(name).recipe() for name in names if name not in FEATURES]

@@ -1,0 +1,140 @@
+"""Drivers around drivers: several side by side, or one whose sensors and actuators are worse."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from unjam.drivers.driver import Driver, Memory, Recipe
+from unjam.drivers.local_state import LocalState
+from unjam.errors import InputError
+from unjam.parameters import NotNegative
+from unjam.physics.arrays import Array, namespace
+
+KIND = "kind"
+"""name in the memory of which driver a CAV has"""
+INNER, AGE, SENT = "inner", "age", "sent"
+"""names in the memory: the other driver's own; decisions made so far; what was said and not yet done"""
+SMALLEST_SEEN_GAP = 0.1
+"""[m], however wrong a sensor is"""
+
+
+@dataclass(frozen=True)
+class Mixed(Driver):
+    """Gives the CAVs different drivers: the first CAV has the first driver, the next the next, and so on.
+
+    After the last driver it begins anew; where CAVs come and go, they are counted as they enter.
+    """
+
+    drivers: tuple[Driver, ...]
+
+    def __post_init__(self) -> None:
+        """Raise `InputError` where one of them is the simulator itself."""
+        if any(driver.native for driver in self.drivers):
+            raise InputError("driver: 'human' is not allowed among several; idm drives like people")
+
+    @property
+    def tensors(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Whether all of them take tensors."""
+        return all(driver.tensors for driver in self.drivers)
+
+    @property
+    def needs_loop(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Whether one of them must know its place on a closed road."""
+        return any(driver.needs_loop for driver in self.drivers)
+
+    @property
+    def _numbered(self) -> dict[str, Driver]:
+        return {str(number): driver for number, driver in enumerate(self.drivers)}
+
+    def initial_memory(self, n: int) -> Memory:
+        """Return which driver each CAV has, and what all drivers would remember of it."""
+        held = {key: driver.initial_memory(n) for key, driver in self._numbered.items()}
+        return {KIND: np.arange(n, dtype=np.float64) % len(self.drivers), **held}
+
+    def recall(self, memory: Memory, history: LocalState) -> Memory:
+        """Return what all drivers make of the warm-up."""
+        recalled = {key: driver.recall(memory[key], history) for key, driver in self._numbered.items()}
+        return {**memory, **recalled}
+
+    def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
+        """Return the acceleration that each CAV's own driver wants, and the new memory."""
+        after, chosen = dict(memory), None
+        for number, (key, driver) in enumerate(self._numbered.items()):
+            wanted, after[key] = driver.act(state, memory[key])
+            mine = memory[KIND] == number
+            chosen = wanted if chosen is None else namespace(wanted).where(mine, wanted, chosen)
+        return chosen, after
+
+    @property
+    def inner(self) -> dict[str, Driver]:
+        """All of them, by their number."""
+        return {f"{key}.": driver for key, driver in self._numbered.items()}
+
+    def describe(self) -> str:
+        """Return all of them, joined by +."""
+        return "+".join(driver.describe() for driver in self.drivers)
+
+    def recipe(self) -> Recipe:
+        """Return what all of them are made from."""
+        return {"kind": "mixed", "drivers": [driver.recipe() for driver in self.drivers]}
+
+
+@dataclass(frozen=True)
+class Impaired(Driver):
+    """Passes what it sees, with noise, to another driver, and hands on what that one said a while ago."""
+
+    driver: Driver
+    delay: NotNegative = 0.0
+    """time after which a command is carried out, rounded to whole decisions [s]"""
+    gap_noise: NotNegative = 0.0
+    """standard deviation of both gaps, anew in every decision [m]"""
+    time_step: float = 0.1
+    """time between two decisions [s]"""
+
+    @property
+    def needs_loop(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Whether the other driver must know its place on a closed road."""
+        return self.driver.needs_loop
+
+    def initial_memory(self, n: int) -> Memory:
+        """Return that of the other driver, that nothing was said yet, and that no decision was made."""
+        late = round(self.delay / self.time_step)
+        return {INNER: self.driver.initial_memory(n), AGE: np.zeros(n), SENT: np.zeros((n, late))}
+
+    def recall(self, memory: Memory, history: LocalState) -> Memory:
+        """Return what the other driver makes of the warm-up."""
+        return {**memory, INNER: self.driver.recall(memory[INNER], history)}
+
+    def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
+        """Return what was said `delay` ago, and remember what is said now."""
+        said, after = self.driver.act(self._seen(state, memory[AGE]), memory[INNER])
+        sent = np.concatenate([memory[SENT], np.asarray(said)[:, None]], axis=1)
+        return sent[:, 0], {INNER: after, AGE: memory[AGE] + 1.0, SENT: sent[:, 1:]}
+
+    def _seen(self, state: LocalState, age: Array) -> LocalState:
+        if self.gap_noise == 0.0 or not len(age):
+            return state
+        # A driver's answer must not depend on who drives beside it: what it sees is the seed.
+        rows = np.stack([age, state.speed, state.leader_gap, state.follower_gap], -1)
+        noise = [np.random.default_rng(row.view(np.uint64).tolist()).normal(size=2) for row in rows]
+        ahead, behind = self.gap_noise * np.array(noise).T
+        return state._replace(
+            leader_gap=np.maximum(state.leader_gap + ahead, SMALLEST_SEEN_GAP),
+            follower_gap=np.maximum(state.follower_gap + behind, SMALLEST_SEEN_GAP),
+        )
+
+    @property
+    def inner(self) -> dict[str, Driver]:
+        """The other driver."""
+        return {f"{INNER}.": self.driver}
+
+    def describe(self) -> str:
+        """Return the other driver, and what is worse about it."""
+        worse = (("late", self.delay, "s"), ("gap noise", self.gap_noise, "m"))
+        words = [f"{name} {value:g} {unit}" for name, value, unit in worse if value]
+        return f"{self.driver.describe()} ({', '.join(words) or 'unimpaired'})"
+
+    def recipe(self) -> Recipe:
+        """Return what the other driver is made from, and what is worse about it."""
+        worse = {"delay": self.delay, "gap_noise": self.gap_noise, "time_step": self.time_step}
+        return {"kind": "impaired", "driver": self.driver.recipe(), **worse}
