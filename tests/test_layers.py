@@ -18,7 +18,7 @@ ORDER = (
     *("training", "studies", "cli"),
 )
 """each may import those before it, and none after it"""
-EVERYWHERE = {"", "errors", "files", "manifest", "parameters"}
+EVERYWHERE = {"", "errors", "files", "manifest", "parameters", "tree"}
 """what has no place in the order: it imports none of the layers"""
 ALLOWED = {
     "controller": {"drivers", "physics"},

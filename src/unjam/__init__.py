@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from unjam.training.drive import drive
     from unjam.training.export import export_controller
     from unjam.training.train import train
-    from unjam.worlds.drive import run_episode
+    from unjam.worlds.episode import run_episode
 
 # Imported when first used: workers must stay free of torch, and the command line quick.
 _PLACES = {
@@ -35,7 +35,7 @@ _PLACES = {
     "load_controller": "unjam.controller",
     "export_controller": "unjam.training.export",
     "verify_controller": "unjam.controller.verify",
-    "run_episode": "unjam.worlds.drive",
+    "run_episode": "unjam.worlds.episode",
     "parallel_env": "unjam.environments.several",
     "write_report": "unjam.reports.html",
     "Driver": "unjam.drivers",

@@ -39,7 +39,7 @@ from unjam.learners.squashed_policy import SquashedResidualPolicy
 from unjam.scenarios import Ring
 from unjam.scenarios.registry import make_scenario
 from unjam.scenarios.scenario import Scenario
-from unjam.worlds.drive import run_episode
+from unjam.worlds.episode import run_episode
 from unjam.worlds.record import Trajectory
 from unjam.worlds.sumo.simulation import Simulation
 

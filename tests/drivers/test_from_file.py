@@ -9,7 +9,7 @@ from unjam.drivers.check import random_state
 from unjam.drivers.from_file import FileDriver
 from unjam.errors import InputError
 from unjam.scenarios import Merge
-from unjam.worlds.drive import run_episode
+from unjam.worlds.episode import run_episode
 
 
 def test_a_function_becomes_a_driver(my_drivers: Path) -> None:

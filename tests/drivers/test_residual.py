@@ -8,6 +8,7 @@ from unjam.drivers.check import random_state
 from unjam.drivers.driver import single_row
 from unjam.drivers.network import Network
 from unjam.drivers.observation import observation_size
+from unjam.tree import mapped
 
 ALL_PARTS = ("local", "expert_acceleration", "expert_memory", "loop_length", "place", "route_position")
 
@@ -32,9 +33,9 @@ def test_with_a_zero_network_it_is_exactly_its_expert_within_the_limit() -> None
 def test_adds_expert_and_residual_and_clips_the_sum() -> None:
     driver = ResidualDriver(IDM(), random_network(5, scale=2.0), 1.0)
     state = random_state(np.random.default_rng(1), 200)
-    decision = driver.decide(state, {})
+    decision = driver.decide(state, driver.initial_memory(200))
     expected = decision.expert + decision.residual
-    np.testing.assert_array_equal(decision.acceleration, expected.clip(-1.0, 1.0))
+    np.testing.assert_array_equal(decision.command.acceleration, expected.clip(-1.0, 1.0))
     assert (np.abs(expected) > 1.0).any()
     assert np.abs(decision.expert).max() <= 1.0
 
@@ -69,15 +70,17 @@ def test_tensors_give_what_arrays_give(hold: int) -> None:
     assert driver.tensors
     generator = np.random.default_rng(5)
     memory = driver.initial_memory(6)
-    tensors = {key: torch.tensor(values) for key, values in memory.items()}
+    tensors = mapped(torch.tensor, memory)
     for _ in range(12):
         state, noise = random_state(generator, 6), generator.normal(size=6)
-        expected = driver.decide(state, memory, noise)
+        expected = driver.decide(state, memory, lambda: noise)  # noqa: B023
         memory = expected.memory
         on_tensors = LocalState(*(torch.tensor(values) for values in state))
-        found = driver.decide(on_tensors, tensors, torch.tensor(noise))
+        found = driver.decide(on_tensors, tensors, lambda: torch.tensor(noise))  # noqa: B023
         tensors = found.memory
-        np.testing.assert_allclose(found.acceleration.numpy(), expected.acceleration, atol=1e-12)
+        np.testing.assert_allclose(
+            found.command.acceleration.numpy(), expected.command.acceleration, atol=1e-12
+        )
         np.testing.assert_allclose(found.observation.numpy(), expected.observation, atol=1e-12)
 
 
@@ -97,8 +100,8 @@ def test_holds_its_residual_for_as_many_decisions_as_asked() -> None:
 def test_explores_only_when_given_noise() -> None:
     driver = ResidualDriver(IDM(), random_network(5), 1.0)
     state = random_state(np.random.default_rng(4), 3)
-    still = driver.decide(state, {}).residual
-    moved = driver.decide(state, {}, np.array([1.0, 0.0, -1.0])).residual
+    still = driver.decide(state, driver.initial_memory(3)).residual
+    moved = driver.decide(state, driver.initial_memory(3), lambda: np.array([1.0, 0.0, -1.0])).residual
     np.testing.assert_allclose(moved - still, [0.2, 0.0, -0.2], atol=1e-12)
 
 

@@ -9,7 +9,7 @@ from pettingzoo.test import parallel_api_test, parallel_seed_test
 import unjam
 from unjam.drivers import Constant
 from unjam.scenarios import make_scenario
-from unjam.worlds.drive import run_episode
+from unjam.worlds.episode import run_episode
 
 SHORT: Any = {"horizon": 40, "cavs": 3}
 

@@ -17,7 +17,7 @@ from unjam.drivers.registry import named_driver
 from unjam.environments.single import RoadEnv
 from unjam.errors import InputError, UnjamError
 from unjam.scenarios import make_scenario
-from unjam.worlds.drive import run_episode
+from unjam.worlds.episode import run_episode
 
 NAMES = {"unjam/Ring-v0": "ring", "unjam/FigureEight-v0": "figure-eight", "unjam/Merge-v0": "merge"}
 SHORT: Any = {"horizon": 60}

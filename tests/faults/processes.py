@@ -22,7 +22,7 @@ from unjam.drivers import IDM, PISaturation
 from unjam.errors import InputError
 from unjam.scenarios import Ring, make_scenario
 from unjam.training.checkpoint import load_checkpoint
-from unjam.worlds.drive import run_episode
+from unjam.worlds.episode import run_episode
 from unjam.worlds.sumo.simulation import Simulation
 from unjam.worlds.workers import EpisodeTask, Workers
 

@@ -15,7 +15,7 @@ from tests.worlds.sumo.own_roads import straight
 from unjam.drivers.registry import DRIVERS, named_driver
 from unjam.scenarios.registry import make_scenario
 from unjam.scenarios.scenario import Scenario
-from unjam.worlds.drive import run_episode
+from unjam.worlds.episode import run_episode
 from unjam.worlds.record import Episode
 from unjam.worlds.sumo.network_files import sumo_version
 from unjam.worlds.sumo.simulation import Simulation

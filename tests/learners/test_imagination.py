@@ -23,7 +23,7 @@ from unjam.physics.idm import IDMParameters
 from unjam.scenarios import Ring
 from unjam.virtual.rollout import Rollouts
 from unjam.virtual.settings import VirtualSettings
-from unjam.worlds.drive import run_episode
+from unjam.worlds.episode import run_episode
 from unjam.worlds.record import Episode
 from unjam.worlds.sumo.simulation import Simulation
 

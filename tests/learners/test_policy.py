@@ -11,7 +11,7 @@ from unjam.drivers.observation import observation_size
 from unjam.learners.policy import ResidualPolicy, policy_spaces
 from unjam.learners.settings import PolicySettings
 from unjam.scenarios import Ring
-from unjam.worlds.drive import run_episode
+from unjam.worlds.episode import run_episode
 from unjam.worlds.sumo.simulation import Simulation
 
 torch.set_num_threads(1)  # more would fight for the cores over matrices of this size

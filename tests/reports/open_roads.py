@@ -9,7 +9,7 @@ from tests.worlds.sumo.own_roads import game
 from unjam.drivers import Human, PISaturation
 from unjam.reports.results import PICTURED, Shown
 from unjam.scenarios import Merge, make_scenario
-from unjam.worlds.drive import run_episode
+from unjam.worlds.episode import run_episode
 from unjam.worlds.record import Episode
 
 

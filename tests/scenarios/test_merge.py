@@ -12,6 +12,7 @@ from unjam.scenarios import Merge, make_scenario
 from unjam.scenarios.merge import ENTRANCE_WAY, JUNCTION_WAYS
 from unjam.scenarios.registry import scenario_from_recipe, scenario_recipe
 from unjam.scenarios.road import MergingRoad
+from unjam.worlds.sumo.files import files_of_built
 from unjam.worlds.sumo.network_files import network_file
 
 
@@ -21,7 +22,8 @@ def drawn(seed: int = 0, **changes: Any) -> MergingRoad:
 
 def entries(road: MergingRoad) -> list[dict[str, str]]:
     """Attributes of the vehicles in SUMO's file, in their order."""
-    return [vehicle.attrib for vehicle in ElementTree.fromstring(road.traffic).iter("vehicle")]
+    written = ElementTree.fromstring(files_of_built(Merge(), road).traffic)
+    return [vehicle.attrib for vehicle in written.iter("vehicle")]
 
 
 def cavs(road: MergingRoad) -> list[int]:

@@ -9,6 +9,7 @@ from unjam.errors import InputError
 from unjam.physics.idm import PAPER_IDM, IDMParameters
 from unjam.scenarios.population import Population, read_population, write_population
 from unjam.scenarios.registry import make_scenario, scenario_from_recipe, scenario_recipe
+from unjam.worlds.sumo.files import files_of_built
 
 DRIVERS = (
     IDMParameters(time_headway=0.8, desired_speed=35.0),
@@ -95,14 +96,15 @@ def test_a_road_draws_its_people_from_it(tmp_path: Path, name: str) -> None:
     roads = [scenario.draw(np.random.default_rng(seed)) for seed in (0, 0, 1)]
     assert set(roads[0].people.values()) == set(DRIVERS)
     assert roads[0].people == roads[1].people != roads[2].people
-    own_types = roads[0].traffic.count('<vType id="of_')
+    own_types = files_of_built(scenario, roads[0]).traffic.count('<vType id="of_')
     assert own_types == (22 if name == "ring" else 0)
 
 
 def test_without_a_population_roads_are_as_they_were() -> None:
-    road = make_scenario("ring").draw(np.random.default_rng(0))
+    scenario = make_scenario("ring")
+    road = scenario.draw(np.random.default_rng(0))
     assert road.people == {}
-    assert "insertionChecks" not in road.traffic
+    assert "insertionChecks" not in files_of_built(scenario, road).traffic
 
 
 def test_a_residual_is_commanded(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from tests.system.conftest import Run
 from unjam.drivers import PISaturation
 from unjam.scenarios import Ring
 from unjam.training.watch import watch_in_window
-from unjam.worlds.drive import run_episode
+from unjam.worlds.episode import run_episode
 
 XVFB = shutil.which("Xvfb")
 needs_display = pytest.mark.skipif(XVFB is None, reason="no Xvfb found: apt-get install xvfb")

@@ -23,7 +23,7 @@ from unjam.training.evaluate import (
     raise_failure,
     save_evaluation,
 )
-from unjam.worlds.drive import run_episode
+from unjam.worlds.episode import run_episode
 from unjam.worlds.workers import Workers
 
 RING = Ring(length=(120, 130), vehicles=8, horizon=60)

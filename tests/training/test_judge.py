@@ -12,7 +12,7 @@ from unjam.reports.results import read_results
 from unjam.training.config import RunConfig
 from unjam.training.evaluate import held_out_seeds
 from unjam.training.judge import TRAINED, comparison, judge
-from unjam.worlds.drive import run_episode
+from unjam.worlds.episode import run_episode
 from unjam.worlds.workers import Workers
 
 

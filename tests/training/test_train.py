@@ -22,7 +22,7 @@ from unjam.training.config import RunConfig
 from unjam.training.evaluate import held_out_seeds
 from unjam.training.folder import read_config
 from unjam.training.train import TrainResult, gain_of, train
-from unjam.worlds.drive import run_episode
+from unjam.worlds.episode import run_episode
 from unjam.worlds.workers import Workers
 
 pytestmark = pytest.mark.usefixtures("without_pictures")

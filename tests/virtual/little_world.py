@@ -1,14 +1,17 @@
 """A little car-following world whose dynamics are known: the truth that models are compared with."""
 
+from typing import Any
+
 import numpy as np
 
 from unjam.drivers import IDM, LocalState
 from unjam.drivers.check import random_state
-from unjam.drivers.residual import ResidualDriver
+from unjam.drivers.residual import EXPERT, ResidualDriver
 from unjam.physics.arrays import Array, as_column, namespace, stack_columns
 from unjam.scenarios import Ring
+from unjam.tree import mapped
 from unjam.virtual.data import ActualData, Recording
-from unjam.virtual.world import Step
+from unjam.virtual.world import Outcomes
 from unjam.worlds.reward import Outcome, released
 
 LOOP = 230.0
@@ -25,7 +28,7 @@ class LittleWorld:
         self.leader = leader
         self.bonus = bonus
 
-    def step(self, state: LocalState, applied: Array, drawn: Array) -> Step:
+    def step(self, state: LocalState, applied: Array, drawn: Array) -> Outcomes:
         """Move all three by 0.1 s; the reward has a share that no seen speed tells."""
         step = 0.1
         behind = state._replace(
@@ -54,7 +57,7 @@ class LittleWorld:
         reward = sum(terms.values()) + self.bonus * 0.1 * (state.leader_gap / 20.0) * ~crashed
         xp = namespace(speed)
         nothing = xp.zeros_like(speed)
-        return Step(reached, reward, crashed, xp.stack([nothing, nothing, nothing]))
+        return Outcomes(reached, reward, crashed, xp.stack([nothing, nothing, nothing]))
 
 
 def drive(
@@ -72,25 +75,46 @@ def drive(
     )
     state = state._replace(leader_speed=state.speed + 0.1, follower_speed=state.speed * 0.9)
     memory = driver.initial_memory(1)
-    began = {key: values[0] for key, values in driver.expert_memory(memory).items()}
+    began = mapped(lambda values: np.array(values[0]), memory[EXPERT])
     states, applied, rewards, crashed = [state], [], [], False
     while len(applied) < decisions and not crashed:
-        noise = generator.standard_normal(1) if explore else None
-        decision = driver.decide(state, memory, noise)
+        noise = generator.standard_normal(1)
+        decision = driver.decide(state, memory, (lambda: noise) if explore else None)  # noqa: B023
         memory = decision.memory
-        step = world.step(state, decision.acceleration, np.zeros((1, 0)))
+        step = world.step(state, decision.command.acceleration, np.zeros((1, 0)))
         state, crashed = step.state, bool(step.crashed[0])
         states.append(state)
-        applied.append(decision.acceleration[0])
+        applied.append(decision.command.acceleration[0])
         rewards.append(step.reward[0])
-    return Recording(
-        states=LocalState(*(np.concatenate(values) for values in zip(*states, strict=True))),
+    return recording(
+        states=states[0].each(lambda *values: np.concatenate(values), *states[1:]),
         applied=np.array(applied),
         reward=np.array(rewards),
         memory=began,
         hold=driver.hold,
         terminated=crashed,
         drawn=np.array([0.3]),
+        episode=episode,
+    )
+
+
+def recording(
+    states: LocalState,
+    applied: np.ndarray,
+    reward: np.ndarray,
+    memory: dict[str, Any] | None = None,
+    hold: int = 1,
+    terminated: bool = False,
+    drawn: np.ndarray | None = None,
+    episode: int = 0,
+) -> Recording:
+    """Return a recording of which nobody asks what the driver saw and decided."""
+    nothing = np.zeros_like(applied)
+    return Recording(
+        *("cav", 0, states, np.zeros((1, 0)), applied, nothing, applied, nothing, memory or {}, hold),
+        terminated=terminated,
+        terms={"reward": reward},
+        drawn=np.zeros(0) if drawn is None else drawn,
         episode=episode,
     )
 

@@ -8,7 +8,7 @@ from unjam.physics.idm import IDMParameters
 from unjam.scenarios import Ring
 from unjam.virtual.data import ActualData, Recording
 from unjam.virtual.people import calibrated_people, people_behind
-from unjam.worlds.drive import run_episode
+from unjam.worlds.episode import run_episode
 
 OTHERS = IDMParameters(time_headway=1.6, max_acceleration=0.7)
 RING = Ring(length=(300, 320), vehicles=20, horizon=900, noise=0.0, humans=OTHERS)

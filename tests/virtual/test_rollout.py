@@ -26,7 +26,7 @@ from unjam.virtual.rollout import (
     rollout_length,
 )
 from unjam.virtual.settings import VirtualSettings
-from unjam.virtual.world import BOUNDS, Step, VirtualDynamics
+from unjam.virtual.world import BOUNDS, Outcomes, VirtualDynamics
 
 PARTS: tuple[FeatureName, ...] = ("local", "expert_acceleration", "expert_memory")
 
@@ -148,7 +148,7 @@ class Bounded(LittleWorld):
 
     steps = 0
 
-    def step(self, state: LocalState, applied: torch.Tensor, drawn: torch.Tensor) -> Step:
+    def step(self, state: LocalState, applied: torch.Tensor, drawn: torch.Tensor) -> Outcomes:
         self.steps += 1
         always = torch.ones_like(applied)
         told = torch.stack([always, always * 0, always * (self.steps == 1)]) > 0
@@ -247,7 +247,7 @@ def test_the_action_limit_holds_for_expert_and_sum() -> None:
     commands: list[torch.Tensor] = []
 
     class Watching(LittleWorld):
-        def step(self, state: LocalState, applied: torch.Tensor, drawn: torch.Tensor) -> Step:
+        def step(self, state: LocalState, applied: torch.Tensor, drawn: torch.Tensor) -> Outcomes:
             commands.append(applied)
             return super().step(state, applied, drawn)
 

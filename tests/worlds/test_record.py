@@ -8,10 +8,11 @@ import pytest
 from tests.conftest import random_network
 from unjam.drivers import IDM, Constant, Driver, Human, PISaturation, ResidualDriver
 from unjam.scenarios import Ring
-from unjam.worlds.drive import run_episode
-from unjam.worlds.messages import read_message, write_message
-from unjam.worlds.record import Episode, Trajectory, failed_episode, pack_episode, unpack_episode
+from unjam.tree import pack, unpack
+from unjam.worlds.episode import run_episode
+from unjam.worlds.record import Episode, Trajectory, failed_episode
 from unjam.worlds.sumo.simulation import Simulation
+from unjam.worlds.worker import read_message, write_message
 
 RING = Ring(length=(230, 240), horizon=60)
 
@@ -31,9 +32,9 @@ def fingerprint(value: Any) -> Any:
 
 def travelled(episode: Episode) -> Episode:
     pipe = BytesIO()
-    write_message(pipe, *pack_episode(episode))
+    write_message(pipe, *pack(episode))
     pipe.seek(0)
-    return unpack_episode(*read_message(pipe))
+    return unpack(Episode, *read_message(pipe))
 
 
 def test_fingerprints_differ_in_the_last_bit_of_any_array() -> None:
@@ -91,7 +92,7 @@ def test_what_a_held_residual_earned_is_the_sum_over_its_decisions(simulation: S
     trajectory: Trajectory = run_episode(RING, driver, (0,), simulation=simulation).trajectories[0]
     reward = trajectory.terms["speed"] + trajectory.terms["acceleration"]
     np.testing.assert_array_equal(trajectory.reward, reward)
-    residuals, earned = trajectory.looks
+    residuals, earned = trajectory.choices
     assert len(residuals) == len(earned) == 9  # 8 whole holds and one of 4 decisions
     for look in range(9):
         held = slice(7 * look, 7 * (look + 1))

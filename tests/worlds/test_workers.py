@@ -19,7 +19,7 @@ from unjam.drivers import IDM, Constant, Driver, Human, LocalState, Memory, PISa
 from unjam.drivers.from_file import FileDriver
 from unjam.errors import InputError
 from unjam.scenarios import Ring, make_scenario
-from unjam.worlds.drive import run_episode
+from unjam.worlds.episode import run_episode
 from unjam.worlds.workers import EpisodeTask, Workers
 
 SHORT = Ring(horizon=60)

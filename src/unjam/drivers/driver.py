@@ -125,7 +125,8 @@ class Driver:
     def recipe(self) -> Recipe:
         """Return what it is made from; its networks' weights are `arrays`."""
         parameters = asdict(self) if is_dataclass(self) else {}
-        return {"kind": "named", "name": self.name, "parameters": parameters}
+        own = vars(type(self)).get("name", "")  # not that of a class which it inherits from
+        return {"kind": "named", "name": own, "parameters": parameters}
 
     def arrays(self) -> Arrays:
         """Return the weights of its networks, those of the drivers that it holds with their prefix."""

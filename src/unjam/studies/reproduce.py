@@ -19,7 +19,7 @@ from unjam.training.config import load_config
 from unjam.training.evaluate import evaluate, held_out_seeds, save_evaluation
 from unjam.training.executors import Executor, Told, run_all
 from unjam.training.folder import read_config
-from unjam.worlds.drive import can_drive
+from unjam.worlds.episode import can_drive
 from unjam.worlds.workers import Workers
 
 SECONDS: dict[str, dict[str, float]] = {

@@ -10,7 +10,7 @@ from unjam.drivers.registry import describe, free_label
 from unjam.manifest import manifest
 from unjam.training.config import RunConfig
 from unjam.training.evaluate import Evaluation, evaluate, held_out_seeds, raise_failure, save_evaluation
-from unjam.worlds.drive import can_drive
+from unjam.worlds.episode import can_drive
 from unjam.worlds.workers import Workers
 
 TRAINED = "trained"

@@ -28,7 +28,8 @@ from unjam.virtual.model import EnvironmentModel, torch_generator
 from unjam.virtual.rollout import begin, draw_starts, imagine
 from unjam.virtual.settings import VirtualSettings
 from unjam.virtual.world import VirtualDynamics
-from unjam.worlds.drive import drive_traffic, run_episode
+from unjam.worlds.drive import drive_traffic
+from unjam.worlds.episode import run_episode
 from unjam.worlds.record import Episode
 from unjam.worlds.sumo import make_traffic
 from unjam.worlds.sumo.simulation import Simulation

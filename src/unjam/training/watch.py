@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from unjam.drivers.driver import Driver
 from unjam.errors import MissingPartError
 from unjam.scenarios.scenario import Scenario
-from unjam.worlds.drive import run_episode
+from unjam.worlds.episode import run_episode
 from unjam.worlds.record import Episode
 from unjam.worlds.sumo.simulation import Simulation
 

@@ -1,19 +1,12 @@
-"""Driving: the one loop in which a driver and a world meet; and an episode, a pure function of its seed."""
+"""Driving: the one loop in which a driver and a world meet."""
 
-from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Iterator
 
 import numpy as np
 
 from unjam.drivers.driver import Decision, Driver, Memory, carried, single_row
 from unjam.drivers.residual import EXPERT
-from unjam.errors import InputError
-from unjam.scenarios.scenario import Scenario
 from unjam.tree import mapped
-from unjam.worlds.record import Episode, Floats, outcome_of
-from unjam.worlds.reward import Reward, make_reward
-from unjam.worlds.sumo import make_traffic
-from unjam.worlds.sumo.simulation import Simulation
 from unjam.worlds.world import Driven, OnProgress, Recorded, World
 
 PROGRESS_STEPS = 10
@@ -99,80 +92,8 @@ def drive(
     decisions = [
         decision[1:4] for decision in driving if decision is not None and decision.observation is not None
     ]
-    last = driver.observation(world.perceive(), driving.memory) if decisions else None
+    last = driver.observation(world.perceive(), driving.memory)
     if last is None:
         return world.record(Driven())
     memories = [each[EXPERT] for each in driving.memories]
     return world.record(Driven(decisions, last, memories, driver.hold))
-
-
-def run_episode(
-    scenario: Scenario,
-    driver: Driver,
-    seed: Sequence[int],
-    reward: str = "",
-    explore: bool = False,
-    full: bool = False,
-    simulation: Simulation | None = None,
-    progress: OnProgress | None = None,
-) -> Episode:
-    """Run one episode and return all of it.
-
-    The result depends on scenario, driver, seed, reward and `explore` alone: not on the process, on what
-    ran in it before, or on the clock.
-
-    Args:
-        scenario: road, traffic and horizon.
-        driver: of every CAV.
-        seed: integers; everything random comes from them.
-        reward: name, or `path.py:name`; empty: the scenario's own.
-        explore: whether a residual driver adds its exploration noise.
-        full: whether fuel is recorded and, on roads with ends, where on the plane vehicles are (it costs a
-            tenth of the speed).
-        simulation: an open one to use again; without it, one is opened and closed.
-        progress: called now and then with the number of decisions made.
-
-    Raises:
-        InputError: driver or reward answer something that is not finite, or of a wrong shape.
-        EpisodeError: SUMO cannot run the scenario.
-    """
-    if not can_drive(driver, scenario):
-        raise InputError(f"driver: it is not allowed on {scenario.title}: it needs a closed road")
-    earned = make_reward(reward or scenario.reward)
-    if simulation is None:
-        with Simulation() as simulation:
-            return run_episode(scenario, driver, seed, reward, explore, full, simulation, progress)
-    traffic = make_traffic(scenario, seed, simulation, driver.plain_numbers, full)
-    episode = drive(traffic, driver, explore, on_progress=progress)
-    if traffic.entered == 0 and not driver.native:
-        raise InputError(f"no CAV was on the road in {episode.steps} decisions: let more vehicles be CAVs")
-    return rewarded(episode, earned)
-
-
-def can_drive(driver: Driver, scenario: Scenario) -> bool:
-    """Return whether a driver can drive a scenario: some need a loop."""
-    return scenario.closed or not driver.needs_loop
-
-
-def rewarded(episode: Episode, reward: Reward) -> Episode:
-    """Return an episode with what was earned in it; raise `InputError` where a term is not finite."""
-    # Columns one behind the other: sums over vehicles are rounded in the order of memory.
-    speeds = np.asfortranarray(episode.speeds)
-    outcome = outcome_of(speeds, episode.trajectories, episode.status == "collision")
-    terms = _checked(reward(outcome), episode.steps)
-    trajectories = tuple(
-        replace(each, terms={name: values[each.during] for name, values in terms.items()})
-        for each in episode.trajectories
-    )
-    return replace(episode, terms=terms, trajectories=trajectories)
-
-
-def _checked(terms: dict[str, Floats], rows: int) -> dict[str, Floats]:
-    """Return the reward's terms; raise `InputError` unless each is finite and has a value per decision."""
-    for name, values in terms.items():
-        if np.shape(values) != (rows,):
-            raise InputError(f"reward: term {name!r} has shape {np.shape(values)}; allowed: ({rows},)")
-        if not np.isfinite(values).all():
-            step = int(np.argmax(~np.isfinite(values)))
-            raise InputError(f"reward: step {step}: term {name!r} is {values[step]}; allowed: finite")
-    return {name: np.asarray(values, np.float64) for name, values in terms.items()}

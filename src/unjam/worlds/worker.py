@@ -22,7 +22,7 @@ from unjam.errors import DISK_ERRNOS, UnjamError, disk_error
 from unjam.scenarios.own_network import OwnNetwork
 from unjam.scenarios.registry import scenario_from_recipe
 from unjam.tree import Arrays, pack
-from unjam.worlds.drive import run_episode
+from unjam.worlds.episode import run_episode
 from unjam.worlds.record import failed_episode
 from unjam.worlds.sumo.simulation import Simulation
 

@@ -115,9 +115,8 @@ class RecordedWorld:
     def advance(self, command: Command | None) -> None:
         """Note what was asked for, and go on to the next moment."""
         names, moment = [f"row {number}" for number in range(self.rows)], len(self._answers)
-        self._answers.append(
-            accelerations(command or Command(np.zeros(0)), self.limits, names, f"step {moment}")
-        )
+        wanted = Command(np.zeros(0)) if command is None else command
+        self._answers.append(accelerations(wanted, self.limits, names, f"step {moment}"))
 
     def noise(self) -> Any:
         """Return none: nobody explores here."""

@@ -9,7 +9,7 @@ import pytest
 from unjam.drivers import IDM, Constant, Driver, Human, LocalState, Memory, PISaturation
 from unjam.errors import EpisodeError, InputError
 from unjam.scenarios import Ring
-from unjam.worlds.drive import run_episode
+from unjam.worlds.episode import run_episode
 from unjam.worlds.record import Episode, Floats
 from unjam.worlds.sumo.simulation import Simulation
 

@@ -7,14 +7,15 @@ import numpy as np
 import pytest
 
 from unjam.drivers import Driver, LocalState, Memory, PISaturation
+from unjam.drivers.command import Command
 from unjam.drivers.idm import Human
 from unjam.drivers.pacer import Pacer
 from unjam.measures.metrics import measure
 from unjam.scenarios.figure_eight import FigureEight
-from unjam.scenarios.scenario import SMALLEST_CAV_GAP
-from unjam.worlds.drive import run_episode
+from unjam.worlds.episode import run_episode
 from unjam.worlds.sumo import make_traffic
 from unjam.worlds.sumo.closed import ClosedTraffic
+from unjam.worlds.sumo.files import SMALLEST_CAV_GAP
 from unjam.worlds.sumo.simulation import Simulation
 from unjam.worlds.workers import EpisodeTask, Workers
 
@@ -48,8 +49,8 @@ def test_leader_and_gap_are_those_of_sumo(simulation: Simulation) -> None:
     traffic.start(controlled=True)
     ids, compared = traffic.road.vehicle_ids, 0
     for _ in range(400):
-        traffic.advance(np.full(14, 0.2))
-        state = traffic.local_state()
+        traffic.advance(Command(np.full(14, 0.2)))
+        state = traffic.perceive()
         for row, name in enumerate(ids):
             found = libsumo.vehicle.getLeader(name, 200.0)
             if found:

@@ -10,15 +10,18 @@ import numpy as np
 import pytest
 
 from unjam.drivers import Constant, Driver, Human, PISaturation
+from unjam.drivers.command import Command
 from unjam.errors import EpisodeError
 from unjam.measures.metrics import measure
 from unjam.scenarios import Merge
-from unjam.worlds.drive import run_episode
+from unjam.worlds.episode import run_episode
 from unjam.worlds.record import Episode
 from unjam.worlds.sumo import make_traffic
+from unjam.worlds.sumo.files import files_of_built
 from unjam.worlds.sumo.merging import MergingTraffic
 from unjam.worlds.sumo.simulation import Simulation
 from unjam.worlds.workers import EpisodeTask, Workers
+from unjam.worlds.world import Driven
 
 STEP = 0.2
 
@@ -126,7 +129,7 @@ def test_people_obey_the_right_of_way_only_where_they_shall(simulation: Simulati
     for right_of_way, mode in ((False, 1), (True, 25)):
         traffic = merging(Merge(right_of_way=right_of_way, penetration=0.3), simulation)
         for _ in range(20):
-            traffic.advance(np.zeros(len(traffic.cavs)))
+            traffic.advance(Command(np.zeros(len(traffic.cavs))))
         modes = {
             libsumo.vehicle.getSpeedMode(name)
             for name in libsumo.vehicle.getIDList()
@@ -139,24 +142,22 @@ def test_people_obey_the_right_of_way_only_where_they_shall(simulation: Simulati
 
 def test_waiting_and_arrived_are_those_of_the_timetable_and_of_sumo(simulation: Simulation) -> None:
     traffic = merging(Merge(), simulation)
-    departs = [
-        float(vehicle.get("depart", "nan"))
-        for vehicle in ElementTree.fromstring(traffic.road.traffic).iter("vehicle")
-    ]
+    written = ElementTree.fromstring(files_of_built(traffic.scenario, traffic.road).traffic)
+    departs = [float(vehicle.get("depart", "nan")) for vehicle in written.iter("vehicle")]
     seen: set[str] = set(libsumo.vehicle.getIDList())
     waiting, gone = [0], []
     for _ in range(120):
-        traffic.advance(np.zeros(len(traffic.cavs)))
+        traffic.advance(Command(np.zeros(len(traffic.cavs))))
         there = set(libsumo.vehicle.getIDList())
         seen |= there
         due = sum(time < libsumo.simulation.getTime() for time in departs)
         waiting.append(due - len(seen))
         gone.append(len(seen) - len(there))
-    found = traffic.log().pictured
+    found = traffic.record(Driven())
     assert max(waiting) > 3
-    np.testing.assert_allclose(found["waiting"], waiting, atol=1)  # one that is due in this very step
-    assert np.mean(found["waiting"] == waiting) > 0.8
-    assert found["arrived"] == gone[-1] > 10
+    np.testing.assert_allclose(found.waiting, waiting, atol=1)  # one that is due in this very step
+    assert np.mean(found.waiting == waiting) > 0.8
+    assert found.arrived == gone[-1] > 10
 
 
 def test_throughput_and_backlog_are_those_counts(simulation: Simulation) -> None:
@@ -174,12 +175,12 @@ def test_positions_that_differ_from_sumos_odometer_are_an_error(
 ) -> None:
     traffic = merging(Merge(), simulation)
     for _ in range(10):
-        traffic.advance(np.zeros(len(traffic.cavs)))
+        traffic.advance(Command(np.zeros(len(traffic.cavs))))
     driven = simulation.distances
-    traffic.log()
+    traffic.record(Driven())
     monkeypatch.setattr(simulation, "distances", lambda ids: [way + 2e-6 for way in driven(ids)])
     with pytest.raises(EpisodeError, match="positions differ from SUMO's odometer by 2e-06 m"):
-        traffic.log()
+        traffic.record(Driven())
 
 
 def test_what_pictures_show_of_it(simulation: Simulation) -> None:

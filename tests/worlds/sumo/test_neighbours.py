@@ -4,6 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from unjam.drivers.command import Command
 from unjam.scenarios import Ring
 from unjam.worlds.sumo import make_traffic
 from unjam.worlds.sumo.closed import ClosedTraffic
@@ -96,13 +97,13 @@ def test_leaders_and_gaps_in_running_traffic_are_sumos(
     pushes = np.random.default_rng(0).uniform(-0.6, 1.0, (steps, cavs))
     names, seen = traffic.road.vehicle_ids, []
     for push in pushes:
-        traffic.advance(push)
+        traffic.advance(Command(push))
         leaders = [libsumo.vehicle.getLeader(name, 600.0) or ("nobody", np.nan) for name in names]
         # SUMO takes the gap that a vehicle likes to keep off what it calls the gap.
         kept = [libsumo.vehicle.getMinGap(name) for name in names]
         seen.append([(leader, gap + keep) for (leader, gap), keep in zip(leaders, kept, strict=True)])
         gaps = [seen[-1][names.index(name)][1] for name in traffic.road.cav_ids]
-        np.testing.assert_allclose(traffic.local_state().leader_gap, gaps, rtol=0, atol=1e-6)
+        np.testing.assert_allclose(traffic.perceive().leader_gap, gaps, rtol=0, atol=1e-6)
     states = traffic.states(*traffic.speeds_and_positions(), np.arange(vehicles))
     for place, name in enumerate(names):
         assert {leaders[place][0] for leaders in seen} == {names[(place + 1) % vehicles]}, name

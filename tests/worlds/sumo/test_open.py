@@ -9,11 +9,12 @@ import pytest
 from tests.conftest import random_network
 from tests.worlds.test_record import fingerprint, travelled
 from unjam.drivers import IDM, Constant, Driver, Human, LocalState, Memory, PISaturation, ResidualDriver
+from unjam.drivers.command import Command
 from unjam.drivers.from_file import FunctionDriver
 from unjam.drivers.observation import local_vector
 from unjam.errors import InputError
 from unjam.scenarios import Merge
-from unjam.worlds.drive import run_episode
+from unjam.worlds.episode import run_episode
 from unjam.worlds.record import Episode, Trajectory
 from unjam.worlds.sumo import make_traffic
 from unjam.worlds.sumo.simulation import Simulation
@@ -161,7 +162,7 @@ def test_a_residual_driver_counts_its_looks_from_each_entry(hold: int, simulatio
         looks = [*range(0, steps, hold), steps]
         seen = local_vector(LocalState(*(values[looks] for values in trajectory.states)))
         np.testing.assert_allclose(trajectory.observations, seen, atol=1e-12)
-        chosen, _ = trajectory.looks
+        chosen, _ = trajectory.choices
         np.testing.assert_array_equal(trajectory.residual, np.repeat(chosen, hold)[:steps])
         noises.append(chosen - driver.network(trajectory.observations[:-1]))
         assert trajectory.memory.keys() == {"decisions", "speeds"}
@@ -244,11 +245,11 @@ def test_rows_of_those_who_stay_follow_who_leaves_and_enters(simulation: Simulat
     moved = 0
     for _ in range(100):
         before = list(traffic.cavs)
-        traffic.advance(np.zeros(len(before)))
-        stayed = [before[row] for row in traffic.stayed]
+        traffic.advance(Command(np.zeros(len(before))))
+        stayed = before if traffic.kept is None else [before[row] for row in traffic.kept]
         assert list(traffic.cavs[: len(stayed)]) == stayed
         assert not set(traffic.cavs[len(stayed) :]) & set(before)
-        assert traffic.local_state().speed.shape == (len(traffic.cavs),)
+        assert traffic.perceive().speed.shape == (len(traffic.cavs),)
         moved += stayed != before
     assert moved > 2
 

@@ -11,10 +11,11 @@ import pytest
 from tests.worlds.sumo.own_roads import game, grid, straight
 from tests.worlds.test_record import fingerprint, travelled
 from unjam.drivers import IDM, Constant, Human, PISaturation
+from unjam.drivers.command import Command
 from unjam.errors import InputError
 from unjam.measures.metrics import measure
 from unjam.scenarios import Scenario, make_scenario
-from unjam.worlds.drive import run_episode
+from unjam.worlds.episode import run_episode
 from unjam.worlds.sumo import make_traffic
 from unjam.worlds.sumo.own import OwnTraffic
 from unjam.worlds.sumo.simulation import Simulation
@@ -86,7 +87,7 @@ def test_a_share_is_about_that_share_and_types_are_all_of_theirs(tmp_path: Path)
         for _ in range(150):
             for name in libsumo.vehicle.getIDList():
                 kinds.setdefault(name, libsumo.vehicle.getTypeID(name))
-            traffic.advance(np.zeros(len(traffic.cavs)))
+            traffic.advance(Command(np.zeros(len(traffic.cavs))))
         assert {name for name, kind in kinds.items() if "truck" in kind} >= set(traffic.cavs)
         driven = {name for moment in traffic._log_cavs for name in moment}
         there = set(traffic._log_moments[-2][0]) | driven
@@ -106,7 +107,7 @@ def test_cavs_are_never_faster_than_allowed(file: Path, simulation: Simulation) 
     compared = 0
     for _ in range(200):
         driven = list(traffic.cavs)
-        traffic.advance(np.ones(len(driven)))
+        traffic.advance(Command(np.ones(len(driven))))
         for name in driven:
             if name in traffic.cavs:
                 speed, allowed = libsumo.vehicle.getSpeed(name), libsumo.vehicle.getAllowedSpeed(name)
@@ -121,7 +122,7 @@ def test_cavs_stop_at_red(signalled: Path, simulation: Simulation) -> None:
     waited = passed = 0
     ahead: dict[str, Any] = {}
     for _ in range(200):
-        traffic.advance(np.ones(len(traffic.cavs)))
+        traffic.advance(Command(np.ones(len(traffic.cavs))))
         for name in libsumo.vehicle.getIDList():
             signals = libsumo.vehicle.getNextTLS(name)
             now = signals[0] if signals else None
@@ -151,8 +152,8 @@ def test_neighbours_on_one_lane_are_those_of_the_positions(tmp_path: Path, simul
     lengths = {name: 7.0 if int(name) % 3 == 1 else 5.0 for name in "01234"}
     seen = 0
     for _ in range(300):
-        traffic.advance(generator.uniform(-0.6, 0.5, len(traffic.cavs)))
-        state = traffic.local_state()
+        traffic.advance(Command(generator.uniform(-0.6, 0.5, len(traffic.cavs))))
+        state = traffic.perceive()
         order = sorted(traffic.cavs)  # nobody overtakes on one lane
         place = {name: libsumo.vehicle.getLanePosition(name) for name in order}
         speed = {name: libsumo.vehicle.getSpeed(name) for name in order}

@@ -8,7 +8,7 @@ from unjam.drivers.network import Network
 from unjam.physics.idm import PAPER_IDM, IDMParameters, idm_acceleration
 from unjam.scenarios.population import Population, write_population
 from unjam.scenarios.registry import make_scenario
-from unjam.worlds.drive import run_episode
+from unjam.worlds.episode import run_episode
 from unjam.worlds.sumo.people import as_calibrated
 
 DRIVERS = (

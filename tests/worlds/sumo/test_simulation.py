@@ -1,5 +1,6 @@
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import psutil
@@ -10,18 +11,19 @@ from tests.worlds.test_record import fingerprint
 from unjam.drivers import IDM, PISaturation
 from unjam.errors import EpisodeError, UnjamError
 from unjam.scenarios import Ring, make_scenario
-from unjam.scenarios.road import ClosedRoad
-from unjam.worlds.drive import run_episode
+from unjam.worlds.episode import run_episode
 from unjam.worlds.sumo import make_traffic
+from unjam.worlds.sumo.files import Files, files_of_built
+from unjam.worlds.sumo.network_files import network_file
 from unjam.worlds.sumo.simulation import Backend, Simulation
 
 RING = Ring(horizon=100, length=(230, 230))
 
 
 @pytest.fixture
-def road(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> ClosedRoad:
+def road(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Files:
     monkeypatch.setenv("UNJAM_CACHE", str(tmp_path))
-    return RING.draw(np.random.default_rng(0))
+    return files_of_built(RING, RING.draw(np.random.default_rng(0)))
 
 
 def test_a_second_simulation_in_one_process_is_refused(simulation: Simulation) -> None:
@@ -50,7 +52,7 @@ def test_simulations_over_traci_run_beside_it_without_disturbing_it(simulation: 
     np.testing.assert_array_equal(again.speeds, expected.speeds)
 
 
-def test_closing_twice_is_fine_and_makes_room_for_a_new_one(road: ClosedRoad) -> None:
+def test_closing_twice_is_fine_and_makes_room_for_a_new_one(road: Files) -> None:
     first = Simulation()
     first.load(road, 0.1, 0)
     first.close()
@@ -68,7 +70,7 @@ def test_one_that_never_ran_can_be_closed() -> None:
     Simulation().close()
 
 
-def test_closing_removes_its_files(road: ClosedRoad, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_closing_removes_its_files(road: Files, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     with Simulation() as simulation:
         simulation.load(road, 0.1, 0)
@@ -76,7 +78,7 @@ def test_closing_removes_its_files(road: ClosedRoad, tmp_path: Path, monkeypatch
     assert not list(tmp_path.glob("unjam-*"))
 
 
-def test_an_error_inside_the_block_closes_it(road: ClosedRoad) -> None:
+def test_an_error_inside_the_block_closes_it(road: Files) -> None:
     def fail() -> None:
         with Simulation() as simulation:
             simulation.load(road, 0.1, 0)
@@ -87,11 +89,12 @@ def test_an_error_inside_the_block_closes_it(road: ClosedRoad) -> None:
     Simulation().close()
 
 
-def test_loading_puts_every_vehicle_in_its_place_at_rest(road: ClosedRoad, simulation: Simulation) -> None:
+def test_loading_puts_every_vehicle_in_its_place_at_rest(road: Files, simulation: Simulation) -> None:
     simulation.load(road, 0.1, 0)
     assert simulation.vehicle_count() == 22
-    assert simulation.speeds(road.vehicle_ids) == [0.0] * 22
-    assert simulation.distances(road.vehicle_ids) == [0.0] * 22
+    ids = RING.draw(np.random.default_rng(0)).vehicle_ids
+    assert simulation.speeds(ids) == [0.0] * 22
+    assert simulation.distances(ids) == [0.0] * 22
     assert simulation.colliding_count() == 0
 
 
@@ -107,62 +110,58 @@ BROKEN_TRAFFIC = {
 @pytest.mark.parametrize("loaded_before", [False, True])
 @pytest.mark.parametrize(("traffic", "words"), BROKEN_TRAFFIC.items())
 def test_sumos_own_words_about_broken_traffic_reach_the_user_in_one_line(
-    loaded_before: bool, traffic: str, words: str, road: ClosedRoad, simulation: Simulation
+    loaded_before: bool, traffic: str, words: str, road: Files, simulation: Simulation
 ) -> None:
     if loaded_before:
         simulation.load(road, 0.1, 0)
     with pytest.raises(EpisodeError) as caught:
-        simulation.load(replace(road, traffic=traffic), 0.1, 0)
+        simulation.load(road._replace(traffic=traffic), 0.1, 0)
     assert words in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
-def test_sumos_own_words_come_from_the_child_process_too(road: ClosedRoad) -> None:
+def test_sumos_own_words_come_from_the_child_process_too(road: Files) -> None:
     for traffic, words in list(BROKEN_TRAFFIC.items())[:2]:
         with Simulation("traci") as simulation, pytest.raises(EpisodeError) as caught:
-            simulation.load(replace(road, traffic=traffic), 0.1, 0)
+            simulation.load(road._replace(traffic=traffic), 0.1, 0)
         assert words in str(caught.value)
 
 
 BROKEN_ROADS = {
-    ("nodes", "<nodes"): "unexpected end of input",
-    ("edges", "<edges></edges>"): "No edges loaded",
-    ("netconvert_options", ("--no-such-option", "1")): "no-such-option",
+    ("nodes", ()): "No nodes loaded",
+    ("edges", ()): "No edges loaded",
+    ("connections", (("edge_0", "elsewhere"),)): "elsewhere",
 }
 
 
 @pytest.mark.parametrize(("change", "words"), BROKEN_ROADS.items())
 def test_netconverts_own_words_about_a_broken_road_reach_the_user_in_one_line(
-    change: tuple[str, str], words: str, road: ClosedRoad, simulation: Simulation
+    change: tuple[str, Any], words: str, road: Files
 ) -> None:
     with pytest.raises(EpisodeError) as caught:
-        simulation.load(replace(road, network=replace(road.network, **dict([change]))), 0.1, 0)
+        network_file(replace(RING.draw(np.random.default_rng(0)).network, **dict([change])))
     assert words in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
-def test_an_error_names_its_own_reason_and_not_an_earlier_one(
-    road: ClosedRoad, simulation: Simulation
-) -> None:
+def test_an_error_names_its_own_reason_and_not_an_earlier_one(road: Files, simulation: Simulation) -> None:
     for traffic, words in BROKEN_TRAFFIC.items():
         with pytest.raises(EpisodeError) as caught:
-            simulation.load(replace(road, traffic=traffic), 0.1, 0)
+            simulation.load(road._replace(traffic=traffic), 0.1, 0)
         others = [other for other in BROKEN_TRAFFIC.values() if other != words]
         assert not any(other in str(caught.value) for other in others)
 
 
 @pytest.mark.parametrize("backend", ["libsumo", pytest.param("traci", marks=pytest.mark.slow)])
-def test_after_a_refused_road_the_next_one_runs_as_in_a_new_simulation(
-    backend: Backend, road: ClosedRoad
-) -> None:
+def test_after_a_refused_road_the_next_one_runs_as_in_a_new_simulation(backend: Backend, road: Files) -> None:
     expected = run_episode(RING, IDM(), (0,))
     first, second, *_ = BROKEN_TRAFFIC
     with Simulation(backend) as simulation:
         with pytest.raises(EpisodeError):
-            simulation.load(replace(road, traffic=first), 0.1, 0)
+            simulation.load(road._replace(traffic=first), 0.1, 0)
         simulation.load(road, 0.1, 0)
         with pytest.raises(EpisodeError):
-            simulation.load(replace(road, traffic=second), 0.1, 0)
+            simulation.load(road._replace(traffic=second), 0.1, 0)
         assert fingerprint(run_episode(RING, IDM(), (0,), simulation=simulation)) == fingerprint(expected)
 
 
@@ -210,7 +209,7 @@ def test_what_sumo_refuses_of_the_users_own_network_is_told_in_one_line_and_the_
     assert run_episode(RING, IDM(), (0,), simulation=simulation).status == "completed"
 
 
-def test_over_traci_sumo_is_reached_from_this_machine_alone_once_we_are_there(road: ClosedRoad) -> None:
+def test_over_traci_sumo_is_reached_from_this_machine_alone_once_we_are_there(road: Files) -> None:
     """SUMO has no option to listen on loopback alone: it must stop to listen once its one client is there."""
     with Simulation("traci") as simulation:
         simulation.load(road, 0.1, 1)

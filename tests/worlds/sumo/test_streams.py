@@ -8,11 +8,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from unjam.drivers.command import Command
 from unjam.errors import EpisodeError
 from unjam.scenarios import Merge
 from unjam.scenarios.road import Origin
-from unjam.scenarios.scenario import SMALLEST_CAV_GAP
 from unjam.worlds.sumo import make_traffic
+from unjam.worlds.sumo.files import SMALLEST_CAV_GAP
 from unjam.worlds.sumo.merging import MergingTraffic
 from unjam.worlds.sumo.simulation import Simulation
 from unjam.worlds.sumo.streams import FAR, Streams
@@ -157,7 +158,7 @@ def test_positions_are_where_sumo_has_the_vehicles(simulation: Simulation) -> No
     traffic = merging(simulation)
     compared = 0
     for _ in range(60):
-        traffic.advance(np.zeros(len(traffic.cavs)))
+        traffic.advance(Command(np.zeros(len(traffic.cavs))))
         streams = traffic._streams
         assert sorted(streams.names) == sorted(libsumo.vehicle.getIDList())
         for name, position in zip(streams.names, streams.positions, strict=True):
@@ -178,7 +179,7 @@ def test_leaders_on_the_same_lane_are_those_of_sumo(simulation: Simulation) -> N
     traffic = merging(simulation)
     compared = 0
     for _ in range(100):
-        traffic.advance(np.zeros(len(traffic.cavs)))
+        traffic.advance(Command(np.zeros(len(traffic.cavs))))
         streams = traffic._streams
         leaders = streams.leaders()
         gaps = streams.gaps(leaders)

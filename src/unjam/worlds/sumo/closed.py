@@ -21,6 +21,7 @@ from unjam.physics.kinematics import next_position, next_speed
 from unjam.scenarios.road import ClosedRoad
 from unjam.scenarios.scenario import Scenario
 from unjam.worlds.record import Episode, trajectory
+from unjam.worlds.sumo.files import Files, files_of_built
 from unjam.worlds.sumo.neighbours import loop_neighbours, loop_state, places_along
 from unjam.worlds.sumo.people import drivers_of, wanted_speeds
 from unjam.worlds.sumo.simulation import Simulation
@@ -65,6 +66,9 @@ class ClosedTraffic(Traffic[ClosedRoad]):
         if simulation.vehicle_count() != len(road.vehicle_ids):
             self._miss()
         self._forget()
+
+    def _files(self) -> Files:
+        return files_of_built(self.scenario, self.road)
 
     def _be_human(self, ids: Sequence[str]) -> None:
         """Let `ids` be those whose driving has noise, from the next step on."""

@@ -14,6 +14,7 @@ from unjam.scenarios.population import as_calibrated
 from unjam.scenarios.road import MergingRoad
 from unjam.scenarios.scenario import Scenario
 from unjam.worlds.record import Episode
+from unjam.worlds.sumo.files import Files, files_of_built
 from unjam.worlds.sumo.network_files import network_file, network_lines
 from unjam.worlds.sumo.open import OpenTraffic
 from unjam.worlds.sumo.people import LEAVE_TO_SUMO, drivers_of
@@ -36,6 +37,9 @@ class MergingTraffic(OpenTraffic[MergingRoad]):
         """Put the first vehicles on the road; nothing moves yet."""
         super().__init__(scenario, road, seed, simulation, full)
         self._streams = Streams()
+
+    def _files(self) -> Files:
+        return files_of_built(self.scenario, self.road)
 
     def _is_cav(self, name: str) -> bool:
         return name in self.road.cav_ids

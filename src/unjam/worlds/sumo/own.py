@@ -13,11 +13,11 @@ from unjam.drivers.local_state import LARGEST_GAP, LocalState
 from unjam.scenarios.road import OwnRoad
 from unjam.scenarios.scenario import Scenario
 from unjam.worlds.record import Episode
+from unjam.worlds.sumo.files import CAV_TYPES, Files, files_of_own
 from unjam.worlds.sumo.network_files import edge_lengths, network_lines
 from unjam.worlds.sumo.open import OpenTraffic
 from unjam.worlds.sumo.simulation import Simulation
 from unjam.worlds.sumo.traffic import Floats, Seed
-from unjam.worlds.sumo.vehicle_types import CAV_TYPES
 from unjam.worlds.world import Driven
 
 
@@ -33,6 +33,9 @@ class OwnTraffic(OpenTraffic[OwnRoad]):
         self._routes: Counter[tuple[str, ...]] = Counter()
         self._log_edges: list[list[tuple[str, float]]] = []
         self._allowed: list[float] = []
+
+    def _files(self) -> Files:
+        return files_of_own(self.scenario, self.road)
 
     @property
     def expects_cavs(self) -> bool:

@@ -16,10 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from unjam.errors import EpisodeError, MissingPartError, UnjamError
-from unjam.scenarios.road import BuiltRoad, OwnRoad, Road
-from unjam.scenarios.scenario import Actuation, Scenario
-from unjam.worlds.sumo.network_files import network_file, sumo_program
-from unjam.worlds.sumo.vehicle_types import own_types_xml, traffic_xml
+from unjam.scenarios.scenario import Actuation
+from unjam.worlds.sumo.files import Files
+from unjam.worlds.sumo.network_files import sumo_program
 
 Backend = Literal["libsumo", "traci", "gui"]
 """`libsumo`: in this process; `traci`: SUMO as a child process; `gui`: the same, with its window."""
@@ -86,13 +85,16 @@ class Simulation:
         self.waiting: Callable[[], Sequence[str]] = call("simulation", "getPendingVehicles")
         """who wants to enter and cannot"""
 
-    def load(self, scenario: Scenario, road: Road, seed: int) -> None:
+    def load(self, files: Files, step: float, seed: int) -> None:
         """Start an episode: load network and traffic, and put the vehicles on the road.
 
         Raises:
             EpisodeError: SUMO refuses the files; the message holds its reason.
         """
-        options = [*self._files(scenario, road), *self._options(scenario.simulation_step, seed)]
+        traffic = Path(self._folder.name) / "traffic.rou.xml"
+        traffic.write_text(files.traffic)
+        named = ",".join(str(path) for path in (*files.beside, traffic))
+        options = [*files.options, files.option, named, *self._options(step, seed)]
         try:
             if self._running:
                 self._sumo.load(options)
@@ -116,20 +118,6 @@ class Simulation:
             traci.start(command, label=label)
         self._sumo = traci.getConnection(label)
         self._bind()
-
-    def _files(self, scenario: Scenario, road: Road) -> list[str]:
-        """Write what SUMO reads of an episode, and return the options that name it."""
-        traffic = Path(self._folder.name) / "traffic.rou.xml"
-        if isinstance(road, OwnRoad):  # its own words about all that is not named here
-            traffic.write_text(own_types_xml(scenario, road))
-            additional = ",".join(str(path) for path in (*road.files.additional_files, traffic))
-            files = ["--configuration-file", str(road.files.path), "--additional-files", additional]
-            return [*files, "--verbose", "false"]
-        assert isinstance(road, BuiltRoad)
-        traffic.write_text(traffic_xml(scenario, road))
-        # Vehicles neither vanish from a jam nor give up waiting to enter.
-        patience = ["--time-to-teleport", "-1", "--max-depart-delay", "-1"]
-        return ["--net-file", str(network_file(road.network)), "--route-files", str(traffic), *patience]
 
     def _options(self, step: float, seed: int) -> list[str]:
         return [

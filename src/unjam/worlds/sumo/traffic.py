@@ -13,6 +13,7 @@ from unjam.physics.arrays import Array
 from unjam.scenarios.road import Road
 from unjam.scenarios.scenario import Scenario
 from unjam.worlds.record import Episode
+from unjam.worlds.sumo.files import Files
 from unjam.worlds.sumo.simulation import Simulation
 from unjam.worlds.world import Driven, OnProgress
 
@@ -81,7 +82,11 @@ class Traffic(Generic[RoadKind]):
         self._exploration_generator = np.random.default_rng(exploration_seed)
         self._simulation = simulation
         sumo = int(sumo_seed.generate_state(1)[0]) % 2**31
-        simulation.load(scenario, road, sumo)
+        simulation.load(self._files(), scenario.simulation_step, sumo)
+
+    def _files(self) -> Files:
+        """Return what SUMO reads of this episode."""
+        raise NotImplementedError
 
     def start(self, controlled: bool, on_progress: OnProgress | None = None) -> LocalState | None:
         """Run the warm-up, then hand the CAVs over, unless they stay human (`controlled` false).
@@ -159,7 +164,7 @@ class Traffic(Generic[RoadKind]):
 
     def _told(self, command: Command | None) -> list[float]:
         """Return what the CAVs are told, within the limits [m/s2]; raise `InputError` where it cannot be."""
-        wanted = command or Command(np.zeros(0))
+        wanted = Command(np.zeros(0)) if command is None else command
         return accelerations(wanted, self.limits, self.cavs, f"driver: step {self.decisions}")
 
     def _facts(self) -> dict[str, Any]:

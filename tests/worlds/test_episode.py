@@ -22,7 +22,7 @@ from unjam.drivers.from_file import FileDriver
 from unjam.drivers.observation import local_vector
 from unjam.errors import EpisodeError, InputError
 from unjam.scenarios import Ring
-from unjam.worlds.drive import run_episode
+from unjam.worlds.episode import run_episode
 from unjam.worlds.sumo.simulation import Simulation
 
 RING = Ring(horizon=300)
@@ -208,7 +208,7 @@ def test_exploration_adds_noise_of_the_networks_spread(cavs: int, hold: int, sim
     episode = run_episode(ring, driver, (0,), explore=True, simulation=simulation)
     noises = []
     for trajectory in episode.trajectories:
-        chosen, _ = trajectory.looks
+        chosen, _ = trajectory.choices
         np.testing.assert_array_equal(trajectory.residual, np.repeat(chosen, hold))
         noises.append(chosen - driver.network(trajectory.observations[:-1]))
         assert noises[-1].std() == pytest.approx(0.2, rel=0.06)

@@ -9,7 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from unjam.worlds.messages import Arrays, read_message, write_message
+from unjam.tree import Arrays
+from unjam.worlds.worker import read_message, write_message
 
 NAMES = st.text(min_size=1, max_size=8)
 FACTS = st.dictionaries(

@@ -1,11 +1,12 @@
-"""Who drives how, as SUMO's vehicle types: people, CAVs, and all traffic of an episode as XML."""
+"""What SUMO reads of an episode: who drives how as vehicle types, routes, and who enters."""
 
-from typing import Any
+from pathlib import Path
+from typing import Any, NamedTuple
 
 from unjam.physics.idm import IDMParameters
 from unjam.scenarios.road import BuiltRoad, OwnRoad
 from unjam.scenarios.scenario import VEHICLE_LENGTH, Scenario
-from unjam.worlds.sumo.network_files import Attributes, element_xml
+from unjam.worlds.sumo.network_files import Attributes, element_xml, network_file
 
 SMALLEST_CAV_GAP = 0.5
 """gap that SUMO keeps for a CAV [m]"""
@@ -19,7 +20,35 @@ KEPT = ("vClass", "length", "width", "height", "maxSpeed", "speedFactor", "guiSh
 """attributes of a vehicle type that a CAV takes over, beside those of changing lanes"""
 
 
-def traffic_xml(scenario: Scenario, road: BuiltRoad) -> str:
+class Files(NamedTuple):
+    """What SUMO reads of an episode."""
+
+    options: tuple[str, ...]
+    """that name the network, and what else is of the road"""
+    traffic: str
+    """XML of vehicle types, and of routes and vehicles where they are not the user's"""
+    option: str
+    """by which SUMO takes the traffic"""
+    beside: tuple[Path, ...] = ()
+    """files that the same option must name too"""
+
+
+def files_of_built(scenario: Scenario, road: BuiltRoad) -> Files:
+    """Return what SUMO reads of a road that is built for the episode."""
+    # Vehicles neither vanish from a jam nor give up waiting to enter.
+    patience = ("--time-to-teleport", "-1", "--max-depart-delay", "-1")
+    options = ("--net-file", str(network_file(road.network)), *patience)
+    return Files(options, _traffic_xml(scenario, road), "--route-files")
+
+
+def files_of_own(scenario: Scenario, road: OwnRoad) -> Files:
+    """Return what SUMO reads of the user's own network: its own words about all that is not named here."""
+    options = ("--configuration-file", str(road.files.path), "--verbose", "false")
+    traffic = _own_types_xml(scenario, road)
+    return Files(options, traffic, "--additional-files", road.files.additional_files)
+
+
+def _traffic_xml(scenario: Scenario, road: BuiltRoad) -> str:
     """Return the XML of types, routes and vehicles of an episode."""
     own = road.people if scenario.people == "native" else {}
     types = [
@@ -46,7 +75,7 @@ def traffic_xml(scenario: Scenario, road: BuiltRoad) -> str:
     return "\n".join(["<routes>", *types, *routes, *vehicles, "</routes>"])
 
 
-def own_types_xml(scenario: Scenario, road: OwnRoad) -> str:
+def _own_types_xml(scenario: Scenario, road: OwnRoad) -> str:
     """Return the XML of a CAV type beside each of the user's types: as large, but driven by commands."""
     lines = ["<additional>"]
     for name, attributes in road.files.types.items():

@@ -9,7 +9,8 @@ from unjam.drivers.registry import describe, driver_from_recipe, recipe_of
 from unjam.drivers.wrappers import Mixed
 from unjam.errors import InputError
 from unjam.scenarios import Merge, Ring
-from unjam.worlds.drive import run_episode
+from unjam.tree import mapped
+from unjam.worlds.episode import run_episode
 from unjam.worlds.sumo.simulation import Simulation
 
 PI, STOPPER = PISaturation(), FollowerStopper()
@@ -33,7 +34,7 @@ def test_it_drives_tensors_as_it_drives_arrays() -> None:
     assert mixed.tensors
     expected, _ = mixed.act(state, mixed.initial_memory(4))
     tensors = type(state)(*(torch.as_tensor(values) for values in state))
-    memory = {name: torch.as_tensor(rows) for name, rows in mixed.initial_memory(4).items()}
+    memory = mapped(torch.as_tensor, mixed.initial_memory(4))
     np.testing.assert_allclose(mixed.act(tensors, memory)[0].numpy(), expected, atol=1e-12)
 
 
