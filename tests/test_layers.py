@@ -15,7 +15,7 @@ MODULES = {path.relative_to(SOURCE).as_posix(): ast.parse(path.read_text()) for 
 
 ORDER = ("physics", "drivers", "scenarios", "traffic", "virtual", "agents", "experiments", "cli")
 """each may import those before it, and none after it"""
-EVERYWHERE = {"", "errors", "files", "parameters"}
+EVERYWHERE = {"", "errors", "files", "kernels", "parameters"}
 """what has no place in the order: it imports none of the layers"""
 ALLOWED = {
     "controller": {"drivers"},
@@ -28,7 +28,7 @@ ALLOWED = {
 }
 """what else a part may import"""
 LAZY = {
-    "__init__": {"controller", "drivers", "environments", "experiments", "reports", "traffic"},
+    "__init__": {"controller", "drivers", "environments", "experiments", "kernels", "reports", "traffic"},
     "__main__": {"cli"},
 }
 TORCH = {"torch", "stable_baselines3", "sb3_contrib"}

@@ -12,6 +12,7 @@ from typing import Any
 from unjam import __version__
 from unjam.drivers.driver import Driver
 from unjam.drivers.registry import describe
+from unjam.kernels import kernels
 from unjam.scenarios.registry import scenario_recipe
 from unjam.scenarios.scenario import Scenario
 
@@ -26,6 +27,7 @@ def manifest() -> dict[str, Any]:
         "python": platform.python_version(),
         "packages": package_versions(),
         "machine": {"system": platform.platform(), "processor": platform.machine(), "cores": os.cpu_count()},
+        "kernels": kernels(),
         "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
         "started": datetime.now(UTC).isoformat(timespec="seconds"),
     }

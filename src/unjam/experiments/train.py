@@ -8,11 +8,13 @@ from typing import Any
 import torch
 
 from unjam.drivers.registry import describe
+from unjam.experiments.apart import train_apart
 from unjam.experiments.config import RunConfig
 from unjam.experiments.folder import check_possible, continue_folder, start_folder
 from unjam.experiments.judge import TRAINED, judge
 from unjam.experiments.model_facts import write_model_facts
 from unjam.experiments.run import Run, Told
+from unjam.kernels import child_would_be_pinned
 from unjam.reports.html import write_report
 from unjam.reports.statistics import Estimate, paired_difference
 from unjam.traffic.workers import Workers
@@ -51,6 +53,9 @@ def train(
     A run that was stopped goes on where it was with `resume`; one that ended goes on if `config.steps` is
     larger than before. It then ends with the same parameters as if it had never stopped.
 
+    Where NumPy was imported before unjam, it trains in a process of its own, so that the result is the same:
+    see `unjam.kernels`.
+
     Args:
         config: what to do; see `unjam.load_config`.
         folder: new, or the run's.
@@ -63,6 +68,9 @@ def train(
         DiskError: the disk is full; the last checkpoint is whole.
     """
     folder = Path(folder)
+    if child_would_be_pinned():
+        rows = train_apart(config, folder, resume, told, progress)
+        return TrainResult(folder, rows, gain_of(config, rows))
     check_possible(config)  # what is wrong is told before anything is written
     if resume:
         continue_folder(folder, config)
