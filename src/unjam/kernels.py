@@ -1,8 +1,11 @@
 """The same bits on every x86-64 machine with AVX2: which kernels NumPy and torch compute with.
 
-Each library chooses its kernels by the processor, and each kernel rounds in its own way. `pin` asks all for those
-that every processor with AVX2 has; it must come before NumPy is imported. `UNJAM_KERNELS=own` leaves all as it is.
-What was tried on which processors, and what still differs, is in docs/training.md.
+Each library chooses its kernels by the processor, and each kernel rounds in its own way. `pin` asks all for
+those that every processor with AVX2 has; it must come before NumPy is imported. `UNJAM_KERNELS=own` leaves
+all as it is. What was tried on which processors, and what still differs, is in docs/training.md.
+
+MKL's square roots begin with an estimate that each make of processor has its own of, in every mode: so Adam
+is fused, and square roots of tensors are those of `unjam.physics.arrays`.
 """
 
 import ctypes

@@ -23,7 +23,7 @@ LEARNERS = {
 
 
 def hashes(learners: list[str]) -> dict[str, str]:
-    """Return the hash of all that each learner holds at its end, virtual environment and optimisers included."""
+    """Return the hash of all that each learner holds at its end, its virtual environment included."""
     torch.set_num_threads(1)  # as a training does
     found = {}
     with tempfile.TemporaryDirectory() as place, Workers(1) as workers:

@@ -61,7 +61,7 @@ def square_root(array: Array) -> Array:
         return math.sqrt(array)
     if isinstance(array, (np.ndarray, np.generic)):
         return np.sqrt(array)
-    # torch hands square roots to MKL, which begins with an estimate that each make of processor has its own of
+    # Those of torch are MKL's, which differ from one make of processor to another: see `unjam.kernels`.
     return array.rsqrt().reciprocal()
 
 
