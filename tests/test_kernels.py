@@ -75,8 +75,9 @@ def test_each_variable_matters_and_changes_nothing_else(variable: str) -> None:
     varied = {**kernels.settings(), variable: UNPINNED[variable], kernels.CHOICE: "own"}
     found = run(OPERATIONS, **varied)
     moved = {kind for kind, value in found.items() if value != GOLDEN["operations"][kind]}
-    assert moved
     assert moved <= OF[variable]
+    if variable != "MKL_CBWR" or kernels.processor()["vendor_id"] == "GenuineIntel":
+        assert moved  # of others' processors MKL knows COMPATIBLE alone
 
 
 @needs_avx2
