@@ -1,0 +1,1 @@
+import unjam  # noqa: F401  (before NumPy: it pins the kernels)

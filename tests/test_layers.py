@@ -18,7 +18,7 @@ ORDER = (
     *("training", "studies", "cli"),
 )
 """each may import those before it, and none after it"""
-EVERYWHERE = {"", "errors", "files", "manifest", "parameters", "tree"}
+EVERYWHERE = {"", "errors", "files", "kernels", "manifest", "parameters", "tree"}
 """what has no place in the order: it imports none of the layers"""
 ALLOWED = {
     "controller": {"drivers", "physics"},
@@ -32,7 +32,7 @@ ALLOWED = {
 }
 """what else a part may import"""
 LAZY = {
-    "__init__": {"controller", "drivers", "environments", "reports", "training", "worlds"},
+    "__init__": {"controller", "drivers", "environments", "kernels", "reports", "training", "worlds"},
     "__main__": {"cli"},
 }
 TORCH = {"torch", "stable_baselines3", "sb3_contrib"}

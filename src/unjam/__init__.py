@@ -11,7 +11,11 @@ The same on the command line: `unjam --help`.
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from unjam.environments import register_all
+from unjam.kernels import pin
+
+pin()  # before anything imports NumPy
+
+from unjam.environments import register_all  # noqa: E402
 
 __version__ = "0.1.0.dev0"
 

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from unjam import __version__
+from unjam.kernels import kernels
 
 PACKAGES = ("libsumo", "eclipse-sumo", "numpy", "torch", "stable-baselines3", "sb3-contrib", "gymnasium")
 
@@ -22,6 +23,7 @@ def manifest() -> dict[str, Any]:
         "python": platform.python_version(),
         "packages": package_versions(),
         "machine": {"system": platform.platform(), "processor": platform.machine(), "cores": os.cpu_count()},
+        "kernels": kernels(),
         "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
         "started": datetime.now(UTC).isoformat(timespec="seconds"),
     }

@@ -61,8 +61,8 @@ class TRPO(OnPolicy, sb3_contrib.TRPO):
         super().__init__(
             training,
             ResidualPolicy,
-            # SB3 drops its own eps when given arguments for the optimiser.
-            {"optimizer_kwargs": {"eps": 1e-5, "weight_decay": settings.value_l2}},
+            # SB3 drops its own eps when given arguments for the optimiser. Fused: see `unjam.kernels`.
+            {"optimizer_kwargs": {"eps": 1e-5, "weight_decay": settings.value_l2, "fused": True}},
             learning_rate=settings.critic_rate,
             n_steps=settings.critic_batch,  # the buffer takes the size of the episodes, see buffers.py
             batch_size=settings.critic_batch,

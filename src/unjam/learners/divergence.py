@@ -6,6 +6,8 @@ import torch
 from torch import Tensor
 from torch.distributions import Normal
 
+from unjam.physics.arrays import square_root
+
 
 class Gaussians(NamedTuple):
     """The distribution of the residual at each state, before bounds and squashing; tensors of shape (n,)."""
@@ -26,7 +28,7 @@ def total_variation(one: Gaussians, other: Gaussians) -> Tensor:
     b = 2 * (n / t**2 - m / s**2)
     c = m**2 / s**2 - n**2 / t**2 + 2 * torch.log(s / t)
     same = a.abs() < 1e-9 / s**2
-    root = (b**2 - 4 * a * c).clip(0).sqrt()
+    root = square_root((b**2 - 4 * a * c).clip(0))
     # Of equal widths they cross once, half-way.
     low, high = ((-b + sign * root) / (2 * torch.where(same, torch.ones_like(a), a)) for sign in (-1, 1))
     between = (_mass(m, s, low, high) - _mass(n, t, low, high)).abs()

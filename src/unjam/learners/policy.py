@@ -114,7 +114,9 @@ class ResidualPolicy(ActorCriticPolicy):
         for name, parameter in self.named_parameters():
             groups["value" in name].append(parameter)
         self.optimizer = torch.optim.Adam(
-            [{"params": groups[False], "lr": actor}, {"params": groups[True], "lr": critic}], eps=1e-5
+            [{"params": groups[False], "lr": actor}, {"params": groups[True], "lr": critic}],
+            eps=1e-5,
+            fused=True,  # see `unjam.kernels`
         )
 
     def scale_value(self, mean: float, std: float) -> None:

@@ -59,7 +59,10 @@ def square_root(array: Array) -> Array:
     """Return the square root of each entry."""
     if type(array) is float:
         return math.sqrt(array)
-    return array**0.5 if not isinstance(array, (np.ndarray, np.generic)) else np.sqrt(array)
+    if isinstance(array, (np.ndarray, np.generic)):
+        return np.sqrt(array)
+    # Those of torch are MKL's, which differ from one make of processor to another: see `unjam.kernels`.
+    return array.rsqrt().reciprocal()
 
 
 def as_column(array: Array) -> Array:

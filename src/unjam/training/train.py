@@ -8,7 +8,9 @@ from typing import Any
 import torch
 
 from unjam.drivers.registry import describe
+from unjam.kernels import child_would_be_pinned
 from unjam.measures.statistics import Estimate, paired_difference
+from unjam.training.apart import train_apart
 from unjam.reports.html import write_report
 from unjam.training.config import RunConfig
 from unjam.training.folder import check_possible, continue_folder, start_folder
@@ -51,6 +53,9 @@ def train(
     A run that was stopped goes on where it was with `resume`; one that ended goes on if `config.steps` is
     larger than before. It then ends with the same parameters as if it had never stopped.
 
+    Where NumPy was imported before unjam, it trains in a process of its own, so that the result is the same:
+    see `unjam.kernels`.
+
     Args:
         config: what to do; see `unjam.load_config`.
         folder: new, or the run's.
@@ -63,6 +68,9 @@ def train(
         DiskError: the disk is full; the last checkpoint is whole.
     """
     folder = Path(folder)
+    if child_would_be_pinned():
+        rows = train_apart(config, folder, resume, told, progress)
+        return TrainResult(folder, rows, gain_of(config, rows))
     check_possible(config)  # what is wrong is told before anything is written
     if resume:
         continue_folder(folder, config)

@@ -7,7 +7,7 @@ from typing import NamedTuple
 from unjam.drivers.from_file import FileReference, is_file_reference
 from unjam.errors import wrong
 from unjam.parameters import split_parameters
-from unjam.physics.arrays import Array, at_least, namespace
+from unjam.physics.arrays import Array, at_least, namespace, square_root
 
 DESIRED_SPEED = 30.0
 """v_des of Eq. 16 [m/s]"""
@@ -97,7 +97,7 @@ def released_merge(outcome: Outcome) -> dict[str, Array]:
     running = ~outcome.crashed
     there = ~xp.isnan(outcome.speeds)
     missed = _sum((MERGE_SPEED - outcome.speeds) ** 2) / (MERGE_SPEED**2 * at_least(there.sum(-1), 1))
-    speed = at_least(1.0 - missed**0.5, 0.0) * there.any(-1) * running
+    speed = at_least(1.0 - square_root(missed), 0.0) * there.any(-1) * running
     headway = HEADWAY_WEIGHT * too_close(outcome) * running
     return {"speed": speed, "headway": headway, "floor": at_least(-speed - headway, 0.0)}
 

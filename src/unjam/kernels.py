@@ -1,0 +1,117 @@
+"""The same bits on every x86-64 machine with AVX2: which kernels NumPy and torch compute with.
+
+Each library chooses its kernels by the processor, and each kernel rounds in its own way. `pin` asks all for
+those that every processor with AVX2 has; it must come before NumPy is imported. `UNJAM_KERNELS=own` leaves
+all as it is. What was tried on which processors, and what still differs, is in docs/training.md.
+
+MKL's square roots begin with an estimate that each make of processor has its own of, in every mode: so Adam
+is fused, and square roots of tensors are those of `unjam.physics.arrays`.
+"""
+
+import ctypes
+import os
+import platform
+import sys
+from contextlib import suppress
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+CHOICE = "UNJAM_KERNELS"
+SETTINGS = {
+    "OPENBLAS_CORETYPE": "Haswell",
+    "NPY_DISABLE_CPU_FEATURES": "X86_V4 AVX512_ICL AVX512_SPR",
+    "ATEN_CPU_CAPABILITY": "avx2",
+    # AVX2 would hold on Intel's processors alone: on others MKL takes it for COMPATIBLE, without a word.
+    "MKL_CBWR": "COMPATIBLE",
+}
+"""NumPy's products; NumPy's functions; torch's functions; torch's products and long functions"""
+OLDER_NUMPY = "AVX512F AVX512CD AVX512_SKX AVX512_CLX AVX512_CNL AVX512_ICL AVX512_SPR"
+"""what NumPy before 2.4 calls the same"""
+LOADED = ("numpy", "torch")
+
+
+def pin() -> None:
+    """Set the variables, over whatever they were; processes that are started from here inherit them."""
+    global _why_not
+    _why_not = _obstacle()
+    if _why_not is None:
+        wanted = settings()
+        late = [name for name in LOADED if name in sys.modules]
+        if late and any(os.environ.get(name) != value for name, value in wanted.items()):
+            _why_not = f"{late[0]} was imported before unjam"
+        os.environ.update(wanted)
+
+
+def pinned() -> bool:
+    """Return whether this process computes with the pinned kernels."""
+    return _why_not is None
+
+
+def child_would_be_pinned() -> bool:
+    """Return whether this process came too late, and a new one would not."""
+    return _why_not is not None and _obstacle() is None
+
+
+def settings() -> dict[str, str]:
+    """Return the variables for the installed NumPy; it warns of names that it does not know."""
+    with suppress(PackageNotFoundError, ValueError):
+        if tuple(map(int, version("numpy").split(".")[:2])) < (2, 4):
+            return {**SETTINGS, "NPY_DISABLE_CPU_FEATURES": OLDER_NUMPY}
+    return SETTINGS
+
+
+def kernels() -> dict[str, Any]:
+    """Return the processor and what is in force, as far as it is loaded: for the record."""
+    numpy, torch = (sys.modules.get(name) for name in LOADED)
+    return {
+        "processor": processor().get("model name", platform.processor() or platform.machine()),
+        "pinned": pinned(),
+        "why_not": _why_not,
+        "settings": {name: os.environ.get(name) for name in SETTINGS},
+        "openblas": _openblas_core(numpy) if numpy else None,
+        "numpy": _numpy_features() if numpy else None,
+        "torch": torch.backends.cpu.get_cpu_capability() if torch else None,
+    }
+
+
+def processor() -> dict[str, str]:
+    """Return what Linux says of the first processor; nothing elsewhere."""
+    found: dict[str, str] = {}
+    with suppress(OSError), open("/proc/cpuinfo", encoding="utf-8", errors="replace") as lines:
+        for line in lines:
+            name, colon, value = line.partition(":")
+            if not colon:
+                break
+            found[name.strip()] = value.strip()
+    return found
+
+
+def _obstacle() -> str | None:
+    """Return why nothing can be pinned here; None where it can."""
+    if os.environ.get(CHOICE) == "own":
+        return f"{CHOICE}=own"
+    if platform.machine() not in ("x86_64", "AMD64"):
+        return f"the processor is no x86-64: {platform.machine()}"
+    if not {"avx2", "fma"} <= set(processor().get("flags", "").split()):
+        return "the processor has no AVX2, or does not say so"
+    return None
+
+
+def _openblas_core(numpy: Any) -> str | None:
+    """Return the processor whose kernels NumPy's own OpenBLAS has chosen; None where it is another BLAS."""
+    for library in (Path(numpy.__file__).parents[1] / "numpy.libs").glob("libscipy_openblas64_*"):
+        with suppress(OSError, AttributeError):
+            ask = ctypes.CDLL(str(library)).scipy_openblas_get_corename64_
+            ask.restype = ctypes.c_char_p
+            return ask().decode()
+    return None
+
+
+def _numpy_features() -> list[str]:
+    """Return the groups of instructions that NumPy chooses kernels from, beside its least."""
+    inside = sys.modules["numpy._core._multiarray_umath"]
+    return [name for name in inside.__cpu_dispatch__ if inside.__cpu_features__.get(name)]
+
+
+_why_not: str | None = "pin() was not called"

@@ -1,0 +1,90 @@
+"""A training in a process of its own, for a program that imported NumPy before unjam: see `unjam.kernels`.
+
+The child, `python -m unjam.training.apart`, reads one line of JSON and answers lines: a list of a word and
+what belongs to it.
+"""
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from unjam.errors import DiskError, EpisodeError, InputError, MissingPartError, UnjamError
+from unjam.training.config import RunConfig
+from unjam.parameters import build
+
+KINDS = {kind.__name__: kind for kind in (InputError, MissingPartError, DiskError, EpisodeError)}
+
+Rows = dict[str, list[dict[str, Any]]]
+
+
+def train_apart(
+    config: RunConfig,
+    folder: Path,
+    resume: bool,
+    told: Callable[[dict[str, Any]], None] | None,
+    progress: Callable[[tuple[str, int], int], None] | None,
+) -> Rows:
+    """Train as `unjam.train` does, and return the rows of the judgement by driver.
+
+    Raises:
+        UnjamError: of the same kind as in this process.
+    """
+    child = subprocess.Popen(
+        [sys.executable, "-m", "unjam.training.apart"],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        encoding="utf-8",
+    )
+    try:
+        assert child.stdin is not None
+        assert child.stdout is not None
+        child.stdin.write(json.dumps([asdict(config), os.fspath(folder), resume, sys.path]))
+        child.stdin.close()
+        for line in child.stdout:
+            word, *content = json.loads(line)
+            if word == "row" and told is not None:
+                told(content[0])
+            elif word == "judged" and progress is not None:
+                progress((content[0], content[1]), content[2])
+            elif word == "error":
+                raise KINDS.get(content[0], UnjamError)(content[1])
+            elif word == "done":
+                return content[0]
+        raise UnjamError(f"training: its process ended with code {child.wait()}")
+    finally:
+        child.terminate()  # where it has ended by itself, this does nothing
+        child.wait()
+
+
+def main() -> None:
+    """Train as the line on standard input says."""
+    answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
+    os.dup2(2, 1)  # SUMO and user code may print: not into the answers
+    values, folder, resume, path = json.loads(sys.stdin.read())
+    sys.path[:] = path  # a user's driver imports what it did in the program
+
+    def say(*words: Any) -> None:
+        print(json.dumps(words), file=answers, flush=True)
+
+    try:
+        from unjam.training.train import train
+
+        result = train(
+            build(RunConfig, values, ""),
+            folder,
+            resume,
+            lambda row: say("row", row),
+            lambda episode, steps: say("judged", *episode, steps),
+        )
+        say("done", result.rows)
+    except UnjamError as error:
+        say("error", type(error).__name__, str(error))
+
+
+if __name__ == "__main__":
+    main()

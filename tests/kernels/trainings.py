@@ -1,0 +1,46 @@
+"""Three tiny trainings, one of each learner: the hash of what each has learned.
+
+Run: python -m tests.kernels.trainings [LEARNER ...]; prints one JSON object.
+"""
+
+import hashlib
+import json
+import sys
+import tempfile
+from pathlib import Path
+
+import torch
+
+from tests.training.test_run import learn_with, small_config
+from unjam.learners.state import learner_state
+from unjam.traffic.workers import Workers
+
+DATA = ("virtual/data/", "replay/")
+"""what was learned from, not what was learned"""
+LEARNERS = {
+    "trpo": {"virtual__virtual_ratio": 1.0, "virtual__epochs": 2, "virtual__members": 2},
+    "ppo": {"virtual__virtual_ratio": 0.0},
+    "sac": {"virtual__virtual_ratio": 0.0},
+}
+
+
+def hashes(learners: list[str]) -> dict[str, str]:
+    """Return the hash of all that each learner has learned, its virtual environment included."""
+    torch.set_num_threads(1)  # as a training does
+    found = {}
+    with tempfile.TemporaryDirectory() as place, Workers(1) as workers:
+        for learner in learners:
+            config = small_config(
+                agent=learner, policy__hidden=[32, 32], evaluation__every=0, **LEARNERS[learner]
+            )
+            run = learn_with(workers, Path(place) / learner, config)
+            total = hashlib.sha256()
+            for name, tensor in sorted(learner_state(run.learner)[1].items()):
+                if not name.startswith(DATA):
+                    total.update(name.encode() + tensor.numpy().tobytes())
+            found[learner] = total.hexdigest()[:16]
+    return found
+
+
+if __name__ == "__main__":
+    print(json.dumps(hashes(sys.argv[1:] or list(LEARNERS)), indent=1))

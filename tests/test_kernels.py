@@ -1,0 +1,165 @@
+"""Do the pinned kernels compute what they did, whatever the shell says? If not, and rightly so:
+python -m tests.kernels.bless.
+"""
+
+import json
+import os
+import platform
+import subprocess
+import sys
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.training.test_run import small_config
+from unjam import kernels
+
+ROOT = Path(__file__).parents[1]
+GOLDEN = json.loads((ROOT / "tests/kernels/hashes.json").read_text())
+UNPINNED = {
+    "OPENBLAS_CORETYPE": "Sandybridge",
+    "NPY_DISABLE_CPU_FEATURES": "X86_V3 X86_V4 AVX512_ICL AVX512_SPR",
+    "ATEN_CPU_CAPABILITY": "default",
+    "MKL_CBWR": "AVX",
+}
+"""other kernels, which every processor with AVX2 has as well"""
+OF = {
+    "OPENBLAS_CORETYPE": {"numpy products"},
+    "NPY_DISABLE_CPU_FEATURES": {"numpy functions", "numpy sums"},
+    "ATEN_CPU_CAPABILITY": {
+        "torch functions",
+        "torch sums",
+        "torch products",
+        "torch beginnings",
+        "torch steps",
+    },
+    "MKL_CBWR": {"torch functions", "torch products", "torch beginnings", "torch steps"},
+}
+"""what each may change"""
+
+needs_avx2 = pytest.mark.skipif(not kernels.pinned(), reason=f"not pinned: {kernels.kernels()['why_not']}")
+
+
+def run(program: str, **variables: str) -> dict[str, Any]:
+    """The JSON that a program prints last, in a process of its own with these variables."""
+    inherited = {name: value for name, value in os.environ.items() if name not in kernels.SETTINGS}
+    ran = subprocess.run(
+        [sys.executable, "-c", program],
+        cwd=ROOT,
+        env={**inherited, **variables},
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=True,
+    )
+    assert "Warning" not in ran.stderr
+    return json.loads(ran.stdout.splitlines()[-1])
+
+
+OPERATIONS = (
+    "import unjam, json; from tests.kernels import operations; print(json.dumps(operations.hashes()))"
+)
+STATE = "import {first}, json; import unjam; from unjam.kernels import kernels; print(json.dumps(kernels()))"
+
+
+@needs_avx2
+def test_whatever_the_shell_says_the_bits_are_the_committed_ones() -> None:
+    assert run(OPERATIONS, **UNPINNED) == GOLDEN["operations"]
+
+
+@needs_avx2
+@pytest.mark.parametrize("variable", UNPINNED)
+def test_each_variable_matters_and_changes_nothing_else(variable: str) -> None:
+    varied = {**kernels.settings(), variable: UNPINNED[variable], kernels.CHOICE: "own"}
+    found = run(OPERATIONS, **varied)
+    moved = {kind for kind, value in found.items() if value != GOLDEN["operations"][kind]}
+    assert moved <= OF[variable]
+    if variable != "MKL_CBWR" or kernels.processor()["vendor_id"] == "GenuineIntel":
+        assert moved  # of others' processors MKL knows COMPATIBLE alone
+
+
+@needs_avx2
+def test_trainings_of_all_learners_end_with_the_committed_bits() -> None:
+    program = (
+        "import json; from tests.kernels import trainings; "
+        "print(json.dumps(trainings.hashes(list(trainings.LEARNERS))))"
+    )
+    assert run(program, **UNPINNED) == GOLDEN["trainings"]
+
+
+@needs_avx2
+def test_says_what_is_in_force() -> None:
+    found = run(STATE.format(first="unjam, torch"))
+    assert found["pinned"]
+    assert found["why_not"] is None
+    assert (found["openblas"], found["torch"]) == ("Haswell", "AVX2")
+    assert not [name for name in found["numpy"] if "512" in name or name == "X86_V4"]
+    assert found["settings"] == kernels.settings()
+    assert found["processor"]
+
+
+@needs_avx2
+def test_says_that_numpy_came_first() -> None:
+    found = run(STATE.format(first="numpy"))
+    assert not found["pinned"]
+    assert found["why_not"] == "numpy was imported before unjam"
+    assert run(STATE.format(first="numpy"), **kernels.settings())["pinned"]
+
+
+def test_leaves_all_as_it_is_where_asked() -> None:
+    found = run(STATE.format(first="unjam"), **{kernels.CHOICE: "own"})
+    assert not found["pinned"]
+    assert set(found["settings"].values()) == {None}
+
+
+@pytest.mark.parametrize(
+    ("machine", "flags", "words"), [("aarch64", "asimd", "no x86-64"), ("x86_64", "sse2 avx", "no AVX2")]
+)
+def test_asks_nothing_of_other_processors(
+    machine: str, flags: str, words: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(platform, "machine", lambda: machine)
+    monkeypatch.setattr(kernels, "processor", lambda: {"flags": flags})
+    assert words in (kernels._obstacle() or "")
+
+
+LATE = """
+import numpy, json, sys
+import unjam
+from unjam.errors import InputError
+from unjam.training.config import RunConfig
+from unjam.kernels import pinned
+from unjam.parameters import build
+assert not pinned()
+values, folder = json.loads({given!r})
+rows, judged = [], []
+config = build(RunConfig, values, "")
+result = unjam.train(config, folder, told=rows.append, progress=lambda *each: judged.append(each))
+print(json.dumps([[row["iteration"] for row in rows], len(judged) > 0, result.gain.count]))
+"""
+REFUSED = """
+try:
+    unjam.train(build(RunConfig, values, ""), folder)
+except InputError as error:
+    print(json.dumps(str(error)))
+"""
+
+
+@needs_avx2
+def test_what_is_wrong_is_told_by_the_other_process_too(tmp_path: Path) -> None:
+    (tmp_path / "something").touch()
+    program = LATE.partition("config = ")[0] + REFUSED
+    given = json.dumps([asdict(small_config()), str(tmp_path)])
+    assert "is not empty" in run(program.format(given=given))
+
+
+@needs_avx2
+@pytest.mark.slow
+def test_a_program_that_imported_numpy_first_trains_in_a_pinned_process(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    given = json.dumps([asdict(small_config(steps=300)), str(folder)])
+    iterations, judged, count = run(LATE.format(given=given))
+    assert (iterations, judged, count) == ([1], True, 2)
+    assert json.loads((folder / "manifest.json").read_text())["kernels"]["pinned"]
