@@ -24,7 +24,7 @@ ALLOWED = {
     "controller": {"drivers", "physics"},
     "following": {"physics", "drivers", "scenarios"},
     "reports": {"physics", "drivers", "scenarios", "worlds", "measures"},
-    "virtual": {"following"},
+    "learners": {"following"},
     "training": {"controller", "reports"},
     "studies": {"controller", "following", "reports"},
     "cli": {"controller", "following", "reports"},
