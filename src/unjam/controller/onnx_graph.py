@@ -11,12 +11,12 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from unjam.controller.graph import ACCELERATION, input_name, output_name
+from unjam.controller.verify import graph_names, needed
 from unjam.drivers.driver import Driver, Memory
 from unjam.drivers.local_state import LocalState
 from unjam.drivers.registry import describe
 from unjam.drivers.speed_history import WrittenRows
-from unjam.errors import InputError, MissingPartError
+from unjam.errors import InputError
 from unjam.physics.arrays import clip
 
 OPSET = 20
@@ -47,14 +47,9 @@ class Whole(nn.Module):
 
 def _with_windows(memory: Memory) -> Memory:
     """Return the memory with each window of speeds in the form that a graph can be drawn of."""
-
-    def seen(name: str) -> Tensor:
-        return memory[f"{name.removesuffix('window')}seen"]
-
-    return {
-        name: WrittenRows(value, seen(name)) if name.rpartition(".")[2] == "window" else value
-        for name, value in memory.items()
-    }
+    windows = [name for name in memory if name.rpartition(".")[2] == "window"]
+    seen = {name: memory[f"{name.removesuffix('window')}seen"] for name in windows}
+    return {**memory, **{name: WrittenRows(memory[name], rows) for name, rows in seen.items()}}
 
 
 def _exact_constant() -> Callable[..., Any]:
@@ -63,11 +58,8 @@ def _exact_constant() -> Callable[..., Any]:
     Raises:
         MissingPartError: onnxscript is not installed.
     """
-    try:
-        import onnx_ir
-        from onnxscript import opset20 as operators
-    except ImportError:
-        raise MissingPartError("onnxscript is not installed; install it: pip install 'unjam[onnx]'") from None
+    operators = needed("onnxscript").opset20
+    import onnx_ir  # comes with it
 
     def constant(value: float, dtype: int = onnx_ir.DataType.DOUBLE, **_: Any) -> Any:
         exact = np.asarray(value, onnx_ir.DataType(dtype).numpy())
@@ -89,9 +81,10 @@ def onnx_graph(driver: Driver, limit: float) -> bytes:
     if not driver.tensors or driver.native:
         raise InputError(f"onnx: {describe(driver)} is not allowed; allowed: drivers that run on tensors")
     exact = {torch.ops.aten.scalar_tensor.default: _exact_constant()}
-    memory = driver.initial_memory(ROWS)
+    inputs, outputs = graph_names(driver)
     state = [torch.ones(ROWS, dtype=torch.float64) for _ in LocalState._fields]
-    arrays = (*state, *(torch.as_tensor(value, dtype=torch.float64) for value in memory.values()))
+    memory = driver.initial_memory(ROWS).values()
+    arrays = (*state, *(torch.as_tensor(value, dtype=torch.float64) for value in memory))
     rows = torch.export.Dim("cavs")
     with torch.no_grad(), warnings.catch_warnings(), redirect_stdout(io.StringIO()):
         warnings.simplefilter("ignore")
@@ -99,8 +92,8 @@ def onnx_graph(driver: Driver, limit: float) -> bytes:
         program: Any = torch.onnx.export(
             Whole(driver, limit),
             arrays,
-            input_names=[*LocalState._fields, *map(input_name, memory)],
-            output_names=[ACCELERATION, *map(output_name, memory)],
+            input_names=inputs,
+            output_names=outputs,
             dynamic_shapes=(tuple({0: rows} for _ in arrays),),
             opset_version=OPSET,
             dynamo=True,
