@@ -36,7 +36,7 @@ LAZY = {
     "__main__": {"cli"},
 }
 TORCH = {"torch", "stable_baselines3", "sb3_contrib"}
-LONGEST = 300
+LONGEST = 330
 
 
 def imported(tree: ast.AST) -> Iterator[str]:

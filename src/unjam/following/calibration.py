@@ -202,7 +202,7 @@ def calibrate_each(
             on_progress(len(found))
         return found
     fixed = {name: (getattr(typical, name),) * 2 for name in SEARCHED if name not in own}
-    found = []
+    found: list[Calibrated] = []
     for number, pairs in enumerate(groups, 1):
         found.append(calibrate(pairs, replace(settings, **fixed)))
         if on_progress is not None:

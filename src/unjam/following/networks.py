@@ -81,7 +81,7 @@ class MultiStepSettings:
     residual_weight: NotNegative = 0.1
     """how much the squared residual counts: where data are silent, the base drives"""
     validate_every: Count = 20
-    """gradient steps between two looks at the validation trajectories, which choose the weights"""
+    """gradient steps between two judgements on the validation trajectories, which choose the weights"""
 
 
 class FollowingNetwork(nn.Module):
@@ -95,14 +95,14 @@ class FollowingNetwork(nn.Module):
     ) -> None:
         """Make a network whose inputs are normalised by `moments`; with `zero` it answers zero at first."""
         super().__init__()
-        sizes = itertools.pairwise([len(RESIDUAL_INPUTS), *settings.hidden, 1])
+        sizes = [len(RESIDUAL_INPUTS), *settings.hidden, 1]
         with torch.random.fork_rng():
             torch.manual_seed(seed)
-            self.layers = [nn.Linear(*pair) for pair in sizes]
+            self.layers = [nn.Linear(*pair) for pair in itertools.pairwise(sizes)]
         if zero:
             nn.init.zeros_(self.layers[-1].weight)
             nn.init.zeros_(self.layers[-1].bias)
-        self.learned = nn.ModuleList(self.layers)
+        self.registered = nn.ModuleList(self.layers)
         self.authority = settings.authority
         seen = residual_inputs(*moments.seen)
         self.register_buffer("mean", _tensor(seen.mean(0)))
@@ -155,11 +155,7 @@ class Losses:
 
 
 def fit_one_step(
-    moments: Moments,
-    validation: Moments,
-    base: Follow | None,
-    settings: NetworkSettings,
-    seed: int,
+    moments: Moments, validation: Moments, base: Follow | None, settings: NetworkSettings, seed: int
 ) -> tuple[FollowingNetwork, Losses]:
     """Return a network that has learned the accelerations of single moments, less what the base says of them.
 
@@ -230,8 +226,8 @@ class MultiStepFit:
 
     network: FollowingNetwork
     validation: list[float]
-    """mean over the validation trajectories of the root mean squared error of the gap [m], by look; the
-    first is the base's"""
+    """mean over the validation trajectories of the root mean squared error of the gap [m], by
+    judgement; the first is the base's"""
 
 
 def fit_multi_step(
@@ -287,9 +283,8 @@ def _loss(
     network: FollowingNetwork, base: Model, limits: Limits, real: Stretches, settings: MultiStepSettings
 ) -> Tensor:
     """Return the loss of driving behind the leaders of some stretches."""
-    speeds, leader_speeds, gaps, paths = map(
-        _tensor, (real.speed, real.leader_speed, real.gap, real.leader_path)
-    )
+    recorded = (real.speed, real.leader_speed, real.gap, real.leader_path)
+    speeds, leader_speeds, gaps, paths = map(_tensor, recorded)
     present = torch.as_tensor(real.present)[1:]
     residuals: list[Tensor] = []
 
