@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from unjam.controller import archive as archives
-from unjam.controller.archive import LARGEST_PART, MANIFEST, PARTS, WEIGHTS, pack_parts, unpack_parts
+from unjam.controller import file as files
+from unjam.controller.file import LARGEST_PART, MANIFEST, PARTS, WEIGHTS, pack_parts, unpack_parts
 from unjam.errors import InputError
 
 WHOLE = {MANIFEST: b"{}", WEIGHTS: b"numbers"}
@@ -86,7 +86,7 @@ def test_a_bomb_is_refused_before_it_is_unpacked(
 
 
 def test_a_part_that_is_too_large_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(archives, "LARGEST_PART", 1000)
+    monkeypatch.setattr(files, "LARGEST_PART", 1000)
     assert "has 1001 bytes; allowed: at most 1000" in refused(
         tmp_path, with_entry(zipfile.ZipInfo(PARTS[2]), bytes(1001))
     )

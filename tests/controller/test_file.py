@@ -17,8 +17,7 @@ from safetensors.numpy import save
 
 from tests.conftest import random_network
 from unjam.controller import controller_bytes, load_controller
-from unjam.controller.archive import MANIFEST, WEIGHTS
-from unjam.controller.manifest import FORMAT
+from unjam.controller.file import FORMAT, MANIFEST, WEIGHTS
 from unjam.drivers import IDM, FollowerStopper, PISaturation, ResidualDriver
 from unjam.drivers.check import random_state
 from unjam.drivers.driver import Driver

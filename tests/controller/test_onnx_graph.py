@@ -12,9 +12,8 @@ from tests.controller.test_sample import perceived
 from tests.drivers.test_experts import EXPERTS
 from tests.learners.test_policy import make_policy, mean_of, shake
 from tests.learners.test_squashed_policy import make_policy as make_squashed_policy
-from unjam.controller.graph import check_graph, run_graph
 from unjam.controller.onnx_graph import onnx_graph
-from unjam.controller.sample import replay
+from unjam.controller.verify import check_graph, replay, run_graph
 from unjam.drivers import (
     ACC,
     IDM,

@@ -1,10 +1,12 @@
+from typing import Literal
+
 import numpy as np
 import pytest
 
 from tests.following.made_up import idm_driver
-from unjam.following.calibration import CalibrationSettings, calibrate, gap_objective
-from unjam.following.pairs import stretches_of
-from unjam.physics.idm import IDMParameters
+from unjam.following.calibration import CalibrationSettings, calibrate, calibrate_each, gap_objective
+from unjam.following.pairs import Pair, stretches_of
+from unjam.physics.idm import PAPER_IDM, IDMParameters
 
 QUICK = CalibrationSettings(generations=40)
 DRIVER = IDMParameters(time_headway=0.9, max_acceleration=1.4, comfortable_deceleration=2.0, minimum_gap=2.5)
@@ -36,3 +38,47 @@ def test_the_result_depends_on_the_seed_alone() -> None:
 def test_a_parameter_at_the_end_of_what_is_searched_is_named() -> None:
     settings = CalibrationSettings(generations=20, time_headway=(1.5, 3.0))
     assert "time_headway" in calibrate([idm_driver(DRIVER)], settings).bounds
+
+
+HEADWAYS = (0.8, 1.6, 1.15)
+
+
+def groups() -> list[list[Pair]]:
+    """Drivers who differ in their headway alone; the second with two trajectories."""
+    made = [[idm_driver(IDMParameters(time_headway=headway), f"{headway}")] for headway in HEADWAYS]
+    made[1].append(idm_driver(IDMParameters(time_headway=HEADWAYS[1]), "1.6", seed=4, seconds=20.0))
+    return made
+
+
+@pytest.mark.parametrize("every", ["trajectory", "moment"])
+def test_each_driver_gets_its_own_headway_and_what_is_typical(every: Literal["trajectory", "moment"]) -> None:
+    told: list[int] = []
+    settings = CalibrationSettings(every=every)
+    found = calibrate_each(groups(), PAPER_IDM, ("time_headway",), settings, told.append)
+    assert [one.parameters.time_headway for one in found] == pytest.approx(HEADWAYS, abs=5e-3)
+    assert all(one.parameters.minimum_gap == PAPER_IDM.minimum_gap for one in found)
+    assert all(one.gap_error < 0.05 for one in found)
+    assert [one.seconds for one in found] == pytest.approx([40.0, 60.0, 40.0])
+    assert told == [3]
+
+
+def test_who_drives_beside_whom_does_not_matter() -> None:
+    together = calibrate_each(groups(), PAPER_IDM, ("time_headway",))
+    alone = [calibrate_each([group], PAPER_IDM, ("time_headway",))[0] for group in groups()]
+    for one, other in zip(together, alone, strict=True):
+        assert one.parameters.time_headway == pytest.approx(other.parameters.time_headway, abs=2e-3)
+
+
+def test_several_own_parameters_are_searched_for_one_driver_after_the_other() -> None:
+    told: list[int] = []
+    settings = CalibrationSettings(generations=5)
+    found = calibrate_each(groups()[:2], PAPER_IDM, ("time_headway", "minimum_gap"), settings, told.append)
+    assert all(one.parameters.max_acceleration == PAPER_IDM.max_acceleration for one in found)
+    assert found[0].parameters.time_headway < found[1].parameters.time_headway
+    assert told == [1, 2]
+
+
+def test_a_headway_beyond_what_is_searched_is_named() -> None:
+    settings = CalibrationSettings(time_headway=(1.0, 3.0))
+    (found,) = calibrate_each(groups()[:1], PAPER_IDM, ("time_headway",), settings)
+    assert (found.parameters.time_headway, found.bounds) == (1.0, ("time_headway",))

@@ -3,12 +3,12 @@ import pytest
 
 from unjam.errors import InputError
 from unjam.following.four_regimes import REGIMES, FourRegimes, four_regimes
-from unjam.following.pairs import rows_of
+from unjam.following.pairs import moments_of
 from unjam.parameters import build
 
 
 def test_there_are_as_many_rows_as_in_the_paper() -> None:
-    assert len(rows_of(four_regimes(FourRegimes()))) == 262_630
+    assert len(moments_of(four_regimes(FourRegimes()))) == 262_630
 
 
 def test_the_same_seed_gives_the_same_set() -> None:

@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 
 from tests.following.made_up import idm_driver
 from unjam.errors import InputError
-from unjam.following.pairs import Pair, of_split, rows_of, split_by_trajectory, stretches_of
+from unjam.following.pairs import Pair, moments_of, of_split, split_by_trajectory, stretches_of
 from unjam.physics.idm import PAPER_IDM
 
 
@@ -22,7 +22,7 @@ def test_the_leaders_path_gives_back_the_recorded_gap() -> None:
 
 def test_rows_are_all_moments_with_a_next_one() -> None:
     pairs = [idm_driver(PAPER_IDM, seconds=3.0), idm_driver(PAPER_IDM, seconds=5.0)]
-    rows = rows_of(pairs)
+    rows = moments_of(pairs)
     assert len(rows) == 30 + 50
     assert rows.acceleration[30] == pytest.approx((pairs[1].speed[1] - pairs[1].speed[0]) / 0.1)
 

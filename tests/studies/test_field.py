@@ -6,8 +6,7 @@ import pytest
 
 from tests.following.made_up import idm_driver
 from unjam.following.calibration import CalibrationSettings
-from unjam.following.multi_step import MultiStepSettings
-from unjam.following.network import NetworkSettings
+from unjam.following.networks import MultiStepSettings, NetworkSettings
 from unjam.physics.idm import IDMParameters
 from unjam.studies import field
 from unjam.studies.field import DATA, Task, data_of, halves, measure, summary

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from unjam.following.four_regimes import FourRegimes
-from unjam.following.network import NetworkSettings
-from unjam.following.pairs import Rows
+from unjam.following.networks import NetworkSettings
+from unjam.following.pairs import Moments
 from unjam.physics.idm import idm_acceleration
 from unjam.physics.kinematics import next_speed
 from unjam.studies import figure_6
@@ -63,7 +63,7 @@ def test_a_fit_is_judged_with_and_without_noise(small: None, network: str) -> No
 @pytest.mark.parametrize("speed", [0.0, 0.01, 10.0])
 def test_who_stands_can_only_start(speed: float) -> None:
     count, settings = 200_000, FourRegimes()
-    rows = Rows(*(np.full(count, value) for value in (speed, 0.0, 2.0 + speed * 5, 0.0)))
+    rows = Moments(*(np.full(count, value) for value in (speed, 0.0, 2.0 + speed * 5, 0.0)))
     noise = np.random.default_rng(0).normal(0.0, settings.noise, count)
     wanted = idm_acceleration(rows.speed, rows.leader_speed, rows.gap, settings.driver) + noise
     drawn = (next_speed(rows.speed, wanted, settings.step) - rows.speed) / settings.step

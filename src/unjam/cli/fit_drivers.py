@@ -54,7 +54,7 @@ def fit_drivers(
       unjam drive ring-jammed -d human -d pi --humans drivers.json
     """
     from unjam.cli.output import Counted, aside, console, print_json
-    from unjam.following.fit_from_files import fit_from_files
+    from unjam.following.fit_drivers import fit_from_files
     from unjam.scenarios.population import write_population
 
     changes: dict[str, Any] = {"residual": residual, "seed": seed, **assignments(settings)}

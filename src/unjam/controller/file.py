@@ -1,27 +1,45 @@
-"""Writing and reading a `.unjam` file."""
+"""Writing and reading a `.unjam` file: its archive, its manifest, and what is checked of them."""
 
 import hashlib
+import io
 import json
+import stat
 import zipfile
 import zlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
 from unjam import __version__
-from unjam.controller.archive import MANIFEST, WEIGHTS, pack_parts, unpack_parts
-from unjam.controller.manifest import FORMAT, READABLE, description
 from unjam.drivers.driver import Driver
-from unjam.drivers.observation import observation_size
+from unjam.drivers.local_state import STATE_UNITS
 from unjam.drivers.registry import driver_from_recipe, files_of, recipe_of
-from unjam.drivers.residual import ResidualDriver
 from unjam.errors import InputError
 from unjam.files import to_json
+from unjam.tree import leaves
 
 SUFFIX = ".unjam"
+FORMAT = 3
+"""schema version of the manifest"""
+READABLE = (1, 2, FORMAT)
+"""versions that can be read; the first had no description, sample or graph, the second other names of what is
+remembered"""
+MANIFEST, WEIGHTS = "manifest.json", "weights.safetensors"
+SAMPLE, GRAPH = "sample.safetensors", "controller.onnx"
+PARTS = (MANIFEST, WEIGHTS, SAMPLE, GRAPH)
+"""all that an archive may hold; the last two are there where it was exported"""
+LARGEST_PART = 64 * 2**20
+"""bytes of one part"""
+DAMAGED = (
+    *(zipfile.BadZipFile, zlib.error, SafetensorError, OSError, EOFError, ValueError, KeyError, TypeError),
+    *(AttributeError, ArithmeticError, MemoryError),
+    RuntimeError,  # of a kind that zipfile does not know, or nested without end
+)
+"""what reading can raise where a file is none of ours"""
 
 
 @dataclass(frozen=True)
@@ -83,22 +101,8 @@ def read_controller(path: Path | str) -> Controller:
         unknown = arrays.keys() - recipe_of(driver)[1].keys()
         if unknown:
             raise InputError(f"controller {file.name}: weights {min(unknown)!r} belong to no network")
-        _check_inputs(driver)
         return Controller(driver, manifest, parts)
-    except (
-        zipfile.BadZipFile,
-        zlib.error,
-        SafetensorError,
-        OSError,
-        EOFError,
-        ValueError,
-        KeyError,
-        TypeError,
-        AttributeError,
-        ArithmeticError,
-        MemoryError,
-        RuntimeError,  # of a kind that zipfile does not know, or nested without end
-    ) as error:
+    except DAMAGED as error:
         raise InputError(f"controller {file.name}: not a controller: {error}") from None
 
 
@@ -132,10 +136,95 @@ def _check_code(name: str, recipe: Any, own: bool) -> None:
             raise InputError(f"controller {name}: its expert {str(code)!r} has changed since")
 
 
-def _check_inputs(driver: Driver) -> None:
-    """Raise `InputError` where a network does not see as many numbers as its driver shows it."""
-    while isinstance(driver, ResidualDriver):
-        shown = observation_size(driver.parts, driver.expert)
-        if driver.network.inputs != shown:
-            raise InputError(f"network: {driver.network.inputs} inputs are not allowed; allowed: {shown}")
-        driver = driver.expert
+def pack_parts(parts: dict[str, bytes]) -> bytes:
+    """Return the archive of `parts`; the same parts have the same bytes."""
+    content = io.BytesIO()
+    with zipfile.ZipFile(content, "w", zipfile.ZIP_STORED) as archive:
+        for name, part in parts.items():
+            archive.writestr(zipfile.ZipInfo(name), part)  # of a fixed date
+    return content.getvalue()
+
+
+def unpack_parts(file: Path) -> dict[str, bytes]:
+    """Return the parts of an archive, in memory: nothing is written.
+
+    Raises:
+        InputError: it holds what no controller has: an unknown, second, compressed or too large part, a link.
+        zipfile.BadZipFile, OSError, EOFError, RuntimeError: it is not an archive, or damaged.
+    """
+    size, largest = file.stat().st_size, len(PARTS) * LARGEST_PART
+    if size > largest:
+        raise InputError(f"controller {file.name}: {size} bytes; allowed: at most {largest}")
+    parts: dict[str, bytes] = {}
+    with zipfile.ZipFile(file) as archive:
+        for entry in archive.infolist():
+            if entry.filename in parts:
+                raise InputError(f"controller {file.name}: has {entry.filename} twice")
+            if wrong := _what_is_wrong(entry):
+                raise InputError(f"controller {file.name}: part {entry.filename!r} {wrong}")
+            parts[entry.filename] = archive.read(entry)
+    for name in (MANIFEST, WEIGHTS):
+        if name not in parts:
+            raise InputError(f"controller {file.name}: not a controller: it has no {name}")
+    return parts
+
+
+def _what_is_wrong(entry: zipfile.ZipInfo) -> str:
+    """Return why an entry is not let in; empty where it is."""
+    if entry.filename not in PARTS:
+        return f"is unknown; allowed: {', '.join(PARTS)}"
+    if stat.S_ISLNK(entry.external_attr >> 16):
+        return "is a link"
+    stored = entry.compress_type == zipfile.ZIP_STORED and entry.compress_size == entry.file_size
+    if not stored or entry.flag_bits & 1:
+        return "is compressed or encrypted; allowed: neither"
+    if entry.file_size > LARGEST_PART:
+        return f"has {entry.file_size} bytes; allowed: at most {LARGEST_PART}"
+    return ""
+
+
+def description(driver: Driver, action_limit: float | None = None) -> dict[str, Any]:
+    """Return what whoever runs a controller must know beside the recipe of its driver, as JSON.
+
+    Args:
+        driver: the controller's.
+        action_limit: of the road it is for [m/s2], where the driver has none of its own.
+
+    Returns:
+        `observation`: what it is given at each decision, in order, in SI units; `networks`: what each of its
+        networks sees, in order, by the prefix of its weights: each number is divided by its scale;
+        `memory`: what it remembers of each CAV, with its value before the first decision, null where that
+        is NaN; `action`: the acceleration that it answers, clipped to these bounds; `hold`: decisions for
+        which a residual is held.
+    """
+    low, high = driver.limits or (None if action_limit is None else -action_limit, action_limit)
+    remembered = leaves(driver.initial_memory(1))
+    return {
+        "observation": [{"name": name, "unit": unit} for name, unit in STATE_UNITS.items()],
+        "networks": _networks(driver),
+        "memory": [_remembered(name, value[0]) for name, value in remembered],
+        "action": {"name": "acceleration", "unit": "m/s2", "low": low, "high": high},
+        "hold": driver.hold,
+    }
+
+
+def _networks(driver: Driver, prefix: str = "") -> dict[str, list[dict[str, Any]]]:
+    shown = driver.shown
+    own = {} if shown is None else {prefix: [number._asdict() for number in shown]}
+    return own | {
+        name: seen
+        for below, held in driver.inner.items()
+        for name, seen in _networks(held, prefix + below).items()
+    }
+
+
+def _remembered(name: str, value: Any) -> dict[str, Any]:
+    """Return the name, shape and first value of what is remembered of one CAV."""
+    values = np.asarray(value, np.float64)
+    same = bool(values.size) and np.array_equal(values, np.full_like(values, values.flat[0]), equal_nan=True)
+    first = values.flat[0].item() if same else values.tolist()
+    return {
+        "name": name,
+        "shape": list(values.shape),
+        "first": None if same and np.isnan(values.flat[0]) else first,
+    }

@@ -13,6 +13,7 @@ from unjam.errors import wrong_name
 
 SHIPPED = "unjam:"
 """what the name of a controller begins with that is part of the package"""
+SHIPPED_FOLDER = Path(str(files("unjam") / "controllers"))
 
 _SEVERAL = re.compile(r"\+(?=[^\W\d]|[./~])")
 """between two drivers of a mixture; not the + of 1e+5"""
@@ -44,15 +45,11 @@ def make_driver(text: str, time_step: float) -> Driver:
 
 def shipped_names() -> list[str]:
     """Return the names of the controllers that are part of the package: `ring-best`."""
-    return sorted(path.stem for path in _shipped_folder().glob(f"*{SUFFIX}"))
+    return sorted(path.stem for path in SHIPPED_FOLDER.glob(f"*{SUFFIX}"))
 
 
 def shipped_file(name: str) -> Path:
     """Return the file of a shipped controller; raise `InputError` where there is none of that name."""
     if name not in shipped_names():
         raise wrong_name("driver", f"{SHIPPED}{name}", [f"{SHIPPED}{known}" for known in shipped_names()])
-    return _shipped_folder() / f"{name}{SUFFIX}"
-
-
-def _shipped_folder() -> Path:
-    return Path(str(files("unjam") / "controllers"))
+    return SHIPPED_FOLDER / f"{name}{SUFFIX}"

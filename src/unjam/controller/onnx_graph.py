@@ -11,13 +11,13 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from unjam.controller.graph import ACCELERATION, input_name, output_name
+from unjam.controller.verify import graph_names, needed
+from unjam.drivers.command import Limits
 from unjam.drivers.driver import Driver, Memory
 from unjam.drivers.local_state import LocalState
-from unjam.drivers.registry import describe
 from unjam.drivers.speed_history import WrittenRows
-from unjam.errors import InputError, MissingPartError
-from unjam.physics.arrays import clip
+from unjam.errors import InputError
+from unjam.tree import leaves, rebuilt
 
 OPSET = 20
 """version of ONNX's operators"""
@@ -31,30 +31,27 @@ class Whole(nn.Module):
     def __init__(self, driver: Driver, limit: float) -> None:
         super().__init__()
         self.driver = driver
-        self.limit = limit
-        self.remembered = tuple(driver.initial_memory(1))
+        self.limits = Limits.symmetric(limit)
+        self.example = driver.initial_memory(1)
+        self.remembered = [name for name, _ in leaves(self.example)]
 
     def forward(self, *arrays: Tensor) -> tuple[Tensor, ...]:
         """Return the acceleration [m/s2] and what is remembered, for the state and memory `arrays`."""
         count = len(LocalState._fields)
         state = LocalState(*arrays[:count])
         memory = _with_windows(dict(zip(self.remembered, arrays[count:], strict=True)))
-        wanted, after = self.driver.act(state, memory)
-        kept = (after[name] for name in self.remembered)
-        rows = (value.rows if isinstance(value, WrittenRows) else value.clone() for value in kept)
-        return clip(wanted, -self.limit, self.limit), *rows
+        wanted, after = self.driver.act(state, rebuilt(self.example, memory))
+        kept = dict(leaves(after))
+        rows = (kept[name] for name in self.remembered)
+        rows = (value.rows if isinstance(value, WrittenRows) else value.clone() for value in rows)
+        return self.limits.keep(wanted), *rows
 
 
 def _with_windows(memory: Memory) -> Memory:
     """Return the memory with each window of speeds in the form that a graph can be drawn of."""
-
-    def seen(name: str) -> Tensor:
-        return memory[f"{name.removesuffix('window')}seen"]
-
-    return {
-        name: WrittenRows(value, seen(name)) if name.rpartition(".")[2] == "window" else value
-        for name, value in memory.items()
-    }
+    windows = [name for name in memory if name.rpartition(".")[2] == "window"]
+    seen = {name: memory[f"{name.removesuffix('window')}seen"] for name in windows}
+    return {**memory, **{name: WrittenRows(memory[name], rows) for name, rows in seen.items()}}
 
 
 def _exact_constant() -> Callable[..., Any]:
@@ -63,11 +60,8 @@ def _exact_constant() -> Callable[..., Any]:
     Raises:
         MissingPartError: onnxscript is not installed.
     """
-    try:
-        import onnx_ir
-        from onnxscript import opset20 as operators
-    except ImportError:
-        raise MissingPartError("onnxscript is not installed; install it: pip install 'unjam[onnx]'") from None
+    operators = needed("onnxscript").opset20
+    import onnx_ir  # comes with it
 
     def constant(value: float, dtype: int = onnx_ir.DataType.DOUBLE, **_: Any) -> Any:
         exact = np.asarray(value, onnx_ir.DataType(dtype).numpy())
@@ -87,11 +81,12 @@ def onnx_graph(driver: Driver, limit: float) -> bytes:
         MissingPartError: onnxscript is not installed.
     """
     if not driver.tensors or driver.native:
-        raise InputError(f"onnx: {describe(driver)} is not allowed; allowed: drivers that run on tensors")
+        raise InputError(f"onnx: {driver.describe()} is not allowed; allowed: drivers that run on tensors")
     exact = {torch.ops.aten.scalar_tensor.default: _exact_constant()}
-    memory = driver.initial_memory(ROWS)
+    inputs, outputs = graph_names(driver)
     state = [torch.ones(ROWS, dtype=torch.float64) for _ in LocalState._fields]
-    arrays = (*state, *(torch.as_tensor(value, dtype=torch.float64) for value in memory.values()))
+    memory = (rows for _, rows in leaves(driver.initial_memory(ROWS)))
+    arrays = (*state, *(torch.as_tensor(value, dtype=torch.float64) for value in memory))
     rows = torch.export.Dim("cavs")
     with torch.no_grad(), warnings.catch_warnings(), redirect_stdout(io.StringIO()):
         warnings.simplefilter("ignore")
@@ -99,8 +94,8 @@ def onnx_graph(driver: Driver, limit: float) -> bytes:
         program: Any = torch.onnx.export(
             Whole(driver, limit),
             arrays,
-            input_names=[*LocalState._fields, *map(input_name, memory)],
-            output_names=[ACCELERATION, *map(output_name, memory)],
+            input_names=inputs,
+            output_names=outputs,
             dynamic_shapes=(tuple({0: rows} for _ in arrays),),
             opset_version=OPSET,
             dynamo=True,

@@ -1,23 +1,52 @@
-"""Is a controller whole, is it what it says, and do its forms agree: `unjam verify`."""
+"""Is a controller whole, is it what it says, and do its forms agree: `unjam verify`.
+
+Its forms are its driver, a recorded sample (what a CAV perceived in an episode, and what the controller
+answers to it) and an ONNX graph, which is looked at before it is run.
+"""
 
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
+from safetensors.numpy import load, save
 
-from unjam.controller.archive import GRAPH, MANIFEST, SAMPLE, WEIGHTS
-from unjam.controller.file import Controller, read_controller
-from unjam.controller.graph import check_graph, run_graph
-from unjam.controller.manifest import description
-from unjam.controller.sample import read_sample, replay
-from unjam.drivers.registry import describe
+from unjam.controller.file import (
+    FORMAT,
+    GRAPH,
+    MANIFEST,
+    SAMPLE,
+    WEIGHTS,
+    Controller,
+    description,
+    read_controller,
+)
+from unjam.drivers.command import Limits
+from unjam.drivers.driver import Driver
+from unjam.drivers.local_state import LocalState
 from unjam.errors import InputError, MissingPartError
+from unjam.tree import leaves
+from unjam.worlds.drive import drive
+from unjam.worlds.world import RecordedWorld
 
+Floats = NDArray[np.float64]
+
+ANSWER = "acceleration"
+"""the answer's name in a sample and in a graph"""
 REPEATS_TO = 1e-9
 """how far the recorded accelerations may be from those of this machine [m/s2]"""
 PARITY = 1e-6
 """how far the graph may be from the driver [m/s2]"""
+OPERATORS = {
+    *("Abs", "Add", "And", "Cast", "Clip", "Concat", "Constant", "Cos", "Div", "Equal", "Expand", "Floor"),
+    *("Gather", "GatherElements", "GatherND", "Gemm", "Greater", "GreaterOrEqual", "Identity", "IsNaN"),
+    *("Less", "LessOrEqual", "MatMul", "Max", "Min", "Mod", "Mul", "Neg", "Not", "Or", "Pow", "Relu"),
+    *("Reshape", "ScatterElements", "Shape", "Sin", "Slice", "Sqrt", "Squeeze", "Sub", "Tanh", "Transpose"),
+    *("Unsqueeze", "Where"),
+}
+"""all that the graph of a controller is made of: arithmetic, without loops and without files"""
 
 
 @dataclass(frozen=True)
@@ -37,30 +66,25 @@ def verify_controller(path: Path | str) -> list[Verified]:
     controller = read_controller(path)
     driver, manifest, parts = controller.driver, controller.manifest, controller.parts
     sizes = ", ".join(f"{name} {len(part):,} bytes" for name, part in parts.items() if name != MANIFEST)
+    weights = f"finite, of the shapes that the driver needs; SHA-256 {manifest['sha256'][WEIGHTS]}"
     verified = [
         Verified("parts", f"{sizes}; each has the hash that the manifest names"),
-        Verified("driver", describe(driver)),
-        Verified(
-            "weights", f"finite, of the shapes that the driver needs; SHA-256 {manifest['sha256'][WEIGHTS]}"
-        ),
+        Verified("driver", driver.describe()),
+        Verified("weights", weights),
     ]
     if manifest["format"] > 1:
-        _check_description(controller)
-        seen = "what it observes, remembers and answers"
-        verified.append(Verified("manifest", f"{seen} is what its driver does"))
+        for key, value in description(driver, manifest.get("action_limit")).items():
+            named_otherwise = key == "memory" and manifest["format"] < FORMAT
+            if manifest.get(key) != value and not named_otherwise:
+                said, allowed = _short(manifest.get(key)), _short(value)
+                raise InputError(f"controller: its manifest says of {key}: {said}; allowed: {allowed}")
+        seen = "what it observes, remembers and answers is what its driver does"
+        verified.append(Verified("manifest", seen))
     if SAMPLE in parts:
         verified += _check_sample(controller)
     elif GRAPH in parts:
         raise InputError("controller: has a graph, but no recorded sample to compare it on")
     return verified
-
-
-def _check_description(controller: Controller) -> None:
-    manifest = controller.manifest
-    for key, value in description(controller.driver, manifest.get("action_limit")).items():
-        if manifest.get(key) != value:
-            said = _short(manifest.get(key))
-            raise InputError(f"controller: its manifest says of {key}: {said}; allowed: {_short(value)}")
 
 
 def _short(value: Any) -> str:
@@ -75,9 +99,10 @@ def _check_sample(controller: Controller) -> list[Verified]:
         raise InputError("controller: has a recorded sample, but its manifest names no bounds of its action")
     states, recorded = read_sample(controller.parts[SAMPLE])
     answers = replay(controller.driver, states, limit)
-    words = _compare("its driver", answers, recorded, REPEATS_TO)
-    verified = [Verified("sample", words)]
-    if GRAPH in controller.parts:
+    verified = [Verified("sample", _compare("its driver", answers, recorded, REPEATS_TO))]
+    if GRAPH in controller.parts and controller.manifest["format"] < FORMAT:
+        verified.append(Verified("graph", "not run: an older version of unjam made it, with other names"))
+    elif GRAPH in controller.parts:
         try:
             check_graph(controller.parts[GRAPH], controller.driver)
             found = run_graph(controller.parts[GRAPH], controller.driver, states)
@@ -96,3 +121,117 @@ def _compare(who: str, found: np.ndarray, recorded: np.ndarray, tolerance: float
             f"allowed: {recorded[step]:.9g} to {tolerance:g}"
         )
     return f"{len(found):,} decisions, {who} within {off.max(initial=0.0):.1e} m/s2 of what was recorded"
+
+
+def sample_bytes(driver: Driver, states: LocalState, limit: float) -> bytes:
+    """Return the part of an archive with `states`, arrays of shape (T,), and the answers of `driver`."""
+    arrays = {name: np.array(values, np.float64) for name, values in states._asdict().items()}
+    return save({**arrays, ANSWER: replay(driver, states, limit)})
+
+
+def read_sample(part: bytes) -> tuple[LocalState, Floats]:
+    """Return the states of a sample and the recorded accelerations [m/s2], all of shape (T,).
+
+    Raises:
+        InputError: an array is missing, unknown, of another shape or type, or an acceleration is not finite.
+    """
+    arrays: dict[str, Any] = load(part)
+    names = {*LocalState._fields, ANSWER}
+    if arrays.keys() != names:
+        wrong = min(arrays.keys() ^ names)
+        raise InputError(f"sample: {wrong!r} is {'missing' if wrong in names else 'unknown'}")
+    answers = arrays.pop(ANSWER)
+    for name, values in {**arrays, ANSWER: answers}.items():
+        if values.ndim != 1 or values.shape != answers.shape or values.dtype != np.float64:
+            raise InputError(f"sample: {name!r} has shape {values.shape} of {values.dtype}; allowed: numbers")
+    if not np.isfinite(answers).all():
+        raise InputError("sample: a recorded acceleration is not finite")
+    return LocalState(**arrays), answers
+
+
+def replay(driver: Driver, states: LocalState, limit: float) -> Floats:
+    """Return what a driver answers when it perceives `states` one after the other, from its first memory.
+
+    Args:
+        driver: of one CAV.
+        states: arrays of shape (T,).
+        limit: the acceleration is clipped to it [m/s2].
+
+    Returns:
+        Accelerations [m/s2], shape (T,).
+    """
+    world = RecordedWorld(states.each(lambda values: values[:, None]), Limits.symmetric(limit))
+    return drive(world, driver).ravel()
+
+
+def graph_names(driver: Driver) -> tuple[list[str], list[str]]:
+    """Return the names of a graph's inputs (state, memory) and outputs (acceleration, memory after it)."""
+    remembered = [name for name, _ in leaves(driver.initial_memory(1))]
+    inputs = [*LocalState._fields, *(f"memory.{name}" for name in remembered)]
+    return inputs, [ANSWER, *(f"next.{name}" for name in remembered)]
+
+
+def check_graph(part: bytes, driver: Driver) -> None:
+    """Raise `InputError` unless a graph has a controller's inputs and outputs, and only arithmetic between.
+
+    Raises:
+        MissingPartError: onnx is not installed.
+    """
+    onnx = needed("onnx")
+    try:
+        model = onnx.load_model_from_string(part)
+    except Exception as error:  # protobuf's own kinds of error
+        raise InputError(f"graph: cannot be read: {error}") from None
+    graph, wanted = model.graph, graph_names(driver)
+    found = [value.name for value in graph.input], [value.name for value in graph.output]
+    if found != wanted:
+        raise InputError(f"graph: inputs and outputs {found} are not allowed; allowed: {wanted}")
+    if model.functions or graph.sparse_initializer:
+        raise InputError("graph: functions and sparse weights are not allowed")
+    tensors = list(graph.initializer)
+    for node in graph.node:
+        if node.domain not in ("", "ai.onnx") or node.op_type not in OPERATORS:
+            raise InputError(f"graph: operator {node.op_type!r} is not allowed; allowed: arithmetic")
+        tensors += [attribute.t for attribute in node.attribute if attribute.HasField("t")]
+    if any(tensor.external_data or tensor.data_location for tensor in tensors):
+        raise InputError("graph: weights in another file are not allowed")
+
+
+def run_graph(part: bytes, driver: Driver, states: LocalState) -> Floats:
+    """Return what a graph answers when it perceives `states` one after the other, from its first memory.
+
+    Args:
+        part: the graph, checked.
+        driver: whose graph it is; its memory is the graph's.
+        states: arrays of shape (T,).
+
+    Returns:
+        Accelerations [m/s2], shape (T,).
+
+    Raises:
+        InputError: onnxruntime refuses it.
+        MissingPartError: onnxruntime is not installed.
+    """
+    runtime = needed("onnxruntime")
+    options = runtime.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    options.log_severity_level = 4
+    (inputs, _), answers = graph_names(driver), np.zeros(len(states.speed))
+    memory: list[Any] = [rows for _, rows in leaves(driver.initial_memory(1))]
+    try:
+        session = runtime.InferenceSession(part, options, providers=["CPUExecutionProvider"])
+        for step in range(len(answers)):
+            seen = [values[step : step + 1] for values in states]
+            acceleration, *memory = session.run(None, dict(zip(inputs, [*seen, *memory], strict=True)))
+            answers[step] = acceleration[0]
+    except Exception as error:  # the runtime's own kinds of error
+        raise InputError(f"graph: cannot be run: {error}") from None
+    return answers
+
+
+def needed(name: str) -> Any:
+    """Return a package that only graphs need; raise `MissingPartError` where it is not installed."""
+    try:
+        return import_module(name)
+    except ImportError:
+        raise MissingPartError(f"{name} is not installed; install it: pip install 'unjam[onnx]'") from None

@@ -7,7 +7,7 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from unjam.drivers.command import Command
+from unjam.drivers.command import Command, Limits
 from unjam.drivers.local_state import LocalState, Observed
 from unjam.physics.arrays import Array
 from unjam.tree import Arrays, mapped
@@ -73,6 +73,9 @@ class Driver:
     hold: int = 1
     """decisions for which one residual is held"""
 
+    limits: Limits | None = None
+    """within which it keeps its own acceleration [m/s2]; None: the road does"""
+
     def initial_memory(self, n: int) -> Memory:
         """Return the memory of `n` CAVs before their first step: NumPy arrays of shape (n, ...)."""
         return {}
@@ -110,6 +113,11 @@ class Driver:
     def inner(self) -> dict[str, "Driver"]:
         """The drivers that it holds, by what the weights of their networks are prefixed with."""
         return {}
+
+    @property
+    def shown(self) -> tuple[Observed, ...] | None:
+        """What its own network sees, in order; None without one."""
+        return None
 
     def describe(self) -> str:
         """Return it in a few words: its name and the parameters that differ from the defaults."""

@@ -18,13 +18,13 @@ from unjam.drivers.from_file import FileDriver, FileReference, is_file_reference
 from unjam.drivers.idm import IDM, Human
 from unjam.drivers.jam_absorber import JamAbsorber
 from unjam.drivers.network import network_from_arrays
-from unjam.drivers.observation import FeatureName
+from unjam.drivers.observation import FeatureName, observation_size
 from unjam.drivers.ovm import OVM
 from unjam.drivers.pacer import Pacer
 from unjam.drivers.pi_saturation import PISaturation
 from unjam.drivers.residual import ResidualDriver
 from unjam.drivers.wrappers import Impaired, Mixed
-from unjam.errors import wrong
+from unjam.errors import InputError, wrong
 from unjam.parameters import STRICT, Count, NotNegative, Positive, build, split_parameters
 from unjam.tree import Arrays
 
@@ -115,13 +115,12 @@ def _residual(recipe: Recipe, arrays: Arrays, prefix: str) -> Driver:
         for name, array in arrays.items()
         if name.startswith(prefix) and not name.startswith(expert)
     }
-    return ResidualDriver(
-        driver_from_recipe(found.expert, arrays, expert),
-        network_from_arrays(own, found.authority, found.exploration_std),
-        found.action_limit,
-        found.parts,
-        found.hold,
-    )
+    base = driver_from_recipe(found.expert, arrays, expert)
+    network = network_from_arrays(own, found.authority, found.exploration_std)
+    shown = observation_size(found.parts, base)
+    if network.inputs != shown:
+        raise InputError(f"network: {network.inputs} inputs are not allowed; allowed: {shown}")
+    return ResidualDriver(base, network, found.action_limit, found.parts, found.hold)
 
 
 RECIPES: dict[str, Callable[[Recipe, Arrays, str], Driver]] = {

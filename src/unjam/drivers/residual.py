@@ -9,7 +9,7 @@ from unjam.drivers.command import Command, Limits
 from unjam.drivers.driver import Decision, Driver, Memory, Noise, Recipe
 from unjam.drivers.local_state import LocalState, Observed
 from unjam.drivers.network import Network, network_arrays
-from unjam.drivers.observation import Seen, feature, own_files
+from unjam.drivers.observation import Seen, feature, observed, own_files
 from unjam.drivers.observation import observe as observe_features
 from unjam.physics.arrays import Array, namespace
 from unjam.tree import Arrays
@@ -35,7 +35,7 @@ class ResidualDriver(Driver):
     """decisions for which one residual is held; the expert goes on deciding in each of them"""
 
     @cached_property
-    def limits(self) -> Limits:
+    def limits(self) -> Limits:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Within which expert and sum are kept."""
         return Limits.symmetric(self.action_limit)
 
@@ -120,6 +120,11 @@ class ResidualDriver(Driver):
     def inner(self) -> dict[str, Driver]:
         """Its expert."""
         return {f"{EXPERT}.": self.expert}
+
+    @property
+    def shown(self) -> tuple[Observed, ...]:
+        """What its own network sees, in order."""
+        return observed(self.parts, self.expert)
 
     def describe(self) -> str:
         """Return the expert in a few words, and that there is a residual."""

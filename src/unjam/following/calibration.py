@@ -1,20 +1,25 @@
 """Calibrating the IDM on people: the parameters with which the simulated gap is nearest to the real one.
 
-Least squares on single accelerations would degenerate: the model then hardly reacts. On the simulated gap it
-has to drive. Source of the method: Treiber and Kesting, Traffic Flow Dynamics (2013), chapter 16.
+Of all drivers together, and of each for itself on top of what suits all. Least squares on single
+accelerations would degenerate: the model then hardly reacts. On the simulated gap it has to drive. Source of
+the method: Treiber and Kesting, Traffic Flow Dynamics (2013), chapter 16.
 """
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from itertools import chain
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic.dataclasses import dataclass as checked_dataclass
 
-from unjam.following.open_loop import Limits, Model, drive_behind, open_loop, personal_idm
-from unjam.following.pairs import Floats, Pair, Stretches, stretches_of
+from unjam.drivers.local_state import LocalState
+from unjam.following.open_loop import Limits, Model, drive_behind, open_loop, personal_idm, with_values
+from unjam.following.pairs import Floats, Pair, Stretches, people_behind, stretches_of
 from unjam.parameters import STRICT, Count, CountOrNone, NotNegative, Positive
 from unjam.physics.idm import IDMParameters, IDMRows
+from unjam.scenarios.scenario import Scenario
 
 Range = tuple[Positive, Positive]
 
@@ -53,7 +58,12 @@ class CalibrationSettings:
 
 
 SEARCHED = ("desired_speed", "time_headway", "max_acceleration", "comfortable_deceleration", "minimum_gap")
-KEPT = "kept_headway"
+GRID = 32
+"""values of an only parameter that are tried at first"""
+TOLERANCE = 1e-3
+"""to which the best of them is then refined, in the parameter's unit"""
+BEHIND_CAVS = CalibrationSettings(candidates=4, generations=40)
+"""for those who drove behind the CAVs of a training"""
 
 
 @dataclass(frozen=True)
@@ -71,7 +81,7 @@ class Calibrated:
     """stretches in which the model used the gap up"""
     seconds: float
     """of driving that it was calibrated on"""
-    bounds: tuple[str, ...] = field(default=())
+    bounds: tuple[str, ...]
     """parameters that lie at the end of what was searched: the data do not tell them"""
 
     def model(self, limits: Limits) -> Model:
@@ -105,7 +115,7 @@ def calibrate(
     factors = 1.0 if headways is None else np.array(headways)[stretches.owner]
     found = differential_evolution(
         gap_objective(stretches, settings.limits, settings.every, factors),
-        bounds=[getattr(settings, name) for name in (*SEARCHED, KEPT)],
+        bounds=[getattr(settings, name) for name in (*SEARCHED, "kept_headway")],
         popsize=settings.candidates,
         maxiter=settings.generations,
         tol=settings.tolerance,
@@ -116,7 +126,7 @@ def calibrate(
     )
     *searched, kept = map(float, found.x)
     parameters = IDMParameters(**dict(zip(SEARCHED, searched, strict=True)))
-    driven = IDMRows(**{**vars(parameters), "time_headway": parameters.time_headway * factors})
+    driven = with_values(parameters, time_headway=parameters.time_headway * factors)
     drove = open_loop(personal_idm(driven, kept, settings.limits), stretches)
     weights = drove.moments / drove.moments.sum()
     return Calibrated(
@@ -169,3 +179,111 @@ def at_an_end(value: float, within: Range) -> bool:
     """Return whether a value lies at the end of what was searched: the data do not tell it."""
     low, high = within
     return low < high and min(value - low, high - value) < 0.01 * (high - low)
+
+
+def calibrate_each(
+    groups: Sequence[Sequence[Pair]],
+    typical: IDMParameters,
+    own: Sequence[str],
+    settings: CalibrationSettings | None = None,
+    on_progress: Callable[[int], object] | None = None,
+) -> list[Calibrated]:
+    """Return a calibration of each group of pairs, for instance of each driver.
+
+    Only the parameters `own` are searched, the others are those of `typical`: a minute of driving tells the
+    distance that somebody keeps, but not how fast they would like to be on an empty road. A single parameter
+    is searched for all groups at once, several for one group after the other, which takes a second each.
+    `on_progress` is told how many are done.
+    """
+    settings = settings or CalibrationSettings()
+    if len(own) == 1:
+        found = _one_parameter(groups, typical, own[0], settings)
+        if on_progress is not None:
+            on_progress(len(found))
+        return found
+    fixed = {name: (getattr(typical, name),) * 2 for name in SEARCHED if name not in own}
+    found: list[Calibrated] = []
+    for number, pairs in enumerate(groups, 1):
+        found.append(calibrate(pairs, replace(settings, **fixed)))
+        if on_progress is not None:
+            on_progress(number)
+    return found
+
+
+def _one_parameter(
+    groups: Sequence[Sequence[Pair]], typical: IDMParameters, name: str, settings: CalibrationSettings
+) -> list[Calibrated]:
+    """Return each group's own value of one parameter, and how it drives with it."""
+    stretches = stretches_of(list(chain.from_iterable(groups)), settings.seconds)
+    group = np.repeat(np.arange(len(groups)), [len(pairs) for pairs in groups])[stretches.owner]
+
+    def model(values: Floats) -> Model:
+        return personal_idm(with_values(typical, **{name: values[group]}), 0.0, settings.limits)
+
+    def errors(values: Floats) -> Floats:
+        (squares,) = gap_squares(stretches, model(values))
+        return _by_group(squares, stretches, group, settings.every)
+
+    low, high = within = getattr(settings, name)
+    values = _least(errors, np.linspace(low, high, GRID), len(groups))
+    drove = open_loop(model(values), stretches)
+    gap_errors, speed_errors = (
+        _by_group(squares, stretches, group, "moment") for squares in (drove.gap_square, drove.speed_square)
+    )
+    collided = np.bincount(group, drove.collided, len(groups))
+    return [
+        Calibrated(
+            parameters=replace(typical, **{name: float(value)}),
+            kept_headway=0.0,
+            gap_error=float(gap_errors[number]),
+            speed_error=float(speed_errors[number]),
+            collided=int(collided[number]),
+            seconds=sum(pair.seconds for pair in groups[number]),
+            bounds=(name,) if at_an_end(value, within) else (),
+        )
+        for number, value in enumerate(values)
+    ]
+
+
+def _least(errors: Callable[[Floats], Floats], grid: Floats, groups: int) -> Floats:
+    """Return where each group's error is least: the best of a grid, refined between its neighbours."""
+    from scipy.optimize import elementwise  # half a second that help need not wait
+
+    tried = np.stack([errors(np.full(groups, value)) for value in grid])
+    place = tried.argmin(0)
+    values = grid[place]
+    inner = np.flatnonzero((place > 0) & (place < GRID - 1))
+
+    def refined(chosen: Floats, indices: NDArray[np.int64]) -> Floats:
+        wanted = values.copy()
+        wanted[indices.astype(int)] = chosen
+        return errors(wanted)[indices.astype(int)]
+
+    if len(inner):
+        bracket = tuple(grid[place[inner] + shift] for shift in (-1, 0, 1))
+        found = elementwise.find_minimum(refined, bracket, args=(inner,), tolerances={"xatol": TOLERANCE})
+        better = found.f_x <= tried.min(0)[inner]
+        values[inner[better]] = found.x[better]
+    return values
+
+
+def _by_group(squares: Floats, stretches: Stretches, group: NDArray[np.int64], every: str) -> Floats:
+    """Return the error of each group from the mean squared errors of its stretches, as settings say."""
+    if every == "trajectory":
+        return np.bincount(group, np.sqrt(squares)) / np.bincount(group)
+    moments = stretches.present[1:].sum(0)
+    return np.sqrt(np.bincount(group, squares * moments) / np.bincount(group, moments))
+
+
+def calibrated_people(recordings: Iterable[LocalState], scenario: Scenario) -> IDMParameters:
+    """Return the IDM parameters that suit the people behind the CAVs best; the scenario's where nobody was.
+
+    `recordings` are what CAVs perceived, see `people_behind`. Desired speed and smallest gap stay the
+    scenario's: in traffic that moves slowly nobody shows them.
+    """
+    pairs, known = people_behind(recordings, scenario.decision_step), scenario.humans
+    if not pairs:
+        return known
+    speed, gap = known.desired_speed, known.minimum_gap
+    found = calibrate(pairs, replace(BEHIND_CAVS, desired_speed=(speed, speed), minimum_gap=(gap, gap)))
+    return replace(found.parameters, exponent=known.exponent)

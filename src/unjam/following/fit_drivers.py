@@ -1,19 +1,27 @@
-"""From trajectories to a population: every driver's own IDM, and what all of them do beside it."""
+"""From trajectories to a population: every driver's own IDM, and what all of them do beside it.
+
+`unjam fit-drivers`.
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, field, replace
+from dataclasses import dataclass as plain_dataclass
+from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from unjam.drivers.network import Network
-from unjam.errors import wrong, wrong_name
-from unjam.following.calibration import SEARCHED, Calibrated, CalibrationSettings, calibrate
-from unjam.following.each_driver import calibrate_each
-from unjam.following.multi_step import Known, MultiStepSettings, fit_multi_step
+from unjam.errors import InputError, wrong, wrong_name
+from unjam.files import check_folder
+from unjam.following.calibration import SEARCHED, Calibrated, CalibrationSettings, calibrate, calibrate_each
+from unjam.following.loaders import Reading, read_pairs
+from unjam.following.networks import Known, MultiStepSettings, fit_multi_step
 from unjam.following.pairs import Pair, of_split, split_by_trajectory
-from unjam.parameters import STRICT, Count, CountOrNone
+from unjam.manifest import manifest
+from unjam.parameters import STRICT, Count, CountOrNone, build, nested
 from unjam.physics.idm import IDMParameters
 from unjam.scenarios.population import Population
 
@@ -21,6 +29,8 @@ VALIDATION_SHARE = 0.2
 """share of the drivers who decide whether a residual is better than none"""
 FEWEST = 5
 """drivers that a residual needs: one of them judges"""
+FILTERS = ("kind", "split", "driver")
+"""what trajectories can be chosen by"""
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -40,10 +50,95 @@ class FitDriversSettings:
     seed: CountOrNone = 0
 
 
+@plain_dataclass(frozen=True)
+class FittedDrivers:
+    """A population, and what it was made from."""
+
+    population: Population
+    words: list[str]
+    """what was read and what was not"""
+
+    def facts(self) -> dict[str, Any]:
+        """Return what matters about it, as JSON."""
+        population = self.population
+        fit = {key: value for key, value in population.about["fit"].items() if key != "settings"}
+        return {"drivers": len(population.drivers), "spread": population.spread(), **fit}
+
+    def verdict(self) -> list[str]:
+        """Return in words how near the drivers come to the recorded gaps."""
+        fit, details = self.population.about["fit"], self.population.details
+        errors = [one["gap_error"] for one in details]
+        lines = [
+            f"error of the simulated gap: one IDM for all {fit['together']['gap_error']:.2f} m, "
+            f"each driver's own {np.mean(errors):.2f} m on average"
+        ]
+        collided = sum(one["collided"] > 0 for one in details)
+        if collided:
+            lines.append(f"{collided} drivers use up their gap in the simulation")
+        if "residual_gap_errors" in fit:
+            before, best = fit["residual_gap_errors"][0], min(fit["residual_gap_errors"])
+            made = "kept" if fit["residual_is_better"] else "of no use, left out"
+            lines.append(f"residual: {made}: {before:.2f} m without, {best:.2f} m with, on other drivers")
+        return lines
+
+
+def fit_from_files(
+    files: Sequence[Path],
+    changes: dict[str, Any],
+    format: str = "",
+    cut_bad: bool = False,
+    driver: tuple[str, ...] = (),
+    only: dict[str, str] | None = None,
+    out: Path | None = None,
+    on_progress: Callable[[int, int], None] | None = None,
+) -> FittedDrivers:
+    """Return the population of the drivers in files.
+
+    Args:
+        files: of one format and one time step.
+        changes: to `FitDriversSettings`; keys may have dots.
+        format: of `unjam.following.loaders.FORMATS`; empty: told from the columns.
+        cut_bad: whether bad rows are cut out instead of refused.
+        driver: columns of a plain table that together name the driver.
+        only: which trajectories, by a name in FILTERS.
+        out: where the population will be written; checked before anything is calibrated.
+        on_progress: told how many drivers are done, and of how many.
+
+    Raises:
+        InputError: a file, a row or a setting is wrong, or no trajectory is chosen.
+        DiskError: the folder of `out` is not there.
+    """
+    if out is not None:
+        if out.suffix != ".json":
+            raise wrong("out", str(out), "a .json file")
+        check_folder(out)
+    settings = build(FitDriversSettings, nested(changes), "")
+    pairs: list[Pair] = []
+    words = []
+    for file in files:
+        found = read_pairs(file, format, Reading(cut_bad=cut_bad, driver=driver))
+        words += [f"{file.name}: {line}" for line in found.words()]
+        prefix = f"{file.stem}-" if len(files) > 1 else ""
+        pairs += [replace(pair, name=prefix + pair.name, driver=prefix + pair.driver) for pair in found.pairs]
+    for name, value in (only or {}).items():
+        if name not in FILTERS:
+            raise wrong_name("only", name, FILTERS)
+        there = sorted({str(getattr(pair, name)) for pair in pairs})
+        pairs = [pair for pair in pairs if getattr(pair, name) == value]
+        if not pairs:
+            raise InputError(f"only: no trajectory has {name} {value!r}; there are: {', '.join(there)}")
+    population = fit_drivers(pairs, settings, on_progress)
+    made = manifest()
+    # It is given away: no folder of this machine is named.
+    made["command"] = [Path(word).name if "/" in word else word for word in made["command"]]
+    about = {"data": [file.name for file in files], "only": only or {}, "manifest": made}
+    return FittedDrivers(replace(population, about={**population.about, **about}), words)
+
+
 def fit_drivers(
     pairs: Sequence[Pair],
     settings: FitDriversSettings | None = None,
-    told: Callable[[int, int], None] | None = None,
+    on_progress: Callable[[int, int], None] | None = None,
 ) -> Population:
     """Return the population of all drivers in `pairs`.
 
@@ -54,7 +149,7 @@ def fit_drivers(
     Args:
         pairs: with one and the same time step.
         settings: how.
-        told: told how many drivers are done, and of how many.
+        on_progress: told how many drivers are done, and of how many.
 
     Raises:
         InputError: too few drivers for a residual, or different time steps.
@@ -68,10 +163,8 @@ def fit_drivers(
         raise wrong("drivers", len(names), f">= {FEWEST} for a residual")
     calibration = replace(settings.calibration, kept_headway=(0.0, 0.0))  # each has its own
     together = calibrate(pairs, calibration)
-    typical, found = _levels(pairs, names, settings, calibration, told)
-    residual, learned = None, {}
-    if settings.residual:
-        residual, learned = _residual(pairs, found, settings)
+    typical, found = _levels(pairs, names, replace(settings, calibration=calibration), on_progress)
+    residual, learned = _residual(pairs, found, settings) if settings.residual else (None, {})
     return Population(
         typical=typical,
         drivers=tuple(one.parameters for one in found.values()),
@@ -86,34 +179,35 @@ def _levels(
     pairs: Sequence[Pair],
     names: Sequence[str],
     settings: FitDriversSettings,
-    calibration: CalibrationSettings,
-    told: Callable[[int, int], None] | None,
+    on_progress: Callable[[int, int], None] | None,
 ) -> tuple[IDMParameters, dict[str, Calibrated]]:
     """Return what drivers have in common, and each driver's own, each calibrated given the other in turn.
 
     One IDM for people who keep different distances is too soft: it must not react to gaps that are just the
     driver's own. So what is common is calibrated with everybody's own headway.
     """
+
+    def counted(done: int) -> None:
+        if on_progress is not None:
+            on_progress(done, len(names))
+
     groups = [[pair for pair in pairs if pair.driver == name] for name in names]
-    typical = calibrate(pairs, replace(calibration, kept_headway=(0.0, 1.0))).parameters
-    each: list[Calibrated] = []
+    shared = replace(settings.calibration, kept_headway=(0.0, 1.0))
+    typical, found = calibrate(pairs, shared).parameters, {}
     for turn in range(settings.turns):
         if turn:
-            own = {name: one.parameters.time_headway for name, one in zip(names, each, strict=True)}
-            factors = [own[pair.driver] / typical.time_headway for pair in pairs]
-            typical = calibrate(pairs, calibration, factors).parameters
-        each = calibrate_each(
-            groups, typical, settings.own, calibration, lambda done: told and told(done, len(names))
-        )
-    return typical, dict(zip(names, each, strict=True))
+            own = [found[pair.driver].parameters.time_headway / typical.time_headway for pair in pairs]
+            typical = calibrate(pairs, settings.calibration, own).parameters
+        each = calibrate_each(groups, typical, settings.own, settings.calibration, counted)
+        found = dict(zip(names, each, strict=True))
+    return typical, found
 
 
 def _residual(
     pairs: Sequence[Pair], found: dict[str, Calibrated], settings: FitDriversSettings
 ) -> tuple[Network | None, dict[str, Any]]:
     """Return the residual, None where it is of no use, and how it did."""
-    shares = (1.0 - VALIDATION_SHARE, VALIDATION_SHARE, 0.0)
-    chosen = split_by_trajectory(pairs, shares, settings.seed)
+    chosen = split_by_trajectory(pairs, (1.0 - VALIDATION_SHARE, VALIDATION_SHARE, 0.0), settings.seed)
     known, validation = (
         Known(part, [found[pair.driver].parameters for pair in part])
         for part in (of_split(chosen, "train"), of_split(chosen, "validation"))

@@ -85,28 +85,20 @@ def four_regimes(settings: FourRegimes) -> list[Pair]:
     regime = np.arange(count) % len(REGIMES)
     speed, leader_speed, gap = _starts(regime, settings, generator)
     noise = generator.normal(0.0, settings.noise, (length, count))
-    speeds, gaps = np.empty((length + 1, count)), np.empty((length + 1, count))
-    speeds[0], gaps[0] = speed, gap
+    speeds, gaps = np.empty((2, count, length + 1))
+    speeds[:, 0], gaps[:, 0] = speed, gap
     for moment in range(length):
         seen = at_least(gap, SMALLEST_GAP)
         acceleration = idm_acceleration(speed, leader_speed, seen, settings.driver) + noise[moment]
         speed = next_speed(speed, acceleration, settings.step)
         gap = next_position(gap, leader_speed - speed, settings.step)
-        speeds[moment + 1], gaps[moment + 1] = speed, gap
+        speeds[:, moment + 1], gaps[:, moment + 1] = speed, gap
+    leaders = np.repeat(leader_speed[:, None], length + 1, axis=1)
     pairs = []
-    for number in range(count):
-        kept = min(length, settings.rows - number * length) + 1
-        pairs.append(
-            Pair(
-                name=f"{number}",
-                driver=f"{number}",
-                step=settings.step,
-                speed=speeds[:kept, number].copy(),
-                leader_speed=np.full(kept, leader_speed[number]),
-                gap=gaps[:kept, number].copy(),
-                kind=REGIMES[regime[number]],
-            )
-        )
+    for number, driven in enumerate(zip(speeds, leaders, gaps, strict=True)):
+        name, kind = f"{number}", REGIMES[regime[number]]
+        pair = Pair(name, name, settings.step, *driven, kind=kind)
+        pairs.append(pair.part(0, min(length, settings.rows - number * length) + 1))
     return pairs
 
 
@@ -118,27 +110,13 @@ def _starts(
     def uniform(within: Range) -> Floats:
         return generator.uniform(*within, size=len(regime))
 
-    p = settings.driver
-    speed = uniform(settings.speed)
+    p, s = settings.driver, settings
+    speed = uniform(s.speed)
     free = p.max_acceleration * (1.0 - (speed / p.desired_speed) ** p.exponent)
-    leader_speed = np.choose(
-        regime,
-        [
-            speed + uniform(settings.leader_faster),
-            speed - uniform(settings.leader_slower),
-            speed + uniform(settings.cruising_difference),
-            speed - uniform(settings.emergency_slower),
-        ],
-    ).clip(0.0, None)
-    wanted = np.choose(
-        regime,
-        [
-            uniform(settings.acceleration) * free,
-            uniform(settings.deceleration),
-            np.zeros(len(regime)),
-            np.full(len(regime), settings.emergency),
-        ],
-    )
+    faster = [uniform(s.leader_faster), -uniform(s.leader_slower)]
+    faster += [uniform(s.cruising_difference), -uniform(s.emergency_slower)]
+    leader_speed = (speed + np.choose(regime, faster)).clip(0.0, None)
+    wanted = [uniform(s.acceleration) * free, uniform(s.deceleration), 0.0, s.emergency]
     # Eq. 5 solved for the gap.
-    interaction = (free - wanted) / p.max_acceleration
+    interaction = (free - np.choose(regime, wanted)) / p.max_acceleration
     return speed, leader_speed, desired_gap(speed, speed - leader_speed, p) / np.sqrt(interaction)

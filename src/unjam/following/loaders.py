@@ -1,30 +1,45 @@
-"""Reading car-following data: a plain table, and the public formats of NGSIM and OpenACC."""
+"""Reading car-following data: a plain table, and the public formats of NGSIM and OpenACC.
+
+Every number is checked, and nothing is left out without a word.
+"""
 
 import re
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Hashable, Iterable
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from unjam.errors import InputError, wrong_name
-from unjam.following.recorded import COLUMNS, OPTIONAL, Recorded, trajectories_of
+from unjam.following.pairs import Pair
 
-ALIASES = {
-    "time": ("t",),
-    "speed": ("v_foll",),
-    "leader_speed": ("v_lead",),
-}
+COLUMNS = ("pair", "time", "speed", "leader_speed", "gap")
+"""what every row must have: [s], [m/s], [m/s], [m]"""
+OPTIONAL = ("driver", "kind", "split")
+ALIASES = {"t": "time", "v_foll": "speed", "v_lead": "leader_speed"}
 """other names under which a plain table may have a column"""
+ALLOWED = {"speed": (0.0, 70.0), "leader_speed": (0.0, 70.0), "gap": (0.0, 1000.0)}
+"""what a vehicle on a road can do; beyond it the units are wrong, or the row is"""
+ROUGHNESS = 0.01
+"""by how much moments may be unevenly spaced, relative to the time step"""
+LISTED = 5
+"""bad rows that a message names"""
 FOOT = 0.3048
 """[m]"""
 VEHICLE_LENGTHS = (3.0, 8.0)
 """within which the median length of vehicles lies, if the units are right [m]"""
 
-NGSIM = ("vehicle_id", "global_time", "local_y", "v_length", "v_vel", "lane_id", "preceding")
-RECONSTRUCTED = ("vehicleid", "frameid", "laneid", "localy", "meanspeed", "vehiclelength", "leaderid")
+NGSIM = {
+    **{"vehicle_id": "vehicle", "global_time": "time", "local_y": "front", "v_length": "length"},
+    **{"v_vel": "speed", "lane_id": "lane", "preceding": "leader"},
+}
+"""our names of the columns of the public NGSIM file (US DOT), by its own in small letters"""
+RECONSTRUCTED = {
+    **{"vehicleid": "vehicle", "frameid": "time", "laneid": "lane", "localy": "front"},
+    **{"meanspeed": "speed", "vehiclelength": "length", "leaderid": "leader"},
+}
+"""of those of the reconstructed NGSIM I-80 (Montanino and Punzo 2015), by letters alone"""
 RECONSTRUCTED_ORDER = (
     *("vehicleid", "frameid", "laneid", "localy", "meanspeed"),
     *("meanaccel", "vehiclelength", "vehicleclassid", "followerid", "leaderid"),
@@ -37,13 +52,45 @@ class Reading:
     """How a file is read."""
 
     cut_bad: bool = False
-    """whether bad rows are cut out instead of refused"""
+    """whether bad rows are cut out, and end their trajectory, instead of refused"""
     shortest: float = 20.0
-    """trajectories shorter than that are left out [s]"""
+    """trajectories shorter than that are left out, and counted [s]"""
     driver: tuple[str, ...] = ()
     """plain tables: columns that together name the driver, where `driver` is not one"""
     kind: tuple[str, ...] = ()
     """plain tables: columns that together name the kind of driver, where `kind` is not one"""
+
+
+@dataclass(frozen=True)
+class BadRow:
+    """A row that cannot be used."""
+
+    line: int
+    """in the file, its header being line 1"""
+    why: str
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """What a file holds."""
+
+    pairs: list[Pair] = field(repr=False)
+    rows: int
+    """in the file"""
+    bad: list[BadRow]
+    """rows that were cut out, with what was wrong"""
+    left_out: dict[str, int]
+    """rows that are not wrong but of no use, by reason"""
+
+    def words(self) -> list[str]:
+        """Return lines that say what was read and what was not."""
+        moments = sum(len(pair.speed) for pair in self.pairs)
+        lines = [f"{len(self.pairs)} trajectories with {moments:,} of {self.rows:,} rows"]
+        lines += [f"left out: {count:,} rows: {why}" for why, count in self.left_out.items() if count]
+        lines += [f"cut out: line {row.line}: {row.why}" for row in self.bad[:LISTED]]
+        if len(self.bad) > LISTED:
+            lines.append(f"cut out: {len(self.bad) - LISTED} more bad rows")
+        return lines
 
 
 def read_pairs(path: Path, format: str = "", reading: Reading | None = None) -> Recorded:
@@ -59,95 +106,36 @@ def read_pairs(path: Path, format: str = "", reading: Reading | None = None) -> 
     """
     if format and format not in FORMATS:
         raise wrong_name("format", format, FORMATS)
-    frame, about = _read(path)
-    return FORMATS[format or _told_format(frame, path)](frame, about, path, reading or Reading())
+    frame = _read(path)
+    return FORMATS[format or _told_format(frame)](frame, path, reading or Reading())
 
 
-def read_table(frame: pd.DataFrame, about: dict[str, str], path: Path, reading: Reading) -> Recorded:
+def _table(frame: pd.DataFrame, path: Path, reading: Reading) -> Recorded:
     """Return the trajectories of a plain table with the columns COLUMNS, and OPTIONAL if there are such."""
-    renamed = {other: name for name, others in ALIASES.items() for other in others if name not in frame}
-    frame = frame.rename(columns=renamed)
+    frame = frame.rename(columns={other: name for other, name in ALIASES.items() if name not in frame})
     _check_columns(frame, COLUMNS, path)
     for name, columns in (("driver", reading.driver), ("kind", reading.kind)):
         if columns and name not in frame:
             _check_columns(frame, columns, path)
             frame[name] = _joined(frame, columns)
-    kept = ["line", *COLUMNS, *(name for name in OPTIONAL if name in frame)]
-    return trajectories_of(_numbers(frame.loc[:, kept], COLUMNS[1:]), path, reading.cut_bad, reading.shortest)
+    return _trajectories(_numbers(frame, COLUMNS[1:]), path, reading)
 
 
-def read_ngsim(frame: pd.DataFrame, about: dict[str, str], path: Path, reading: Reading) -> Recorded:
-    """Return the trajectories of the public NGSIM file (US DOT), which is in feet and milliseconds."""
+def _ngsim(frame: pd.DataFrame, path: Path, reading: Reading) -> Recorded:
+    """Return the trajectories of the public NGSIM file, which is in feet and milliseconds."""
     frame = frame.rename(columns=str.lower)
-    _check_columns(frame, NGSIM, path)
-    frame = _numbers(frame, NGSIM)
-    place = frame["location"].astype(str) if "location" in frame else pd.Series("", frame.index)
-    vehicles = pd.DataFrame(
-        {
-            "line": frame["line"],
-            "place": place,
-            "vehicle": frame["vehicle_id"],
-            "leader": frame["preceding"],
-            "lane": frame["lane_id"],
-            "time": frame["global_time"] / 1000.0,
-            "front": frame["local_y"] * FOOT,
-            "speed": frame["v_vel"] * FOOT,
-            "length": frame["v_length"] * FOOT,
-        }
-    )
+    place = frame["location"].astype(str) if "location" in frame else ""
+    vehicles = _columns(frame, NGSIM, path)
+    lengths = {name: vehicles[name] * FOOT for name in ("front", "speed", "length")}
+    vehicles = vehicles.assign(place=place, time=vehicles["time"] / 1000.0, **lengths)
     return _behind_leaders(vehicles, path, reading)
 
 
-def read_reconstructed(frame: pd.DataFrame, about: dict[str, str], path: Path, reading: Reading) -> Recorded:
-    """Return the trajectories of the reconstructed NGSIM I-80 (Montanino and Punzo 2015), in metres."""
-    frame = frame.rename(columns=_plain)
-    _check_columns(frame, RECONSTRUCTED, path)
-    frame = _numbers(frame, RECONSTRUCTED)
-    vehicles = pd.DataFrame(
-        {
-            "line": frame["line"],
-            "place": path.stem,
-            "vehicle": frame["vehicleid"],
-            "leader": frame["leaderid"],
-            "lane": frame["laneid"],
-            "time": frame["frameid"] / 10.0,
-            "front": frame["localy"],
-            "speed": frame["meanspeed"],
-            "length": frame["vehiclelength"],
-        }
-    )
+def _reconstructed(frame: pd.DataFrame, path: Path, reading: Reading) -> Recorded:
+    """Return the trajectories of the reconstructed NGSIM I-80, in metres and tenths of a second."""
+    vehicles = _columns(frame.rename(columns=_plain), RECONSTRUCTED, path)
+    vehicles = vehicles.assign(place=path.stem, time=vehicles["time"] / 10.0)
     return _behind_leaders(vehicles, path, reading)
-
-
-def read_openacc(frame: pd.DataFrame, about: dict[str, str], path: Path, reading: Reading) -> Recorded:
-    """Return the trajectories of an OpenACC file (JRC): a platoon, each vehicle behind the one before it."""
-    numbers = sorted(int(name[3:]) for name in frame.columns if re.fullmatch(r"IVS\d+", name))
-    if not numbers:
-        raise InputError(f"{path.name}: no column IVS1: not an OpenACC file")
-    vehicles = [name.strip() for name in about.get("vehicle_order", "").split(",") if name.strip()]
-    parts = []
-    for number in numbers:
-        columns = ["Time", f"Speed{number}", f"Speed{number + 1}", f"IVS{number}"]
-        _check_columns(frame, columns, path)
-        part = _numbers(frame.loc[:, ["line", *columns]], columns)
-        part.columns = ["line", "time", "leader_speed", "speed", "gap"]
-        driven = f"Driver{number + 1}"
-        kind = frame[driven].astype(str) if driven in frame else pd.Series("", frame.index)
-        name = vehicles[number] if number < len(vehicles) else f"vehicle {number + 1}"
-        # Who takes over in mid-way is another driver.
-        part = part.assign(
-            pair=f"{path.stem}-{number + 1}" + np.where(kind == "", "", "-" + kind), driver=name, kind=kind
-        )
-        parts.append(part)
-    return trajectories_of(pd.concat(parts), path, reading.cut_bad, reading.shortest)
-
-
-FORMATS: dict[str, Callable[[pd.DataFrame, dict[str, str], Path, Reading], Recorded]] = {
-    "table": read_table,
-    "ngsim": read_ngsim,
-    "ngsim-reconstructed": read_reconstructed,
-    "openacc": read_openacc,
-}
 
 
 def _behind_leaders(vehicles: pd.DataFrame, path: Path, reading: Reading) -> Recorded:
@@ -159,85 +147,107 @@ def _behind_leaders(vehicles: pd.DataFrame, path: Path, reading: Reading) -> Rec
             f"{path.name}: the median length of its vehicles would be {typical:.1f} m; allowed: {low:g} to "
             f"{high:g} m; are the units those of this format?"
         )
+    key = ["place", "time", "leader"]
     leaders = vehicles.loc[:, ["place", "time", "vehicle", "front", "speed", "length"]]
-    leaders = leaders.drop_duplicates(subset=["place", "time", "vehicle"])
-    joined = vehicles.merge(
-        leaders,
-        left_on=["place", "time", "leader"],
-        right_on=["place", "time", "vehicle"],
-        how="left",
-        suffixes=("", "_ahead"),
+    leaders = leaders.rename(columns={"vehicle": "leader"}).drop_duplicates(key)
+    vehicles = vehicles.merge(leaders, on=key, how="left", suffixes=("", "_ahead"))
+    alone = vehicles["front_ahead"].isna() & vehicles["front"].notna()
+    vehicles = vehicles.loc[~alone]
+    frame = vehicles.assign(
+        pair=_joined(vehicles, ("place", "vehicle", "leader", "lane")),
+        driver=_joined(vehicles, ("place", "vehicle")),
+        kind="human",
+        leader_speed=vehicles["speed_ahead"],
+        gap=vehicles["front_ahead"] - vehicles["length_ahead"] - vehicles["front"],
     )
-    alone = joined["front_ahead"].isna() & joined["front"].notna()
-    joined = joined.loc[~alone]
-    name = _joined(joined, ("place", "vehicle", "leader", "lane"))
-    frame = pd.DataFrame(
-        {
-            "line": joined["line"],
-            "pair": name,
-            "driver": _joined(joined, ("place", "vehicle")),
-            "kind": "human",
-            "time": joined["time"],
-            "speed": joined["speed"],
-            "leader_speed": joined["speed_ahead"],
-            "gap": joined["front_ahead"] - joined["length_ahead"] - joined["front"],
-        }
+    return _trajectories(
+        frame, path, reading, {"nobody ahead, or not recorded": int(np.count_nonzero(alone))}
     )
-    left_out = {"nobody ahead, or not recorded": int(np.count_nonzero(alone))}
-    return trajectories_of(frame, path, reading.cut_bad, reading.shortest, left_out)
 
 
-def _read(path: Path) -> tuple[pd.DataFrame, dict[str, str]]:
-    """Return a file's table with a column `line`, and what lines above its header say."""
+def _openacc(frame: pd.DataFrame, path: Path, reading: Reading) -> Recorded:
+    """Return the trajectories of an OpenACC file (JRC): a platoon, each vehicle behind the one before it."""
+    numbers = sorted(int(name[3:]) for name in frame.columns if re.fullmatch(r"IVS\d+", name))
+    if not numbers:
+        raise InputError(f"{path.name}: no column IVS1: not an OpenACC file")
+    order = frame.attrs.get("vehicle_order", "").split(",")
+    vehicles = [name.strip() for name in order if name.strip()]
+    parts = []
+    for number in numbers:
+        speeds = {f"Speed{number}": "leader_speed", f"Speed{number + 1}": "speed"}
+        part = _columns(frame, {"Time": "time", **speeds, f"IVS{number}": "gap"}, path)
+        driver = f"Driver{number + 1}"
+        kind = frame[driver].astype(str) if driver in frame else pd.Series("", frame.index)
+        # Who takes over in mid-way is another driver.
+        pair = f"{path.stem}-{number + 1}" + np.where(kind == "", "", "-" + kind)
+        name = vehicles[number] if number < len(vehicles) else f"vehicle {number + 1}"
+        parts.append(part.assign(pair=pair, driver=name, kind=kind))
+    return _trajectories(pd.concat(parts), path, reading)
+
+
+FORMATS: dict[str, Callable[[pd.DataFrame, Path, Reading], Recorded]] = {
+    "table": _table,
+    "ngsim": _ngsim,
+    "ngsim-reconstructed": _reconstructed,
+    "openacc": _openacc,
+}
+
+
+def _read(path: Path) -> pd.DataFrame:
+    """Return a file's table with a column `line`; its `attrs` are what lines above its header say."""
     if not path.is_file():
         raise InputError(f"data: {str(path)!r} does not exist")
-    about: dict[str, str] = {}
+    header, about = 0, dict[Hashable, str]()
     try:
         if path.suffix == ".parquet":
-            frame, header = pd.read_parquet(path), 0
+            frame = pd.read_parquet(path)
         else:
-            header = _header(path, about)
-            names = list(RECONSTRUCTED_ORDER) if header < 0 else None
-            frame = pd.read_csv(
-                path, skiprows=max(0, header), names=names, header=None if names else 0, skipinitialspace=True
-            )
+            header, about = _header(path)
+            bare = {"names": list(RECONSTRUCTED_ORDER), "header": None} if header < 0 else {}
+            frame = pd.read_csv(path, skiprows=max(0, header), skipinitialspace=True, **bare)
     except (ValueError, OSError, UnicodeDecodeError) as error:
         raise InputError(f"{path.name}: cannot be read: {' '.join(str(error).split())}") from None
-    return frame.assign(line=np.arange(len(frame)) + header + 2), about
+    frame = frame.assign(line=np.arange(len(frame)) + header + 2)
+    frame.attrs = about
+    return frame
 
 
-def _header(path: Path, about: dict[str, str]) -> int:
-    """Return how many lines lie above a CSV file's header; -1: it has none, and its rows are numbers."""
+def _header(path: Path) -> tuple[int, dict[Hashable, str]]:
+    """Return how many lines lie above a CSV file's header (-1: it has none), and what these say."""
     with open(path, encoding="utf-8-sig") as file:
         lines = [file.readline().strip() for _ in range(20)]
     first = lines[0].split(",")
     if len(first) == len(RECONSTRUCTED_ORDER) and all(
         re.fullmatch(r"\s*-?[\d.eE+-]+", cell) for cell in first
     ):
-        return -1
+        return -1, {}
     for number, line in enumerate(lines):
         if re.match(r"time\s*,\s*speed1\b", line, re.IGNORECASE):
-            for above in lines[:number]:
-                key, _, value = above.partition(",")
-                about[key.strip(" :").lower()] = value.strip(",\" '")
-            return number
-    return 0
+            above = [line.partition(",") for line in lines[:number]]
+            return number, {key.strip(" :").lower(): value.strip(",\" '") for key, _, value in above}
+    return 0, {}
 
 
-def _told_format(frame: pd.DataFrame, path: Path) -> str:
+def _told_format(frame: pd.DataFrame) -> str:
     names = set(map(str, frame.columns))
-    if set(NGSIM) <= {name.lower() for name in names}:
+    if NGSIM.keys() <= {name.lower() for name in names}:
         return "ngsim"
-    if set(RECONSTRUCTED) <= {_plain(name) for name in names}:
+    if RECONSTRUCTED.keys() <= set(map(_plain, names)):
         return "ngsim-reconstructed"
     return "openacc" if {"Speed1", "IVS1"} <= names else "table"
 
 
 def _plain(name: str) -> str:
-    return re.sub(r"[^a-z0-9]", "", str(name).lower()) if name != "line" else name
+    return re.sub(r"[^a-z0-9]", "", str(name).lower())
 
 
-def _check_columns(frame: pd.DataFrame, wanted: Any, path: Path) -> None:
+def _columns(frame: pd.DataFrame, named: dict[str, str], path: Path) -> pd.DataFrame:
+    """Return some columns of a file as numbers, and `line`, by our names."""
+    _check_columns(frame, named, path)
+    return _numbers(frame.loc[:, ["line", *named]], named).rename(columns=named)
+
+
+def _check_columns(frame: pd.DataFrame, wanted: Iterable[str], path: Path) -> None:
     missing = [name for name in wanted if name not in frame]
     if missing:
         there = ", ".join(str(name) for name in frame.columns if name != "line")
@@ -252,6 +262,62 @@ def _joined(frame: pd.DataFrame, columns: tuple[str, ...]) -> pd.Series:
     return pd.Series(np.array(words, object)[alike.to_numpy()], frame.index)
 
 
-def _numbers(frame: pd.DataFrame, names: Any) -> pd.DataFrame:
+def _numbers(frame: pd.DataFrame, names: Iterable[str]) -> pd.DataFrame:
     """Return the table with these columns as numbers; what is none becomes NaN, and so a bad row."""
     return frame.assign(**{name: pd.to_numeric(frame[name], errors="coerce") for name in names})
+
+
+def _trajectories(
+    frame: pd.DataFrame, path: Path, reading: Reading, left_out: dict[str, int] | None = None
+) -> Recorded:
+    """Return the trajectories of a table with the columns `line`, COLUMNS and OPTIONAL, SI units.
+
+    A trajectory is a run of evenly spaced rows of one pair; where a moment is missing, another begins. Rows
+    may be in any order; `left_out` are those that are left out already.
+
+    Raises:
+        InputError: a row is bad, or nothing is left.
+    """
+    bad, left_out = _bad_rows(frame), left_out or {}
+    if bad and not reading.cut_bad:
+        more = f" ({len(bad)} bad rows)" if len(bad) > 1 else ""
+        raise InputError(f"{path.name}: line {bad[0].line}: {bad[0].why}{more}; --cut-bad leaves them out")
+    good = frame.loc[~frame["line"].isin([row.line for row in bad])]
+    good = good.sort_values(by=["pair", "time"], kind="stable")
+    passed = good.groupby("pair", sort=False, dropna=False)["time"].diff()
+    if passed.isna().all():
+        raise InputError("time: no pair has two rows")
+    step = round(float(passed.median()), 4)  # times in single precision are no better
+    begins = ~((passed - step).abs() <= ROUGHNESS * step)
+    pairs: list[Pair] = []
+    parts: dict[str, int] = {}
+    short = 0
+    for _, rows in good.groupby(begins.cumsum(), sort=False):
+        if (len(rows) - 1) * step < reading.shortest or len(rows) < 2:
+            short += len(rows)
+            continue
+        pair = str(rows["pair"].iloc[0])
+        speed, leader_speed, gap = (rows[name].to_numpy(np.float64) for name in COLUMNS[2:])
+        driver, kind, split = (str(rows[name].iloc[0]) if name in rows else "" for name in OPTIONAL)
+        parts[pair] = parts.get(pair, 0) + 1
+        name = pair if parts[pair] == 1 else f"{pair}/{parts[pair]}"
+        pairs.append(Pair(name, driver or pair, step, speed, leader_speed, gap, kind, split))
+    if not pairs:
+        raise InputError(f"{path.name}: no trajectory lasts {reading.shortest:g} s")
+    why = {**left_out, f"trajectories shorter than {reading.shortest:g} s": short}
+    return Recorded(pairs, len(frame) + sum(left_out.values()), bad, why)
+
+
+def _bad_rows(frame: pd.DataFrame) -> list[BadRow]:
+    found: dict[int, str] = {}
+    for name in COLUMNS[1:]:
+        values = frame[name].to_numpy(np.float64)
+        low, high = ALLOWED.get(name, (-np.inf, np.inf))
+        wrong = ~np.isfinite(values) | (values < low) | (values > high)
+        allowed = f"{low:g} to {high:g}" if name in ALLOWED else "finite"
+        for line, value in zip(frame["line"][wrong], values[wrong], strict=True):
+            found.setdefault(int(line), f"{name}: {value:g} is not allowed; allowed: {allowed}")
+    twice = frame.assign(time=frame["time"].round(6)).duplicated(["pair", "time"])
+    for line, time in zip(frame["line"][twice], frame["time"][twice], strict=True):
+        found.setdefault(int(line), f"time: {time:g} is there twice in its pair")
+    return [BadRow(line, found[line]) for line in sorted(found)]

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from unjam.drivers.idm import SMALLEST_GAP
 from unjam.following.pairs import Floats, Stretches
 from unjam.physics.arrays import Array, at_least, clip, namespace
-from unjam.physics.idm import IDMParameters, IDMRows, idm_acceleration
+from unjam.physics.idm import PARAMETER_NAMES, IDMParameters, IDMRows, idm_acceleration
 from unjam.physics.kinematics import next_position, next_speed
 from unjam.scenarios.population import residual_inputs
 
@@ -37,6 +37,11 @@ HEADWAYS = (0.2, 6.0)
 def always(follow: Follow) -> Model:
     """Return the driver that drives alike wherever it takes over."""
     return lambda speed, gap: follow
+
+
+def with_values(parameters: IDMParameters | IDMRows, **values: Array) -> IDMRows:
+    """Return the parameters with arrays in some places."""
+    return IDMRows(*(values.get(name, getattr(parameters, name)) for name in PARAMETER_NAMES))
 
 
 def idm_follow(parameters: IDMParameters | IDMRows, limits: Limits | None = None) -> Follow:
@@ -65,8 +70,7 @@ def personal_idm(parameters: IDMParameters | IDMRows, kept: Array, limits: Limit
     def begin(speed: Array, gap: Array) -> Follow:
         found = clip((gap - p.minimum_gap) / at_least(speed, SLOWEST), *HEADWAYS)
         own = p.time_headway ** (1.0 - kept) * found**kept
-        searched = (p.max_acceleration, p.comfortable_deceleration, p.exponent, p.minimum_gap)
-        return idm_follow(IDMRows(p.desired_speed, own, *searched), limits)
+        return idm_follow(with_values(p, time_headway=own), limits)
 
     return begin
 
@@ -115,7 +119,7 @@ def drive_behind(follow: Follow, start: tuple[Array, Array], leader: Any, step: 
 
 
 @dataclass(frozen=True, eq=False)
-class OpenLoop:
+class DrivenBehind:
     """How a model drove behind recorded leaders, beside those who really did; n stretches of T moments."""
 
     speed: Floats
@@ -130,11 +134,9 @@ class OpenLoop:
     """whether the gap was used up, shape (n,)"""
     moments: NDArray[np.int64]
     """moments of each stretch but the first, shape (n,)"""
-    owner: NDArray[np.int64]
-    """which pair each stretch is of, shape (n,)"""
 
 
-def open_loop(model: Model, stretches: Stretches) -> OpenLoop:
+def open_loop(model: Model, stretches: Stretches) -> DrivenBehind:
     """Drive behind the leader of each stretch from its first moment on, and compare with the follower."""
     follow = model(stretches.speed[0], stretches.gap[0])
     speeds, gaps = [stretches.speed[0]], [stretches.gap[0]]
@@ -144,14 +146,13 @@ def open_loop(model: Model, stretches: Stretches) -> OpenLoop:
         gaps.append(gap)
     speed, gap, present = np.stack(speeds), np.stack(gaps), stretches.present
     moments = present[1:].sum(0)
-    return OpenLoop(
+    return DrivenBehind(
         speed,
         gap,
         (np.square(speed - stretches.speed) * present).sum(0) / moments,
         (np.square(gap - stretches.gap) * present).sum(0) / moments,
         np.any((gap <= 0.0) & present, axis=0),
         moments,
-        stretches.owner,
     )
 
 

@@ -1,18 +1,26 @@
 """What is known of how people drive: one follower behind one leader, moment by moment."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
+from unjam.drivers.local_state import LARGEST_GAP, LocalState
 from unjam.errors import wrong
 from unjam.physics.kinematics import next_position
 
 Floats = NDArray[np.float64]
 
 SPLITS = ("train", "validation", "test")
+DRIVEN = ("speed", "leader_speed", "gap", "leader_path")
+"""of a `Pair`, what stretches have side by side"""
+SHORTEST = 20.0
+"""drives behind a CAV that are shorter tell too little [s]"""
+LONGEST_JUMP = 0.5
+"""change of the gap in a decision that speeds do not explain, beyond which another vehicle is behind [m]"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,14 +66,13 @@ class Pair:
 
     def part(self, first: int, last: int, name: str = "") -> "Pair":
         """Return the moments from `first` on and before `last` as a trajectory of its own."""
-        cut = slice(first, last)
-        values = (self.speed[cut], self.leader_speed[cut], self.gap[cut])
-        return Pair(name or self.name, self.driver, self.step, *values, self.kind, self.split)
+        cut = {each: getattr(self, each)[first:last] for each in ("speed", "leader_speed", "gap")}
+        return replace(self, name=name or self.name, **cut)
 
 
 @dataclass(frozen=True, eq=False)
-class Rows:
-    """Single moments, without what came before; n rows."""
+class Moments:
+    """Single moments, without what came before; n of them."""
 
     speed: Floats
     leader_speed: Floats
@@ -76,19 +83,23 @@ class Rows:
     def __len__(self) -> int:
         return len(self.speed)
 
-    def some(self, chosen: NDArray[np.int64]) -> "Rows":
-        """Return the chosen rows."""
-        return Rows(*(values[chosen] for values in vars(self).values()))
+    @property
+    def seen(self) -> tuple[Floats, Floats, Floats]:
+        """What a driver sees: own speed, leader's speed and gap."""
+        return self.speed, self.leader_speed, self.gap
+
+    def some(self, chosen: NDArray[np.int64]) -> "Moments":
+        """Return the chosen moments."""
+        return Moments(*(values[chosen] for values in vars(self).values()))
 
 
-def rows_of(pairs: Sequence[Pair]) -> Rows:
+def moments_of(pairs: Sequence[Pair]) -> Moments:
     """Return all moments of `pairs` but the last of each, one after the other."""
-    return Rows(
-        np.concatenate([pair.speed[:-1] for pair in pairs]),
-        np.concatenate([pair.leader_speed[:-1] for pair in pairs]),
-        np.concatenate([pair.gap[:-1] for pair in pairs]),
-        np.concatenate([pair.acceleration for pair in pairs]),
-    )
+
+    def joined(name: str) -> Floats:
+        return np.concatenate([getattr(pair, name)[: len(pair.acceleration)] for pair in pairs])
+
+    return Moments(joined("speed"), joined("leader_speed"), joined("gap"), joined("acceleration"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,15 +122,8 @@ class Stretches:
     def some(self, chosen: NDArray[np.int64]) -> "Stretches":
         """Return the chosen stretches, as long as the longest of them."""
         long = int(self.present[:, chosen].sum(0).max())
-        return Stretches(
-            self.speed[:long, chosen],
-            self.leader_speed[:long, chosen],
-            self.gap[:long, chosen],
-            self.leader_path[:long, chosen],
-            self.present[:long, chosen],
-            self.step,
-            self.owner[chosen],
-        )
+        cut = {name: getattr(self, name)[:long, chosen] for name in (*DRIVEN, "present")}
+        return replace(self, **cut, owner=self.owner[chosen])
 
 
 def stretches_of(pairs: Sequence[Pair], seconds: float | None = None) -> Stretches:
@@ -141,21 +145,18 @@ def stretches_of(pairs: Sequence[Pair], seconds: float | None = None) -> Stretch
         for first in range(0, len(pair.speed) - 1, max(1, length - 1)):
             parts.append(pair.part(first, first + length))
             owner.append(number)
-    longest = max(len(part.speed) for part in parts)
+    lengths = np.array([len(part.speed) for part in parts])
+    longest = int(lengths.max())
 
     def side_by_side(name: str) -> Floats:
         columns = [getattr(part, name) for part in parts]
         return np.stack([np.pad(column, (0, longest - len(column)), mode="edge") for column in columns], 1)
 
-    lengths = np.array([len(part.speed) for part in parts])
     return Stretches(
-        side_by_side("speed"),
-        side_by_side("leader_speed"),
-        side_by_side("gap"),
-        side_by_side("leader_path"),
-        np.arange(longest)[:, None] < lengths,
-        step,
-        np.array(owner),
+        **{name: side_by_side(name) for name in DRIVEN},
+        present=np.arange(longest)[:, None] < lengths,
+        step=step,
+        owner=np.array(owner),
     )
 
 
@@ -178,3 +179,26 @@ def split_by_trajectory(pairs: Sequence[Pair], shares: Sequence[float], seed: in
 def of_split(pairs: Sequence[Pair], *names: str) -> list[Pair]:
     """Return the pairs of these parts of the split."""
     return [pair for pair in pairs if pair.split in names]
+
+
+def people_behind(recordings: Iterable[LocalState], step: float) -> list[Pair]:
+    """Return the drives of those who followed a CAV, each of the same vehicle throughout.
+
+    Args:
+        recordings: what CAVs perceived, one after the other, each of shape (T,).
+        step: time between two decisions [s].
+    """
+    pairs = []
+    for number, states in enumerate(recordings):
+        largest = np.where(np.isnan(states.loop_length), LARGEST_GAP, states.loop_length)
+        nobody = states.follower_gap >= largest
+        expected = states.follower_gap[:-1] + (states.speed[1:] - states.follower_speed[1:]) * step
+        other = np.abs(states.follower_gap[1:] - expected) > LONGEST_JUMP
+        ends = np.flatnonzero(np.r_[True, other | nobody[1:] | nobody[:-1], True])
+        for first, last in pairwise(ends):
+            if (last - first) * step >= SHORTEST:
+                seen = (states.follower_speed, states.speed, states.follower_gap)
+                own, leader, gap = (np.asarray(values[first:last], np.float64) for values in seen)
+                name = f"{number}-{first}"
+                pairs.append(Pair(name, name, step, own, leader, gap))
+    return pairs

@@ -13,6 +13,7 @@ from unjam.drivers.driver import Driver
 from unjam.drivers.network import Network
 from unjam.drivers.residual import ResidualDriver
 from unjam.errors import MissingPartError
+from unjam.following.calibration import calibrated_people
 from unjam.learners.rows import Rows
 from unjam.learners.settings import PolicySettings
 from unjam.physics.idm import IDMParameters
@@ -20,7 +21,6 @@ from unjam.scenarios.scenario import Scenario
 from unjam.virtual.data import ActualData, pack_data, unpack_data
 from unjam.virtual.fitting import fit
 from unjam.virtual.model import EnvironmentModel, torch_generator
-from unjam.virtual.people import calibrated_people
 from unjam.virtual.rollout import Rollouts, begin, imagine, return_bound, rollout_length
 from unjam.virtual.settings import VirtualSettings
 from unjam.virtual.world import VirtualDynamics
@@ -72,7 +72,7 @@ class Imagination:
         self._actual = sum(len(self.data.recordings[place].reward) for place in self._newest)
         settings = self.settings
         if settings.calibrate and first == 0:
-            self._know(calibrated_people(self.data.recordings, self.scenario))
+            self._know(calibrated_people((kept.states for kept in self.data.recordings), self.scenario))
         found = fit(
             self.model,
             self.data.transitions(settings.holdout),

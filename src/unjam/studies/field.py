@@ -14,11 +14,16 @@ from typing import Any
 import numpy as np
 
 from unjam.files import to_json, write_whole
-from unjam.following.calibration import SEARCHED, CalibrationSettings, calibrate
-from unjam.following.each_driver import calibrate_each
+from unjam.following.calibration import SEARCHED, CalibrationSettings, calibrate, calibrate_each
 from unjam.following.loaders import Reading, read_pairs
-from unjam.following.multi_step import Known, MultiStepSettings, fit_multi_step
-from unjam.following.network import NetworkSettings, fit_one_step, on_rows
+from unjam.following.networks import (
+    Known,
+    MultiStepSettings,
+    NetworkSettings,
+    fit_multi_step,
+    fit_one_step,
+    on_rows,
+)
 from unjam.following.open_loop import (
     Follow,
     Limits,
@@ -30,7 +35,7 @@ from unjam.following.open_loop import (
     personal_idm,
     with_residual,
 )
-from unjam.following.pairs import Pair, Stretches, of_split, rows_of, split_by_trajectory, stretches_of
+from unjam.following.pairs import Pair, Stretches, moments_of, of_split, split_by_trajectory, stretches_of
 from unjam.physics.idm import PAPER_IDM, parameter_rows
 from unjam.studies.parts import Part, Told, about_study, measure_parts, read_part
 
@@ -199,7 +204,7 @@ def _made(task: Task, data: Data) -> tuple[Model, dict[str, Any]]:
         facts = {"validation": fitted.validation, "best_step": best}
         return with_residual(found.model(LIMITS), on_rows(fitted.network.as_driver()), LIMITS), facts
     base = _base(task.model, learn)
-    rows, judges = rows_of(learn), rows_of(validation)
+    rows, judges = moments_of(learn), moments_of(validation)
     apart = ROWS_APART[task.data.partition("-")[0]]
     rows, judges = (each.some(np.arange(0, len(each), apart)) for each in (rows, judges))
     network, losses = fit_one_step(rows, judges, base, ONE_STEP, task.seed)

@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 
 from unjam.files import to_json, write_whole
 from unjam.following.four_regimes import SMALLEST_GAP, FourRegimes, four_regimes
-from unjam.following.network import NetworkSettings, fit_one_step, on_rows
+from unjam.following.networks import NetworkSettings, fit_one_step, on_rows
 from unjam.following.open_loop import always, idm_follow, with_residual
-from unjam.following.pairs import SPLITS, Floats, Rows, of_split, rows_of, split_by_trajectory
+from unjam.following.pairs import SPLITS, Floats, Moments, moments_of, of_split, split_by_trajectory
 from unjam.physics.arrays import at_least
 from unjam.physics.idm import PAPER_IDM, idm_acceleration
 from unjam.studies.parts import Part, Told, about_study, measure_parts, read_part
@@ -70,9 +70,9 @@ class Task:
 class Parted(NamedTuple):
     """The rows of a split."""
 
-    training: Rows
-    validation: Rows
-    test: Rows
+    training: Moments
+    validation: Moments
+    test: Moments
     overlap: float
     """share of the test rows that are also training rows"""
 
@@ -118,8 +118,8 @@ def parted(driver: str, split: Split) -> Parted:
     pairs = four_regimes(SETTINGS[driver])
     if split == "trajectories":
         chosen = split_by_trajectory(pairs, SHARES, seed=0)
-        return Parted(*(rows_of(of_split(chosen, name)) for name in SPLITS), overlap=0.0)
-    rows, generator = rows_of(pairs), np.random.default_rng(0)
+        return Parted(*(moments_of(of_split(chosen, name)) for name in SPLITS), overlap=0.0)
+    rows, generator = moments_of(pairs), np.random.default_rng(0)
     borders = np.round(np.cumsum(SHARES)[:-1] * len(rows)).astype(int)
     training, validation, test = np.split(generator.permutation(len(rows)), borders)
     if split == "released":
@@ -156,7 +156,7 @@ def measure(task: Task) -> dict[str, Any]:
     }
 
 
-def average_acceleration(rows: Rows, settings: FourRegimes) -> Floats:
+def average_acceleration(rows: Moments, settings: FourRegimes) -> Floats:
     """Return what the driver of the data does on average, over the noise, in each row [m/s2].
 
     That is its IDM, but for those who nearly stand: as nobody drives backwards, noise only lets them start.
@@ -172,7 +172,7 @@ def average_acceleration(rows: Rows, settings: FourRegimes) -> Floats:
     return least + settings.noise * (norm.pdf(above) + above * norm.cdf(above))
 
 
-def _learned(task: Task, training: Rows, rows: Parted) -> tuple[Floats, dict[str, Any]]:
+def _learned(task: Task, training: Moments, rows: Parted) -> tuple[Floats, dict[str, Any]]:
     base = idm_follow(PAPER_IDM) if task.network == "knowledge" else None
     if task.longer:
         training = training.some(np.tile(np.arange(len(training)), LONGER))
@@ -191,7 +191,7 @@ def _learned(task: Task, training: Rows, rows: Parted) -> tuple[Floats, dict[str
     return predicted, facts
 
 
-def _nearest(training: Rows, test: Rows) -> Floats:
+def _nearest(training: Moments, test: Moments) -> Floats:
     """Return the acceleration of the training row that is most similar to each test row."""
     from scipy.spatial import KDTree
 

@@ -8,8 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from unjam.controller.archive import WEIGHTS, unpack_parts
-from unjam.controller.file import hash_of
+from unjam.controller.file import WEIGHTS, hash_of, unpack_parts
 from unjam.reports.results import EVALUATION_FILE, Results, read_progress, read_results, read_rows
 from unjam.studies.plan import PlannedRun
 from unjam.training.executors import Command

@@ -55,19 +55,12 @@ def read_sumo_files(path: Path) -> SumoFiles:
         if all(file.is_file() and stamp(file) == before for file, before in stamps.items()):
             return files
     found = _ask("configuration", path)
-    stamps = {
-        Path(file): (time, size) for file, (time, size) in zip(found["files"], found["stamps"], strict=True)
+    stamps = {Path(file): (time, size) for file, (time, size) in found.pop("stamps").items()}
+    paths = {
+        "network": Path(found["network"]),
+        "additional_files": tuple(map(Path, found["additional_files"])),
     }
-    files = SumoFiles(
-        path,
-        Path(found["network"]),
-        tuple(map(Path, found["additional_files"])),
-        found["begin"],
-        found["end"],
-        found["step"],
-        found["types"],
-        frozenset(found["used_types"]),
-    )
+    files = SumoFiles(path, **{**found, **paths, "used_types": frozenset(found["used_types"])})
     _known[path] = stamps, files
     return files
 

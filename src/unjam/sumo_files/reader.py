@@ -42,12 +42,25 @@ def read_configuration(path: Path) -> dict[str, Any]:
     Raises:
         Broken: one is missing or broken, the network has no version, or there are no vehicles.
     """
-    options, network, additional, routes = _named(path)
+    if not path.is_file():
+        raise Broken(f"{str(path)!r}: there is no such file")
+    options = {
+        SYNONYMS.get(element.tag, element.tag): element.get("value", "")
+        for element in _elements(path, "end")
+        if element.get("value") is not None
+    }
+    if not options.get("net-file"):
+        raise Broken(f"{path.name}: names no net-file")
+    network = path.parent / options["net-file"]
+    additional, routes = (
+        [path.parent / name for name in options.get(files, "").replace(",", " ").split()]
+        for files in ("additional-files", "route-files")
+    )
     files = [path, network, *additional, *routes]
     for file in files:
         if not file.is_file():
             raise Broken(f"{str(file)!r}: there is no such file")
-    stamps = [list(stamp(file)) for file in files]
+    stamps = {str(file): stamp(file) for file in files}
     _check_network(network)
     demand = _Demand({}, {}, set())
     for file in [*additional, *routes]:
@@ -71,7 +84,6 @@ def read_configuration(path: Path) -> dict[str, Any]:
         "step": _seconds(path, options, "step-length", 1.0) or 1.0,
         "types": demand.types,
         "used_types": sorted(used),
-        "files": [str(file) for file in files],
         "stamps": stamps,
     }
 
@@ -94,32 +106,6 @@ def stamp(file: Path) -> tuple[int, int]:
     return found.st_mtime_ns, found.st_size
 
 
-class _Named(NamedTuple):
-    """What a .sumocfg file says, and the files that it names."""
-
-    options: dict[str, str]
-    network: Path
-    additional: tuple[Path, ...]
-    routes: tuple[Path, ...]
-
-
-def _named(path: Path) -> _Named:
-    if not path.is_file():
-        raise Broken(f"{str(path)!r}: there is no such file")
-    options = {
-        SYNONYMS.get(element.tag, element.tag): element.get("value", "")
-        for element in _elements(path, "end")
-        if element.get("value") is not None
-    }
-    if not options.get("net-file"):
-        raise Broken(f"{path.name}: names no net-file")
-    additional, routes = (
-        tuple(path.parent / name for name in options.get(files, "").replace(",", " ").split())
-        for files in ("additional-files", "route-files")
-    )
-    return _Named(options, path.parent / options["net-file"], additional, routes)
-
-
 def _seconds(path: Path, options: dict[str, str], name: str, otherwise: float | None) -> float | None:
     """Return a time option [s]; SUMO writes -1 for no end."""
     text = options.get(name)
@@ -130,13 +116,9 @@ def _seconds(path: Path, options: dict[str, str], name: str, otherwise: float | 
         value = sum(float(part) * unit for part, unit in zip(reversed(parts), UNITS, strict=False))
     except ValueError:
         value = nan
-    if (
-        not isfinite(value)
-        or value < 0
-        or len(parts) not in (1, 3, 4)
-        or (name == "step-length" and not value)
-    ):
-        allowed = "seconds > 0" if name == "step-length" else "seconds, hours:minutes:seconds"
+    positive = name == "step-length"
+    if not isfinite(value) or value < 0 or len(parts) not in (1, 3, 4) or (positive and not value):
+        allowed = "seconds > 0" if positive else "seconds, hours:minutes:seconds"
         raise Broken(f"{path.name}: {name}: {text!r} is not allowed; allowed: {allowed}")
     return value
 

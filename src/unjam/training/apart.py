@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Any
 
 from unjam.errors import DiskError, EpisodeError, InputError, MissingPartError, UnjamError
-from unjam.training.config import RunConfig
 from unjam.parameters import build
+from unjam.training.config import RunConfig
 
 KINDS = {kind.__name__: kind for kind in (InputError, MissingPartError, DiskError, EpisodeError)}
 

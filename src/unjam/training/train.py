@@ -10,8 +10,8 @@ import torch
 from unjam.drivers.registry import describe
 from unjam.kernels import child_would_be_pinned
 from unjam.measures.statistics import Estimate, paired_difference
-from unjam.training.apart import train_apart
 from unjam.reports.html import write_report
+from unjam.training.apart import train_apart
 from unjam.training.config import RunConfig
 from unjam.training.folder import check_possible, continue_folder, start_folder
 from unjam.training.judge import TRAINED, judge

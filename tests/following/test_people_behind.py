@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 
 from unjam.drivers import LocalState, PISaturation
+from unjam.following.calibration import calibrated_people
+from unjam.following.pairs import people_behind
 from unjam.physics.idm import IDMParameters
 from unjam.scenarios import Ring
 from unjam.virtual.data import ActualData, Recording
-from unjam.virtual.people import calibrated_people, people_behind
 from unjam.worlds.episode import run_episode
 
 OTHERS = IDMParameters(time_headway=1.6, max_acceleration=0.7)
@@ -23,14 +24,14 @@ def data() -> ActualData:
 
 def test_finds_how_people_on_the_road_drive(data: ActualData) -> None:
     believed = replace(RING, humans=IDMParameters())
-    found = calibrated_people(data.recordings, believed)
+    found = calibrated_people(states_of(data), believed)
     assert found.time_headway == pytest.approx(OTHERS.time_headway, abs=0.1)
     assert found.max_acceleration == pytest.approx(OTHERS.max_acceleration, rel=0.2)
     assert (found.desired_speed, found.minimum_gap) == (30.0, 2.0)
 
 
 def test_a_drive_is_that_of_the_vehicle_behind(data: ActualData) -> None:
-    pairs = people_behind(data.recordings, RING)
+    pairs = people_behind(states_of(data), RING.decision_step)
     assert len(pairs) == 2
     states = data.recordings[0].states
     np.testing.assert_array_equal(pairs[0].leader_speed, states.speed[: len(pairs[0].speed)])
@@ -41,17 +42,20 @@ def test_another_vehicle_behind_is_another_drive(data: ActualData) -> None:
     recording = data.recordings[0]
     gap = np.array(recording.states.follower_gap, np.float64)
     gap[400:] += 30.0
-    pairs = people_behind([changed(recording, gap)], RING)
+    pairs = people_behind([changed(recording, gap)], RING.decision_step)
     assert [len(pair.speed) for pair in pairs] == [400, 501]
 
 
 def test_where_nobody_drove_behind_people_stay_as_they_are_known(data: ActualData) -> None:
     recording = data.recordings[0]
     alone = changed(recording, np.array(recording.states.loop_length, np.float64))
-    assert people_behind([alone], RING) == []
+    assert people_behind([alone], RING.decision_step) == []
     assert calibrated_people([alone], RING) == RING.humans
 
 
-def changed(recording: Recording, follower_gap: np.ndarray) -> Recording:
-    states = LocalState(*recording.states)._replace(follower_gap=follower_gap)
-    return replace(recording, states=states)
+def changed(recording: Recording, follower_gap: np.ndarray) -> LocalState:
+    return LocalState(*recording.states)._replace(follower_gap=follower_gap)
+
+
+def states_of(data: ActualData) -> list[LocalState]:
+    return [recording.states for recording in data.recordings]

@@ -1,0 +1,301 @@
+"""Networks that drive: alone (`vanilla`), or as the residual on a base (`knowledge`, Eq. 4 of the paper).
+
+A network that learned single accelerations (`fit_one_step`) has never seen where its own small errors lead.
+In `fit_multi_step` the loss is the error of the simulated gap, and its gradient runs back through every step
+behind a recorded leader.
+"""
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Annotated
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from pydantic import Field
+from pydantic.dataclasses import dataclass as checked_dataclass
+from torch import Tensor, nn
+
+from unjam.drivers.network import Network
+from unjam.errors import UnjamError
+from unjam.following.open_loop import (
+    Follow,
+    Limits,
+    Model,
+    Residual,
+    drive_behind,
+    open_loop,
+    personal_idm,
+    with_residual,
+)
+from unjam.following.pairs import Floats, Moments, Pair, Stretches, moments_of, stretches_of
+from unjam.parameters import STRICT, Count, NotNegative, Positive
+from unjam.physics.idm import IDMParameters, IDMRows, parameter_rows
+from unjam.scenarios.population import RESIDUAL_INPUTS, residual_inputs
+
+SMALLEST = 1e-2
+"""what is added to a mean square before its root [m2]: a perfect trajectory has no infinite slope"""
+LARGEST_GRADIENT = 1.0
+"""norm to which gradients are cut: those through many steps can be very long"""
+
+Hidden = Annotated[tuple[Count, ...], Field(min_length=1)]
+
+
+@checked_dataclass(frozen=True, config=STRICT)
+class NetworkSettings:
+    """A network and how it learns single accelerations; the defaults are the paper's."""
+
+    hidden: Hidden = (128, 128)
+    """units of the hidden layers"""
+    rate: Positive = 1e-4
+    """learning rate of Adam"""
+    batch: Count = 1024
+    """moments in a gradient step"""
+    epochs: Count = 200
+    """most passes over the moments"""
+    patience: Count = 200
+    """passes without progress in validation after which learning ends; as many as `epochs`: never"""
+    authority: Positive = 8.0
+    """largest acceleration that it may answer [m/s2]: no network answers what no car can do"""
+
+
+@checked_dataclass(frozen=True, config=STRICT)
+class MultiStepSettings:
+    """A network and how it learns, as a residual, from simulated driving."""
+
+    hidden: Hidden = (32, 32)
+    """units of the hidden layers"""
+    authority: Positive = 2.0
+    """largest residual [m/s2]"""
+    seconds: Positive = 30.0
+    """length of the stretches that are simulated"""
+    batch: Count = 64
+    """stretches in a gradient step"""
+    steps: Count = 120
+    """gradient steps"""
+    rate: Positive = 1e-3
+    """learning rate of Adam, which falls to zero as a cosine"""
+    speed_weight: NotNegative = 2.0
+    """how much an error of the speed by 1 m/s counts beside one of the gap by 1 m"""
+    residual_weight: NotNegative = 0.1
+    """how much the squared residual counts: where data are silent, the base drives"""
+    validate_every: Count = 20
+    """gradient steps between two judgements on the validation trajectories, which choose the weights"""
+
+
+class FollowingNetwork(nn.Module):
+    """A perceptron with ReLU layers, `authority * tanh(last layer / authority)`: near zero it is linear."""
+
+    mean: Tensor
+    scale: Tensor
+
+    def __init__(
+        self, settings: NetworkSettings | MultiStepSettings, moments: Moments, seed: int, zero: bool = False
+    ) -> None:
+        """Make a network whose inputs are normalised by `moments`; with `zero` it answers zero at first."""
+        super().__init__()
+        sizes = [len(RESIDUAL_INPUTS), *settings.hidden, 1]
+        with torch.random.fork_rng():
+            torch.manual_seed(seed)
+            self.layers = [nn.Linear(*pair) for pair in itertools.pairwise(sizes)]
+        if zero:
+            nn.init.zeros_(self.layers[-1].weight)
+            nn.init.zeros_(self.layers[-1].bias)
+        self.registered = nn.ModuleList(self.layers)
+        self.authority = settings.authority
+        seen = residual_inputs(*moments.seen)
+        self.register_buffer("mean", _tensor(seen.mean(0)))
+        self.register_buffer("scale", _tensor(seen.std(0).clip(1e-3)))
+
+    def forward(self, inputs: Tensor) -> Tensor:
+        """Return the acceleration [m/s2], shape (n,), for what `residual_inputs` answers."""
+        hidden = (inputs - self.mean) / self.scale
+        for layer in self.layers[:-1]:
+            hidden = layer(hidden).relu()
+        return self.authority * (self.layers[-1](hidden).squeeze(-1) / self.authority).tanh()
+
+    def as_driver(self) -> Network:
+        """Return its NumPy twin: the network that drives in the simulator."""
+        layers: list[tuple[Floats, Floats]] = [
+            (layer.weight.detach().double().numpy().T, layer.bias.detach().double().numpy())
+            for layer in self.layers
+        ]
+        mean, scale = self.mean.double().numpy(), self.scale.double().numpy()
+        weight, bias = layers[0]
+        layers[0] = (weight / scale[:, None], bias - (mean / scale) @ weight)
+        weight, bias = layers[-1]
+        layers[-1] = (weight / self.authority, bias / self.authority)
+        return Network(tuple(layers), self.authority)
+
+    def weights(self) -> dict[str, Tensor]:
+        """Return a copy of all that it has learned, to be loaded again."""
+        return {name: value.clone() for name, value in self.state_dict().items()}
+
+
+def _tensor(values: Floats) -> Tensor:
+    return torch.as_tensor(np.ascontiguousarray(values), dtype=torch.float32)
+
+
+def on_rows(network: Network) -> Residual:
+    """Return a network that drives as one that takes inputs of any shape (..., 3)."""
+
+    def answer(inputs: Floats) -> Floats:
+        return network(inputs.reshape(-1, len(RESIDUAL_INPUTS))).reshape(inputs.shape[:-1])
+
+    return answer
+
+
+@dataclass(frozen=True)
+class Losses:
+    """Mean squared errors over the passes of a fit [(m/s2)2]."""
+
+    training: list[float] = field(default_factory=list)
+    validation: list[float] = field(default_factory=list)
+
+
+def fit_one_step(
+    moments: Moments, validation: Moments, base: Follow | None, settings: NetworkSettings, seed: int
+) -> tuple[FollowingNetwork, Losses]:
+    """Return a network that has learned the accelerations of single moments, less what the base says of them.
+
+    It ends with the weights of the pass that was best on `validation`.
+
+    Args:
+        moments: to learn from.
+        validation: that judge each pass.
+        base: what is known; None: the network learns all of it.
+        settings: of network and learning.
+        seed: of the first weights and the order of the moments.
+
+    Raises:
+        UnjamError: a loss is not finite.
+    """
+    torch.set_num_threads(1)
+    network = FollowingNetwork(settings, moments, seed)
+    (inputs, wanted), (judged, judged_wanted) = (
+        (
+            _tensor(residual_inputs(*each.seen)),
+            _tensor(each.acceleration - (base(*each.seen) if base else 0.0)),
+        )
+        for each in (moments, validation)
+    )
+    optimizer = torch.optim.Adam(network.parameters(), lr=settings.rate, fused=True)
+    generator = torch.Generator().manual_seed(seed)
+    losses, best, waited, kept = Losses(), float("inf"), 0, network.weights()
+    while len(losses.training) < settings.epochs and waited < settings.patience:
+        total = torch.zeros(())
+        for batch in torch.randperm(len(wanted), generator=generator).split(settings.batch):
+            loss = (network(inputs[batch]) - wanted[batch]).square().mean()
+            optimizer.zero_grad()
+            loss.backward()
+            optimizer.step()
+            total += loss.detach() * len(batch)
+        with torch.no_grad():
+            found = (network(judged) - judged_wanted).square().mean().item()
+        losses.training.append(total.item() / len(wanted))
+        losses.validation.append(found)
+        if not np.isfinite([losses.training[-1], found]).all():
+            raise UnjamError(f"following network: the loss of pass {len(losses.training)} is not finite")
+        waited = waited + 1 if found >= best else 0
+        if found < best:
+            best, kept = found, network.weights()
+    network.load_state_dict(kept)
+    return network, losses
+
+
+@dataclass(frozen=True)
+class Known:
+    """Trajectories, and what is known of who drove them before a residual is learned."""
+
+    pairs: Sequence[Pair]
+    drivers: Sequence[IDMParameters]
+    """of each trajectory"""
+    kept_headway: float = 0.0
+    """of `personal_idm`"""
+
+    def model(self, owner: NDArray[np.int64], limits: Limits, tensors: bool = False) -> Model:
+        """Return the base of stretches that are of the trajectories `owner`; for NumPy or for torch."""
+        rows = parameter_rows([self.drivers[number] for number in owner])
+        return personal_idm(IDMRows(*map(_tensor, rows)) if tensors else rows, self.kept_headway, limits)
+
+
+@dataclass(frozen=True)
+class MultiStepFit:
+    """A residual, and how it came to be."""
+
+    network: FollowingNetwork
+    validation: list[float]
+    """mean over the validation trajectories of the root mean squared error of the gap [m], by
+    judgement; the first is the base's"""
+
+
+def fit_multi_step(
+    known: Known, validation: Known, limits: Limits, settings: MultiStepSettings, seed: int
+) -> MultiStepFit:
+    """Return a residual on what is known that makes the simulated gaps those of the trajectories.
+
+    It starts at zero, so that what drives at first is the base alone, and ends with the weights that were
+    best on whole trajectories of `validation`; these may be the first.
+
+    Args:
+        known: to learn from.
+        validation: of other drivers.
+        limits: of the acceleration [m/s2].
+        settings: of network and learning.
+        seed: of the first weights and the order of the stretches.
+
+    Raises:
+        UnjamError: a loss is not finite.
+    """
+    torch.set_num_threads(1)
+    network = FollowingNetwork(settings, moments_of(known.pairs), seed, zero=True)
+    stretches, judged = stretches_of(known.pairs, settings.seconds), stretches_of(validation.pairs)
+    base = validation.model(judged.owner, limits)
+
+    def gap_error() -> float:
+        drove = open_loop(with_residual(base, on_rows(network.as_driver()), limits), judged)
+        return float(np.sqrt(drove.gap_square).mean())
+
+    optimizer = torch.optim.Adam(network.parameters(), lr=settings.rate)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, settings.steps)
+    generator = np.random.default_rng(seed)
+    found, kept = [gap_error()], network.weights()
+    for step in range(1, settings.steps + 1):
+        part = stretches.some(generator.choice(stretches.gap.shape[1], settings.batch))
+        loss = _loss(network, known.model(part.owner, limits, tensors=True), limits, part, settings)
+        if not torch.isfinite(loss):
+            raise UnjamError(f"following network: the loss of step {step} is not finite")
+        optimizer.zero_grad()
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(network.parameters(), LARGEST_GRADIENT)
+        optimizer.step()
+        schedule.step()
+        if step % settings.validate_every == 0:
+            found.append(gap_error())
+            if found[-1] <= min(found):
+                kept = network.weights()
+    network.load_state_dict(kept)
+    return MultiStepFit(network, found)
+
+
+def _loss(
+    network: FollowingNetwork, base: Model, limits: Limits, real: Stretches, settings: MultiStepSettings
+) -> Tensor:
+    """Return the loss of driving behind the leaders of some stretches."""
+    recorded = (real.speed, real.leader_speed, real.gap, real.leader_path)
+    speeds, leader_speeds, gaps, paths = map(_tensor, recorded)
+    present = torch.as_tensor(real.present)[1:]
+    residuals: list[Tensor] = []
+
+    def noted(inputs: Tensor) -> Tensor:
+        residuals.append(network(inputs))
+        return residuals[-1]
+
+    follow = with_residual(base, noted, limits)(speeds[0], gaps[0])
+    driven = list(drive_behind(follow, (speeds[0], gaps[0]), (leader_speeds, paths), real.step))
+    speed, gap = (torch.stack(each) for each in zip(*driven, strict=True))
+    squares = (gap - gaps[1:]).square() + (settings.speed_weight * (speed - speeds[1:])).square()
+    gap_part = ((squares * present).sum(0) / present.sum(0) + SMALLEST).sqrt().mean()
+    residual_part = torch.stack(residuals).square()[present].mean()
+    return gap_part + settings.residual_weight * residual_part

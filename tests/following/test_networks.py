@@ -1,0 +1,112 @@
+import numpy as np
+import pytest
+import torch
+
+from tests.following.made_up import follower, idm_driver
+from unjam.following.networks import (
+    FollowingNetwork,
+    Known,
+    MultiStepSettings,
+    NetworkSettings,
+    fit_multi_step,
+    fit_one_step,
+    on_rows,
+)
+from unjam.following.open_loop import Limits, idm_follow, open_loop, with_residual
+from unjam.following.pairs import Moments, moments_of, stretches_of
+from unjam.physics.idm import PAPER_IDM, IDMParameters
+from unjam.scenarios.population import residual_inputs
+
+SETTINGS = NetworkSettings(hidden=(16, 16), rate=1e-2, epochs=40, batch=128)
+
+
+@pytest.fixture(scope="module")
+def rows() -> Moments:
+    driver = IDMParameters(time_headway=1.5)
+    return moments_of([idm_driver(driver, seed=seed) for seed in range(3)])
+
+
+def test_the_papers_network_has_two_layers_of_128() -> None:
+    settings = NetworkSettings()
+    assert (settings.hidden, settings.rate, settings.batch, settings.epochs) == ((128, 128), 1e-4, 1024, 200)
+
+
+def test_its_numpy_twin_answers_the_same(rows: Moments) -> None:
+    network = FollowingNetwork(SETTINGS, rows, seed=1)
+    seen = residual_inputs(rows.speed, rows.leader_speed, rows.gap)
+    with torch.no_grad():
+        wanted = network(torch.as_tensor(seen, dtype=torch.float32)).numpy()
+    np.testing.assert_allclose(on_rows(network.as_driver())(seen), wanted, atol=1e-4)
+    stacked = seen[:20].reshape(4, 5, 3)
+    np.testing.assert_allclose(on_rows(network.as_driver())(stacked).ravel(), wanted[:20], atol=1e-4)
+
+
+def test_a_new_residual_may_be_zero(rows: Moments) -> None:
+    network = FollowingNetwork(SETTINGS, rows, seed=1, zero=True)
+    assert not network(torch.ones(4, 3)).any()
+
+
+@pytest.mark.parametrize("base", [None, idm_follow(PAPER_IDM)])
+def test_it_learns(rows: Moments, base: None) -> None:
+    network, losses = fit_one_step(rows, rows, base, SETTINGS, seed=0)
+    assert min(losses.validation) < 0.2 * losses.validation[0]
+    seen = residual_inputs(rows.speed, rows.leader_speed, rows.gap)
+    known = base(rows.speed, rows.leader_speed, rows.gap) if base else 0.0
+    error = np.square(on_rows(network.as_driver())(seen) + known - rows.acceleration).mean()
+    assert error == pytest.approx(min(losses.validation), rel=1e-2)
+
+
+def test_the_same_seed_gives_the_same_network(rows: Moments) -> None:
+    short = NetworkSettings(hidden=(8,), epochs=2)
+    one, other = (fit_one_step(rows, rows, None, short, seed=3)[1] for _ in range(2))
+    assert one == other
+
+
+def test_without_progress_it_ends(rows: Moments) -> None:
+    settings = NetworkSettings(hidden=(4,), rate=1e-12, epochs=50, patience=2)
+    still = Moments(rows.speed, rows.leader_speed, rows.gap, np.zeros(len(rows)))
+    _, losses = fit_one_step(still, rows, None, settings, seed=0)
+    assert len(losses.training) < 50
+
+
+LIMITS: Limits = (-4.0, 2.0)
+DRIVING = MultiStepSettings(hidden=(8,), seconds=6.0, batch=16, steps=30, rate=2e-2, validate_every=10)
+
+
+def eager(speed: np.ndarray, leader_speed: np.ndarray, gap: np.ndarray) -> np.ndarray:
+    """The paper's IDM, but half a m/s2 keener."""
+    return idm_follow(PAPER_IDM)(speed, leader_speed, gap) + 0.5
+
+
+def known(seeds: range) -> Known:
+    pairs = [follower(eager, f"{seed}", 20.0, seed=seed) for seed in seeds]
+    return Known(pairs, [PAPER_IDM] * len(pairs))
+
+
+def test_a_residual_learns_what_the_base_lacks_when_it_drives() -> None:
+    fitted = fit_multi_step(known(range(4)), known(range(4, 6)), LIMITS, DRIVING, seed=0)
+    assert min(fitted.validation) < 0.5 * fitted.validation[0]
+    others = known(range(6, 8))
+    stretches = stretches_of(others.pairs)
+    base = others.model(stretches.owner, LIMITS)
+    alone = open_loop(base, stretches)
+    learned = open_loop(with_residual(base, on_rows(fitted.network.as_driver()), LIMITS), stretches)
+    assert (learned.gap_square < alone.gap_square).all()
+
+
+def test_where_nothing_is_left_nothing_is_learned() -> None:
+    pairs = [follower(idm_follow(PAPER_IDM), f"{seed}", 12.0, seed=seed) for seed in range(3)]
+    perfect = Known(pairs, [PAPER_IDM] * 3)
+    settings = MultiStepSettings(hidden=(4,), seconds=3.0, batch=4, steps=2, validate_every=1)
+    fitted = fit_multi_step(perfect, perfect, LIMITS, settings, seed=0)
+    assert fitted.validation[0] == pytest.approx(0.0, abs=1e-9)
+    assert not fitted.network.as_driver()(np.ones((2, 3))).any()
+
+
+def test_the_same_seed_gives_the_same_fit() -> None:
+    settings = MultiStepSettings(hidden=(4,), seconds=3.0, batch=4, steps=2, validate_every=1)
+    one, other = (
+        fit_multi_step(known(range(2)), known(range(2, 3)), LIMITS, settings, seed=1).validation
+        for _ in range(2)
+    )
+    assert one == other
