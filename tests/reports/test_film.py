@@ -7,18 +7,18 @@ import pytest
 from PIL import Image, ImageSequence
 
 from tests.measures.test_metrics import episode_of
-from tests.reports.open_roads import merge_episode
-from unjam.errors import DiskError, InputError
-from unjam.reports.film import CAV_COLOUR, SIZE
-from unjam.reports.film import FRAMES_PER_SECOND, check_format, write_video
-from unjam.worlds.record import Episode
-from pathlib import Path
-
-import numpy as np
-import pytest
-
 from tests.reports.open_roads import merge_episode, own_episode
-from unjam.reports.film import CAV_COLOUR, SIZE, draw_road, scenes, split_lines
+from unjam.errors import DiskError, InputError
+from unjam.reports.film import (
+    CAV_COLOUR,
+    FRAMES_PER_SECOND,
+    SIZE,
+    check_format,
+    draw_road,
+    scenes,
+    split_lines,
+    write_video,
+)
 from unjam.worlds.record import Episode
 from unjam.worlds.sumo.traffic import Scene
 

@@ -1,25 +1,9 @@
-import json
-from pathlib import Path
-from typing import Any
-
-import numpy as np
-import pytest
-
-from unjam.reports.model import (
-    NUMBERS,
-    bound_of,
-    cells,
-    error_rows,
-    error_text,
-    headings,
-    model_section,
-    trust_of,
-    verdict_of,
-)
-from unjam.reports.results import Results
 import base64
+import json
 import re
 from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -27,7 +11,21 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from unjam.reports.figures import data_uri
-from unjam.reports.model import errors, examples, trust
+from unjam.reports.model import (
+    NUMBERS,
+    bound_of,
+    cells,
+    error_rows,
+    error_text,
+    errors,
+    examples,
+    headings,
+    model_section,
+    trust,
+    trust_of,
+    verdict_of,
+)
+from unjam.reports.results import Results
 
 MEMBERS, MOMENTS, EXAMPLES = 4, 20, 2
 
