@@ -227,9 +227,8 @@ def learning_curve(runs: dict[str, list[dict[str, Any]]], references: dict[str, 
         steps = np.array([row["actual_steps"] for row in rows]) / 1000
         prefix = f"{label}: " if len(runs) > 1 else ""
         training = [row["return_mean"] for row in rows]
-        axes.plot(
-            steps, training, color=colour, lw=1, alpha=0.45, label=f"{prefix}training, with exploration"
-        )
+        label = f"{prefix}training, with exploration"
+        axes.plot(steps, training, color=colour, lw=1, alpha=0.45, label=label)
         validated = [(0.0, rows[0]["return_expert"])]  # the policy starts as exactly its expert
         validated += [(step, row["return_validation"]) for step, row in zip(steps, rows, strict=True)]
         points = np.array([point for point in validated if point[1] is not None], float).reshape(-1, 2)
@@ -248,10 +247,8 @@ def learning_curve(runs: dict[str, list[dict[str, Any]]], references: dict[str, 
 @rc_context(STYLE)
 def time_split(progress: Sequence[dict[str, Any]]) -> Figure:
     """Draw how the wall time of training divides among its parts."""
-    totals: dict[str, float] = {}
-    for row in progress:
-        for part, seconds in row["seconds"].items():
-            totals[part] = totals.get(part, 0.0) + seconds
+    parts = dict.fromkeys(part for row in progress for part in row["seconds"])
+    totals = {part: sum(row["seconds"].get(part, 0.0) for row in progress) for part in parts}
     figure = new_figure(1.5)
     axes = figure.subplots()
     start = 0.0

@@ -1,7 +1,6 @@
 """One moment of a road and a film of many, drawn without a display; environments render with it too."""
 
 from collections.abc import Iterator, Sequence
-from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -69,7 +68,7 @@ def draw_road(scene: Scene, fastest: float, words: str) -> Image.Image:
         (pixels / 2, pixels / 2) if inside else (corner, corner),
         words,
         fill=INK,
-        font=_font(),
+        font=ImageFont.load_default(22 * OVERSAMPLING),
         anchor="mm" if inside else "la",
         align="center" if inside else "left",
         spacing=12,
@@ -98,11 +97,6 @@ def _filled(line: np.ndarray, spacing: float) -> np.ndarray:
     along = np.append(0.0, lengths.cumsum())
     wanted = np.linspace(0.0, along[-1], 2 + int(along[-1] / spacing))
     return np.column_stack([np.interp(wanted, along, line[:, axis]) for axis in (0, 1)])
-
-
-@lru_cache(maxsize=1)
-def _font() -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
-    return ImageFont.load_default(22 * OVERSAMPLING)
 
 
 def scenes(episode: Episode, moments: Sequence[int]) -> Iterator[Scene]:

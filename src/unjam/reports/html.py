@@ -78,12 +78,6 @@ def render(results: Sequence[Results]) -> str:
         columns=columns,
         episodes=list(dict.fromkeys((min(counts), max(counts)))),
         table=table_of(columns),
-        failures=[
-            f"{column.name} seed {row['seed']}: {row['reason']}"
-            for column in columns
-            for row in column.rows
-            if row["status"] == "failed"
-        ],
         sources=[(name, result, command_to_repeat(result)) for name, result in sources],
         style=Markup(style),
         script=Markup(script),
