@@ -9,7 +9,7 @@ from IPython.display import HTML
 
 from unjam.measures.metrics import METRICS
 from unjam.measures.statistics import estimate
-from unjam.reports.model_story import error_text
+from unjam.reports.model import error_text
 
 RESULTS = Path(__file__).parent.parent / "results"
 

@@ -125,6 +125,16 @@ def test_reports_read_folders_and_know_neither_learners_nor_trainings() -> None:
             assert not own_imports(tree) & {"learners", "training", "studies", "controller", "cli"}, module
 
 
+def test_what_measures_draws_nothing() -> None:
+    drawing = {"matplotlib", "PIL"}
+    for module in importers(drawing):
+        assert part_of(module) != "measures", module
+    for module, tree in MODULES.items():
+        if part_of(module) == "measures":
+            assert "reports" not in own_imports(tree), module
+    assert not loaded_by("import unjam.measures.metrics, unjam.measures.statistics") & drawing
+
+
 def test_sumo_is_imported_in_one_place() -> None:
     assert importers({"libsumo", "traci", "sumolib"}) == {"worlds/sumo/simulation.py"}
 

@@ -10,14 +10,13 @@ import pytest
 from matplotlib.figure import Figure
 
 from tests.measures.test_metrics import LENGTH, episode_of
-from tests.reports.test_model_story import facts_of, progress_of
+from tests.reports.test_model import facts_of, progress_of
 from unjam import __version__
 from unjam.errors import DiskError, InputError
 from unjam.files import to_json
 from unjam.measures.metrics import METRICS, measure
 from unjam.reports.figures import learning_curve
-from unjam.reports.html import write_report
-from unjam.reports.replay import REPLAY_SECONDS
+from unjam.reports.html import REPLAY_SECONDS, write_report
 from unjam.reports.results import read_results
 from unjam.training.evaluate import Evaluation, save_evaluation
 from unjam.worlds.record import Episode, failed_episode
@@ -143,20 +142,18 @@ def test_a_page_loads_nothing_from_anywhere_else(written: tuple[str, Page]) -> N
 
 def test_pictures_inside_the_page_load_nothing_either(written: tuple[str, Page]) -> None:
     _, page = written
-    addresses = [tag.get("src", tag.get("srcset", "")) for tag in page.of("img") + page.of("source")]
-    drawings = [base64.b64decode(address.partition(",")[2]) for address in addresses if "svg" in address[:20]]
+    drawings = [base64.b64decode(image["src"].partition(",")[2]) for image in page.of("img")]
     assert drawings
     for drawing in drawings:
         assert not re.search(rb'(href|src)="(?!#|data:)', drawing)
 
 
-def test_a_run_has_all_its_pictures_for_both_screens(written: tuple[str, Page]) -> None:
+def test_a_run_has_all_its_pictures_once_for_all_screens(written: tuple[str, Page]) -> None:
     _, page = written
-    assert len(page.of("img")) == len(page.of("source")) == 4
+    assert len({image["src"] for image in page.of("img")}) == len(page.of("img")) == 4
     assert all(len(image["alt"]) > 20 for image in page.of("img"))
-    assert all("max-width" in source["media"] for source in page.of("source"))
-    for image, source in zip(page.of("img"), page.of("source"), strict=True):
-        assert image["src"] != source["srcset"]
+    assert all(image["src"].startswith("data:image/svg+xml;base64,") for image in page.of("img"))
+    assert not page.of("source")
 
 
 def test_drives_have_no_learning_curve(tmp_path: Path) -> None:
@@ -170,9 +167,9 @@ def test_lines_of_the_learning_curve_are_the_drivers_that_do_not_learn(
 ) -> None:
     drawn = []
 
-    def spy(runs: dict[str, Any], references: dict[str, float], wide: bool) -> Figure:
+    def spy(runs: dict[str, Any], references: dict[str, float]) -> Figure:
         drawn.append((list(runs), references))
-        return learning_curve(runs, references, wide)
+        return learning_curve(runs, references)
 
     monkeypatch.setattr("unjam.reports.html.learning_curve", spy)
     write_report([run], tmp_path / "page.html")

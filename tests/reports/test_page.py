@@ -164,18 +164,33 @@ def test_nothing_is_wider_than_the_screen(
     assert page.evaluate("document.documentElement.scrollWidth") <= size[0]
     too_wide = page.evaluate(
         """width => [...document.querySelectorAll("body *")].filter(found =>
-             !found.parentElement.closest(".scroll, pre") && found.getBoundingClientRect().right > width + 0.5
+             !found.parentElement.closest(".scroll, .picture, pre") &&
+             found.getBoundingClientRect().right > width + 0.5
            ).map(found => found.outerHTML.slice(0, 80))""",
         size[0],
     )
     assert too_wide == []
 
 
-def test_a_phone_gets_pictures_of_its_own(open_page: Opener, driven: Path) -> None:
-    shape = "all => all.map(image => image.naturalHeight / image.naturalWidth)"
-    wide = open_page(driven, LAPTOP).page.eval_on_selector_all("img", shape)
-    narrow = open_page(driven, PHONE).page.eval_on_selector_all("img", shape)
-    assert all(high > low * 1.3 for high, low in zip(narrow, wide, strict=True))
+def test_a_picture_fills_a_laptop_and_stays_legible_on_a_phone_that_moves_it(
+    open_page: Opener, driven: Path
+) -> None:
+    sizes = """all => all.map(each => [each.clientWidth, each.scrollWidth, each.firstChild.clientWidth,
+                 getComputedStyle(each, "::before").content.includes("swipe")])"""
+    page = open_page(driven, LAPTOP).page
+    for visible, whole, picture, hinted in page.eval_on_selector_all(".picture", sizes):
+        assert visible == whole == picture > 1000
+        assert not hinted
+    page = open_page(driven, PHONE).page
+    for visible, whole, picture, hinted in page.eval_on_selector_all(".picture", sizes):
+        assert visible < 390 < 700 < whole == picture
+        assert hinted
+    page.eval_on_selector(".picture", "moved => moved.scrollLeft = 1000")
+    box = page.locator(".picture img").first.bounding_box()
+    assert box is not None
+    assert box["x"] + box["width"] <= 390
+    shape = "all => all.map(image => image.naturalHeight / image.naturalWidth - image.height / image.width)"
+    assert all(abs(off) < 0.01 for off in page.eval_on_selector_all("img", shape)), "as it was drawn"
 
 
 def test_the_replay_shows_the_vehicles_of_every_driver(open_page: Opener, driven: Path) -> None:

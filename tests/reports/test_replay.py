@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from tests.reports.open_roads import merge_episode, own_episode, shown_from
-from unjam.reports.replay import _share, replay_data
+from unjam.reports.html import _share, replay_data
 from unjam.reports.results import Shown
 
 

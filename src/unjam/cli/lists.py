@@ -83,7 +83,7 @@ def _draw(scenario: Any, name: str, path: Path) -> None:
     from io import BytesIO
 
     from unjam.files import check_folder, write_whole
-    from unjam.reports.road_picture import draw_road
+    from unjam.reports.film import draw_road
     from unjam.scenarios.road import ClosedRoad
     from unjam.worlds.sumo import make_traffic
     from unjam.worlds.sumo.simulation import Simulation

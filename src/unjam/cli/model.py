@@ -27,7 +27,7 @@ def model(
 
     from unjam.cli.output import aside, console, print_json
     from unjam.reports.html import write_report
-    from unjam.reports.model_story import bound_of, cells, error_rows, headings, trust_of, verdict_of
+    from unjam.reports.model import bound_of, cells, error_rows, headings, trust_of, verdict_of
     from unjam.reports.results import read_progress
     from unjam.training.folder import read_config
     from unjam.training.model_facts import newest_model_facts

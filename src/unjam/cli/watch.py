@@ -58,7 +58,7 @@ def watch(
     from unjam.drivers.registry import describe
     from unjam.files import check_folder
     from unjam.measures.metrics import measure
-    from unjam.reports.video import check_format, write_video
+    from unjam.reports.film import check_format, write_video
     from unjam.scenarios.registry import make_scenario
     from unjam.training.evaluate import raise_failure
     from unjam.training.watch import watch_in_window

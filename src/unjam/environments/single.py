@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from unjam.drivers.observation import FeatureName
 from unjam.environments.road import SteppedRoad
 from unjam.errors import InputError
-from unjam.reports.road_picture import draw_road
+from unjam.reports.film import draw_road
 
 Observation = NDArray[Any]
 

@@ -1,32 +1,39 @@
 """The report: one HTML page with everything in it, no network needed."""
 
+import base64
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
+import numpy as np
 from jinja2 import Environment, StrictUndefined
-from markupsafe import Markup, escape
+from markupsafe import Markup
 from matplotlib.figure import Figure
 
 from unjam import __version__
 from unjam.files import check_folder, write_whole
 from unjam.measures.statistics import estimate
 from unjam.reports.figures import (
+    colour_table,
     data_uri,
     learning_curve,
     over_time,
     space_time,
+    speed_scale,
     time_split,
 )
-from unjam.reports.model_figures import errors, examples, trust
-from unjam.reports.model_story import model_section
-from unjam.reports.replay import replay_data
+from unjam.reports.film import split_lines
+from unjam.reports.model import errors, examples, model_section, trust
 from unjam.reports.results import Results, Shown, command_to_repeat, read_results
-from unjam.reports.story import Column, cards_of, columns_of, lead_of, names_of, notes_of, table_of, title_of
+from unjam.reports.story import cards_of, columns_of, lead_of, names_of, notes_of, table_of, title_of
+from unjam.scenarios.scenario import VEHICLE_LENGTH
 
 MOST_PANELS = 6
+REPLAY_SECONDS = 0.5
+"""time between two frames of the replay [s]"""
 
 
 def write_report(folders: Sequence[Path], target: Path) -> Path:
@@ -37,105 +44,63 @@ def write_report(folders: Sequence[Path], target: Path) -> Path:
         DiskError: the page cannot be written, or there is no folder for it.
     """
     check_folder(target)
-    results = [read_results(folder) for folder in folders]
-    write_whole(target, render(results))
+    write_whole(target, render([read_results(folder) for folder in folders]))
     return target
 
 
 def render(results: Sequence[Results]) -> str:
     """Return the page as text."""
-    page = files("unjam.reports") / "page"
-    columns = columns_of(results)
-    panels = [_renamed(column) for column in columns if column.shown is not None][:MOST_PANELS]
-    pictures = _pictures(results, panels)
+    template, style, script = (
+        (files("unjam.reports") / "page" / name).read_text(encoding="utf-8")
+        for name in ("report.html", "report.css", "replay.js")
+    )
     environment = Environment(
         autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
-    template = environment.from_string((page / "report.html").read_text(encoding="utf-8"))
+    columns = columns_of(results)
+    panels = [replace(column.shown, driver=column.name) for column in columns if column.shown is not None]
+    panels = panels[:MOST_PANELS]
     single = results[0] if len(results) == 1 else None
-    names = names_of(results)
-    return template.render(
+    sources = list(zip(names_of(results), results, strict=True))
+    counts = [len(column.rows) for column in columns]
+    drawn = [", ".join(f"{key} {value:g} m" for key, value in episode.drawn.items()) for episode in panels]
+    return environment.from_string(template).render(
         version=__version__,
         title=title_of(results),
-        lead=lead_of(single)
-        if single
-        else " ".join(f"{name}: {lead_of(result)}" for name, result in zip(names, results, strict=True)),
-        notes=[
-            note if single else f"{name}: {note}"
-            for name, result in zip(names, results, strict=True)
-            for note in notes_of(result)
-        ],
+        single=single is not None,
+        leads=[(name, lead_of(result)) for name, result in sources],
+        notes=[(name, note) for name, result in sources for note in notes_of(result)],
         cards=cards_of(single) if single else [],
-        pictures=pictures,
-        picture=lambda name, text: _picture(pictures[name], text),
-        panels_note=_panels_note(panels, len(columns)),
-        over_time_title="Speed, gap and waves over time"
-        if all(episode.closed for episode in panels)
-        else "Speed, waves and queues over time",
-        learning_note="Validation uses fixed seeds and chooses the controller; the table uses other seeds.",
+        pictures={name: data_uri(figure) for name, figure in _pictures(results, panels).items()},
+        panels=panels,
+        drawn=list(dict.fromkeys(drawn)),
         model=model_section(single) if single else None,
-        columns=[column.name for column in columns],
+        columns=columns,
+        episodes=list(dict.fromkeys((min(counts), max(counts)))),
         table=table_of(columns),
-        table_note=_table_note(columns),
-        failures="; ".join(
-            f"{column.name} seed {row['seed']}: {row['reason']}"
-            for column in columns
-            for row in column.rows
-            if row["status"] == "failed"
-        ),
-        sources=[_source(result, name) for result, name in zip(results, names, strict=True)],
-        style=Markup((page / "report.css").read_text(encoding="utf-8")),
-        script=Markup((page / "replay.js").read_text(encoding="utf-8")),
+        sources=[(name, result, command_to_repeat(result)) for name, result in sources],
+        style=Markup(style),
+        script=Markup(script),
         replay_data=Markup(json.dumps(replay_data(panels)).replace("<", "\\u003c")),
     )
 
 
-def _renamed(column: Column) -> Shown:
-    assert column.shown is not None
-    return Shown(**{**vars(column.shown), "driver": column.name})
-
-
-def _panels_note(panels: Sequence[Shown], drivers: int) -> str:
-    """Return what the panels have in common, and whether all drivers are among them."""
-    drawn = [", ".join(f"{key} {value:g} m" for key, value in episode.drawn.items()) for episode in panels]
-    if len(set(drawn)) == 1:
-        note = "the same traffic and seed in each panel" + (f" ({drawn[0]})" if drawn[0] else "")
-    else:
-        note = "different roads or traffic in the panels"
-    return note + (f"; the first {len(panels)} of {drivers} drivers" if len(panels) < drivers else "")
-
-
-def _table_note(columns: Sequence[Column]) -> str:
-    counts = sorted({len(column.rows) for column in columns})
-    episodes = " to ".join(str(count) for count in dict.fromkeys((counts[0], counts[-1])))
-    return (
-        f"Mean over {episodes} episodes, deterministic drivers, fixed seeds; in brackets the 95 % bootstrap "
-        "interval."
-    )
-
-
-def _pictures(results: Sequence[Results], panels: Sequence[Shown]) -> dict[str, tuple[str, str]]:
-    """Return each picture as two `data:` addresses: for a screen, and for a phone."""
-    pictures: dict[str, tuple[str, str]] = {}
-
-    def add(name: str, kind: Literal["png", "svg"], draw: Callable[[bool], Figure]) -> None:
-        pictures[name] = (data_uri(draw(True), kind), data_uri(draw(False), kind))
-
+def _pictures(results: Sequence[Results], panels: Sequence[Shown]) -> dict[str, Figure]:
+    """Return the pictures that there are, by name."""
+    pictures: dict[str, Figure] = {}
     if panels:
-        add("space_time", "png", lambda wide: space_time(panels, wide))
-        add("over_time", "svg", lambda wide: over_time(panels, wide))
+        pictures |= {"space_time": space_time(panels), "over_time": over_time(panels)}
     named = zip(names_of(results), results, strict=True)
     runs = {name: result.progress for name, result in named if result.progress}
     if runs:
-        references = _references(results)
-        add("learning_curve", "svg", lambda wide: learning_curve(runs, references, wide))
+        pictures["learning_curve"] = learning_curve(runs, _references(results))
     if len(results) == 1 and results[0].progress:
         progress, model = results[0].progress, results[0].model
-        add("time_split", "svg", lambda wide: time_split(progress, wide))
+        pictures["time_split"] = time_split(progress)
         if model is not None:
-            add("model_examples", "svg", lambda wide: examples(model, wide))
-            add("model_errors", "svg", lambda wide: errors(model, wide))
-            add("model_trust", "svg", lambda wide: trust(progress, model, wide))
+            pictures["model_examples"] = examples(model)
+            pictures["model_errors"] = errors(model)
+            pictures["model_trust"] = trust(progress, model)
     return pictures
 
 
@@ -156,23 +121,79 @@ def _references(results: Sequence[Results]) -> dict[str, float]:
     return found
 
 
-def _picture(both: tuple[str, str], text: str) -> Markup:
-    wide, narrow = both
-    small = f'<source media="(max-width: 640px)" srcset="{narrow}">'
-    return Markup(f'<picture>{small}<img src="{wide}" alt="{escape(text)}"></picture>')
-
-
-def _source(result: Results, name: str) -> dict[str, Any]:
-    about = result.about.get("manifest", {})
-    packages = ", ".join(
-        f"{name} {version}" for name, version in about.get("packages", {}).items() if version
-    )
-    commit = f", commit {about['commit']}" if about.get("commit") else ""
-    made_with = f"unjam {about.get('unjam')}{commit}, Python {about.get('python')}, {packages}"
-    facts = f"{made_with}; {about.get('started', '')}."
+def replay_data(panels: Sequence[Shown]) -> dict[str, Any]:
+    """Return what the page's replay needs: positions and speeds at a few frames a second."""
+    if not panels:
+        return {"drivers": []}
+    step = max(REPLAY_SECONDS, *(episode.step for episode in panels))
+    frames = 1 + int(max(episode.times[-1] for episode in panels) / step + 1e-9)
     return {
-        "name": name,
-        "command": command_to_repeat(result),
-        "facts": facts,
-        "config": result.config,
+        "step": step,
+        "frames": frames,
+        "start": 0,
+        "fastest": speed_scale(panels).vmax,
+        "colours": colour_table(),
+        "vehicle_length": VEHICLE_LENGTH,
+        "drivers": [{"name": episode.driver, **_replayed(episode, step, frames)} for episode in panels],
     }
+
+
+def _replayed(episode: Shown, step: float, frames: int) -> dict[str, Any]:
+    """Return where the vehicles are and how fast, along a loop or on the plane, and the road's lines.
+
+    A line is rows (coordinate along the road, x, y) [m]. An episode that ended before stays as at its end.
+    """
+    moments = np.round(np.arange(frames) * step / episode.step).astype(int)
+    moments = moments.clip(max=len(episode.speeds) - 1)
+    speeds = episode.speeds[moments]
+    if episode.closed:
+        return {
+            "vehicles": speeds.shape[1],
+            "cavs": episode.cavs,
+            "loop_length": episode.loop_length,
+            "speeds": _base64(speeds),
+            "positions": _base64(episode.positions[moments]),
+            "lines": [np.round(episode.outline, 2).tolist()],
+        }
+    is_cav = np.isin(np.arange(speeds.shape[1]), episode.cavs)
+    cavs, people = (_share(~np.isnan(speeds), chosen) for chosen in (is_cav, ~is_cav))
+    columns = [*cavs, *people]
+    values = np.concatenate([episode.places[moments], speeds[..., None]], axis=-1)
+    packed = np.full((frames, len(columns), 4), np.nan, np.float32)
+    for number, vehicles in enumerate(columns):
+        for vehicle in vehicles:
+            there = ~np.isnan(speeds[:, vehicle])
+            packed[there, number] = values[there, vehicle]
+    lines = split_lines(episode.lines)
+    return {
+        "vehicles": len(columns),
+        "cavs": list(range(len(cavs))),
+        "loop_length": None,
+        "speeds": _base64(packed[..., 3]),
+        "places": _base64(packed[..., :3]),
+        "lines": [np.column_stack([np.zeros(len(line)), line]).round(1).tolist() for line in lines],
+    }
+
+
+def _share(there: np.ndarray, chosen: np.ndarray) -> list[list[int]]:
+    """Return groups of the `chosen` vehicles that are never on the road together: a column for each will do.
+
+    `there`, shape (frames, vehicles), says when each is on the road; an empty frame lies between two.
+    """
+    stays = {
+        int(vehicle): np.flatnonzero(there[:, vehicle])[[0, -1]]
+        for vehicle in np.flatnonzero(chosen)
+        if there[:, vehicle].any()
+    }
+    groups: list[list[int]] = []
+    for vehicle in sorted(stays, key=lambda vehicle: stays[vehicle][0]):
+        free = [group for group in groups if stays[group[-1]][1] + 1 < stays[vehicle][0]]
+        if free:
+            free[0].append(vehicle)
+        else:
+            groups.append([vehicle])
+    return groups
+
+
+def _base64(array: np.ndarray) -> str:
+    return base64.b64encode(np.ascontiguousarray(array, "<f4").tobytes()).decode()

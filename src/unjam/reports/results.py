@@ -15,7 +15,6 @@ from unjam.errors import InputError
 
 Floats = NDArray[np.float32]
 
-
 EVALUATION_FILE = "evaluation.json"
 """what was measured of each driver"""
 MODEL_FILE = "model.json"
@@ -26,34 +25,28 @@ PICTURED = ("speeds", "positions", "gaps", "outline", "waiting", "lines", "place
 
 @dataclass(frozen=True)
 class Shown:
-    """The episode of one driver that pictures show; T decisions, N vehicles. All share one seed."""
+    """What pictures show of one driver's episode: as in an `Episode`, but for its driver.
+
+    All drivers of a folder share one seed. T decisions, N vehicles; speeds, positions and gaps have the shape
+    (T + 1, N).
+    """
 
     driver: str
     step: float
-    """time between two decisions [s]"""
     loop_length: float
     crossings: list[list[float]]
-    """where along the road it crosses itself [m]"""
     limit_speed: float
     drawn: dict[str, float]
     vehicle_ids: list[str]
     cav_ids: list[str]
     speeds: Floats
-    """[m/s], shape (T + 1, N); NaN where a vehicle is not on the road"""
     positions: Floats
-    """along the route, not wrapped [m], shape (T + 1, N)"""
     gaps: Floats
-    """to the vehicle ahead [m], shape (T + 1, N)"""
     outline: Floats
-    """a closed road's centre line: rows (coordinate along the route, x, y) [m]"""
     branches: list[str]
-    """where each vehicle of a merging road came from"""
     waiting: Floats
-    """vehicles that want to enter and cannot, shape (T + 1,); empty of a closed road"""
     lines: Floats
-    """lanes of a road with ends: rows (x, y) [m], a row of NaN between two"""
     places: Floats
-    """(x, y, heading) of vehicles on a road with ends [m, rad], shape (T + 1, N, 3)"""
 
     @property
     def closed(self) -> bool:
@@ -68,8 +61,7 @@ class Shown:
     @property
     def cavs(self) -> list[int]:
         """Columns of the CAVs."""
-        column = {name: index for index, name in enumerate(self.vehicle_ids)}
-        return [column[name] for name in self.cav_ids]
+        return [self.vehicle_ids.index(name) for name in self.cav_ids]
 
 
 @dataclass(frozen=True)
@@ -107,27 +99,23 @@ def read_results(folder: Path) -> Results:
         hint = "; go on with: unjam train --resume" if (folder / "config.toml").exists() else ""
         raise InputError(f"report: {str(folder)!r} has no {EVALUATION_FILE}{hint}")
     try:
-        return _results(folder, json.loads(path.read_text()), load_file(folder / "shown.safetensors"))
+        about, arrays = json.loads(path.read_text()), load_file(folder / "shown.safetensors")
+        rows, shown = rows_by_driver(about.pop("rows")), {}
+        for number, entry in enumerate(about.pop("shown")):
+            entry.pop("seed", None)
+            pictured: dict[str, Any] = {name: arrays[f"{number}.{name}"] for name in PICTURED}
+            shown[entry["driver"]] = Shown(**_with_nan(entry), **pictured)
+        config = _text(folder / "config.toml")
+        return Results(folder, about, rows, shown, read_progress(folder), config, read_model(folder))
     except (OSError, ValueError, LookupError, TypeError, AttributeError, SafetensorError) as error:
         raise InputError(f"report: {str(folder)!r} cannot be read: {type(error).__name__}: {error}") from None
-
-
-def _results(folder: Path, about: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> Results:
-    rows = rows_by_driver(about.pop("rows"))
-    shown = {}
-    for number, entry in enumerate(about.pop("shown")):
-        values: dict[str, Any] = {key: _nan(value) for key, value in entry.items() if key != "seed"}
-        values |= {name: arrays[f"{number}.{name}"] for name in PICTURED}
-        shown[entry["driver"]] = Shown(**values)
-    config = _text(folder / "config.toml")
-    return Results(folder, about, rows, shown, read_progress(folder), config, read_model(folder))
 
 
 def rows_by_driver(rows: list[dict[str, Any]]) -> dict[str, list[dict[str, Any]]]:
     """Return the rows of an `evaluation.json` by driver, NaN where it has null."""
     found: dict[str, list[dict[str, Any]]] = {}
     for row in rows:
-        found.setdefault(row["driver"], []).append({key: _nan(value) for key, value in row.items()})
+        found.setdefault(row["driver"], []).append(_with_nan(row))
     return found
 
 
@@ -156,16 +144,16 @@ def read_model(folder: Path) -> dict[str, Any] | None:
     return found if isinstance(found, dict) else None
 
 
-def _text(path: Path) -> str:
-    return path.read_text() if path.exists() else ""
-
-
-def _nan(value: Any) -> Any:
-    """JSON has no NaN; null stands for it."""
-    return float("nan") if value is None else value
-
-
 def command_to_repeat(results: Results) -> str:
     """Return the command line that made a folder."""
     command = results.about.get("manifest", {}).get("command", [])
     return shlex.join(str(word) for word in command)
+
+
+def _text(path: Path) -> str:
+    return path.read_text() if path.exists() else ""
+
+
+def _with_nan(entry: dict[str, Any]) -> dict[str, Any]:
+    """JSON has no NaN; null stands for it."""
+    return {key: float("nan") if value is None else value for key, value in entry.items()}

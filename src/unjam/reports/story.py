@@ -72,24 +72,12 @@ def title_of(results: Sequence[Results]) -> str:
 def lead_of(result: Results) -> str:
     """Return the main finding of a folder in a sentence or two, whichever way it went."""
     if result.trained is None:
-        if len(result.rows) > 1:
-            return _lead_of_several(result)
-        label, rows = next(iter(result.rows.items()))
-        speed, ratio = (
-            estimate([row[name] for row in rows]) for name in ("mean_speed", "speed_limit_ratio_steady")
-        )
-        if speed.count == 0:
-            return f"{label} on {result.about['scenario']}: all {len(rows)} episodes failed."
-        return (
-            f"{label} on {result.about['scenario']}, {len(rows)} episodes: all vehicles drive "
-            f"{speed.mean:.2f} m/s on average, and in steady state {100 * ratio.mean:.0f} % of the limit."
-        )
+        return _lead_of_drives(result)
     trained, expert = result.rows[result.trained], result.rows.get(result.about["expert"])
+    earned = estimate([row["return"] for row in trained]).mean
     if expert is None:
-        earned = estimate([row["return"] for row in trained])
-        return f"On {len(trained)} held-out seeds the trained controller earns {earned.mean:.0f} an episode."
+        return f"On {len(trained)} held-out seeds the trained controller earns {earned:.0f} an episode."
     gain = paired_difference(trained, expert, "return")
-    means = [estimate([row["return"] for row in rows]).mean for rows in (trained, expert)]
     if np.isnan(gain.low):
         verdict = "One seed has no interval: it shows nothing."
     elif gain.low > 0:
@@ -98,30 +86,40 @@ def lead_of(result: Results) -> str:
         verdict = "The residual makes it worse."
     else:
         verdict = "No gain is shown: the interval holds zero."
+    alone = estimate([row["return"] for row in expert]).mean
     return (
-        f"On {gain.count} held-out seeds the trained controller earns {means[0]:.0f} an episode, its expert "
-        f"{result.about['expert']} alone {means[1]:.0f}: {signed(gain)}. {verdict}"
+        f"On {gain.count} held-out seeds the trained controller earns {earned:.0f} an episode, its expert "
+        f"{result.about['expert']} alone {alone:.0f}: {signed(gain)}. {verdict}"
     )
 
 
-def _lead_of_several(result: Results) -> str:
+def _lead_of_drives(result: Results) -> str:
     """Return how fast all vehicles drive with each driver."""
-    found = {
+    scenario = result.about["scenario"]
+    ratios = {
         label: estimate([row["speed_limit_ratio_steady"] for row in rows])
         for label, rows in result.rows.items()
     }
-    words = ", ".join(
-        f"{label} {100 * ratio.mean:.0f}\u00a0%" if ratio.count else f"{label} failed"
-        for label, ratio in found.items()
+    if len(ratios) > 1:
+        words = ", ".join(
+            f"{label} {100 * ratio.mean:.0f}\u00a0%" if ratio.count else f"{label} failed"
+            for label, ratio in ratios.items()
+        )
+        return f"Mean speed of all vehicles in steady state on {scenario}, of the limit: {words}."
+    [(label, rows)] = result.rows.items()
+    speed = estimate([row["mean_speed"] for row in rows])
+    if speed.count == 0:
+        return f"{label} on {scenario}: all {len(rows)} episodes failed."
+    return (
+        f"{label} on {scenario}, {len(rows)} episodes: all vehicles drive {speed.mean:.2f} m/s on average, "
+        f"and in steady state {100 * ratios[label].mean:.0f}\u00a0% of the limit."
     )
-    return f"Mean speed of all vehicles in steady state on {result.about['scenario']}, of the limit: {words}."
 
 
 def signed(gain: Estimate) -> str:
     """Return a difference with its sign and, where it has one, its interval."""
-    if np.isnan(gain.low):
-        return f"{gain.mean:+.0f}"
-    return f"{gain.mean:+.0f} [{gain.low:+.0f}, {gain.high:+.0f}]"
+    interval = "" if np.isnan(gain.low) else f" [{gain.low:+.0f}, {gain.high:+.0f}]"
+    return f"{gain.mean:+.0f}{interval}"
 
 
 def notes_of(result: Results) -> list[str]:
@@ -138,11 +136,10 @@ def _notes_of(result: Results, label: str) -> list[str]:
         notes.append(f"{label} ended in a collision in {crashes} of {len(rows)} episodes.")
     closest = min((row["min_headway"] for row in rows if np.isfinite(row["min_headway"])), default=np.inf)
     if closest < CLOSE_HEADWAY:
+        blamed = " The reward (released) does not ask for distance."
         notes.append(
-            f"{label} drives close: its smallest time headway is {closest:.2f} s. The reward "
-            f"({result.about['reward']}) does not ask for distance."
-            if result.about["reward"] == "released"
-            else f"{label} drives close: its smallest time headway is {closest:.2f} s."
+            f"{label} drives close: its smallest time headway is {closest:.2f} s."
+            + (blamed if result.about["reward"] == "released" else "")
         )
     ratio = estimate([row["speed_limit_ratio_steady"] for row in rows]).mean
     if ratio > BEYOND_LIMIT:
@@ -166,47 +163,45 @@ def cards_of(result: Results) -> list[dict[str, str]]:
         return []
     label = result.trained or next(iter(result.rows))
     rows = result.rows[label]
-
     human = [] if label == "human" else result.rows.get("human", [])
-
-    def card(title: str, name: str, digits: int, unit: str, scale: float = 1.0) -> dict[str, str]:
-        def mean(of: list[dict[str, Any]]) -> str:
-            found = estimate([row[name] for row in of])
-            return f"{scale * found.mean:.{digits}f} {unit}" if found.count else "–"
-
-        return _card(title, mean(rows), f"all-human: {mean(human)}" if human else label)
-
     closed = all(episode.closed for episode in result.shown.values())
-    cards = [
-        card("Mean speed / limit, steady", "speed_limit_ratio_steady", 0, "%", 100.0),
-        card("Speed std across vehicles, steady", "speed_std_fleet_steady", 2, "m/s")
+    figures = (
+        ("Mean speed / limit, steady", "speed_limit_ratio_steady", 0, "%", 100.0),
+        ("Speed std across vehicles, steady", "speed_std_fleet_steady", 2, "m/s", 1.0)
         if closed
-        else card("Vehicles that left the road", "throughput_veh_per_h", 0, "per hour"),
-        card("Fuel", "fuel_ml_per_km", 0, "ml/km"),
-    ]
+        else ("Vehicles that left the road", "throughput_veh_per_h", 0, "per hour", 1.0),
+        ("Fuel", "fuel_ml_per_km", 0, "ml/km", 1.0),
+    )
+    cards = []
+    for title, name, digits, unit, scale in figures:
+        found, people = (estimate([row[name] for row in of]) for of in (rows, human))
+        value, beside = (
+            f"{scale * each.mean:.{digits}f} {unit}" if each.count else "–" for each in (found, people)
+        )
+        detail = f"all-human: {beside}" if human else label
+        cards.append({"label": title, "value": value, "detail": detail})
     expert = result.rows.get(result.about.get("expert", ""))
     if result.trained and expert is not None:
         gain = paired_difference(rows, expert, "return")
         detail = "of one seed" if np.isnan(gain.low) else f"95 % interval {gain.low:+.0f} to {gain.high:+.0f}"
-        cards.insert(0, _card("Return beyond the expert", f"{gain.mean:+.0f}", detail))
+        cards.insert(0, {"label": "Return beyond the expert", "value": f"{gain.mean:+.0f}", "detail": detail})
     return cards
-
-
-def _card(label: str, value: str, detail: str) -> dict[str, str]:
-    return {"label": label, "value": value, "detail": detail}
 
 
 def table_of(columns: Sequence[Column]) -> list[dict[str, Any]]:
     """Return the table of all metrics: a row per metric, a cell per column, mean and 95 % interval."""
-    table = []
-    for name, metric in METRICS.items():
-        cells = []
-        for column in columns:
-            found = estimate([row[name] for row in column.rows])
-            cells.append(cell_of(found, metric.digits, len(column.rows)))
-        about = " ".join((metric.function.__doc__ or "").split())
-        table.append({"label": metric.label, "unit": metric.unit, "about": about, "cells": cells})
-    return table
+    return [
+        {
+            "label": metric.label,
+            "unit": metric.unit,
+            "about": " ".join((metric.function.__doc__ or "").split()),
+            "cells": [
+                cell_of(estimate([row[name] for row in column.rows]), metric.digits, len(column.rows))
+                for column in columns
+            ],
+        }
+        for name, metric in METRICS.items()
+    ]
 
 
 def cell_of(found: Estimate, digits: int, wanted: int) -> dict[str, str]:

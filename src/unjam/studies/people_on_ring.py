@@ -12,8 +12,7 @@ import numpy as np
 from unjam.controller import make_driver
 from unjam.files import make_folder, to_json, write_whole
 from unjam.manifest import manifest
-from unjam.measures.metrics import measure
-from unjam.measures.waves import wave_speed
+from unjam.measures.metrics import measure, wave_speed
 from unjam.reports.figures import png_bytes, space_time
 from unjam.reports.results import read_results
 from unjam.scenarios.registry import make_scenario

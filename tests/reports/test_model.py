@@ -1,18 +1,27 @@
+import base64
 import json
+import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
-from unjam.reports.model_story import (
+from unjam.reports.figures import data_uri
+from unjam.reports.model import (
     NUMBERS,
     bound_of,
     cells,
     error_rows,
     error_text,
+    errors,
+    examples,
     headings,
     model_section,
+    trust,
     trust_of,
     verdict_of,
 )
@@ -164,3 +173,89 @@ def test_only_runs_with_a_virtual_environment_have_a_section() -> None:
     assert "nothing known but that nothing changes, plus an ensemble of 4 networks" in found["about"]
     assert "1,234 decisions" in found["about"]
     assert [row["label"] for row in found["table"]] == [label for label, _ in NUMBERS.values()]
+
+
+Draw = Callable[[], Figure]
+PICTURES: dict[str, tuple[Draw, int]] = {
+    "trust": (lambda: trust(progress_of(), facts_of()), 4),
+    "errors": (lambda: errors(facts_of()), 6),
+    "examples": (lambda: examples(facts_of()), 2 * EXAMPLES),
+}
+
+
+def titled(figure: Figure, words: str) -> list[Axes]:
+    return [axes for axes in figure.axes if words in axes.get_title(loc="left")]
+
+
+def drawn(axes: Axes) -> dict[str, np.ndarray]:
+    """The lines of a panel, by label."""
+    return {str(line.get_label()): np.asarray(line.get_ydata(), float) for line in axes.lines}
+
+
+@pytest.mark.parametrize("name", PICTURES)
+def test_every_panel_has_a_title_and_lines_and_a_picture_can_be_made(name: str) -> None:
+    draw, panels = PICTURES[name]
+    figure = draw()
+    assert len(figure.axes) == panels
+    assert all(axes.get_title(loc="left") and axes.get_xlabel() and axes.lines for axes in figure.axes)
+    width, height = figure.get_size_inches()
+    assert width > height
+    assert data_uri(figure) == data_uri(draw())
+
+
+def test_no_text_of_a_panel_lies_on_that_of_another() -> None:
+    for draw, _ in PICTURES.values():
+        figure = draw()
+        figure.draw_without_rendering()
+        boxes = [axes.get_tightbbox() for axes in figure.axes]
+        for number, box in enumerate(boxes):
+            for other in boxes[number + 1 :]:
+                assert box is not None
+                assert other is not None
+                assert not (box.overlaps(other))
+
+
+def test_each_member_is_a_line_beside_what_happened() -> None:
+    figure = examples(facts_of())
+    panels = titled(figure, "gap to the leader [m], from 10 s on")
+    assert len(panels) == 1
+    lines = panels[0].lines
+    assert len(lines) == MEMBERS + 2
+    found = facts_of()["replay"]["examples"][1]["numbers"]["leader_gap"]
+    np.testing.assert_allclose(drawn(panels[0])["actual"], found["actual"])
+    np.testing.assert_allclose(drawn(panels[0])["IDM alone"], found["base"])
+
+
+def test_errors_are_drawn_with_the_spread_and_where_rollouts_end() -> None:
+    (panel,) = titled(errors(facts_of()), "error: leader's speed [m/s]")
+    found = facts_of()["replay"]["numbers"]["leader_speed"]
+    lines = drawn(panel)
+    for label, name in {
+        "model, a member": "model",
+        "spread of the members": "spread",
+        "IDM alone": "base",
+    }.items():
+        np.testing.assert_allclose(lines[label], found[name])
+    (end,) = [line for line in panel.lines if "k*" in str(line.get_label())]
+    assert list(np.asarray(end.get_xdata())) == pytest.approx([1.2, 1.2])
+    (panel,) = titled(errors(facts_of(k_star=0)), "error: leader's speed [m/s]")
+    assert not any("k*" in label for label in drawn(panel))
+
+
+def test_iterations_without_rollouts_leave_a_gap_in_the_returns() -> None:
+    progress = progress_of()
+    progress[0] = progress_of(return_virtual=None, return_actual=None)[0]
+    (panel,) = titled(trust(progress, facts_of()), "earned in k* decisions")
+    np.testing.assert_array_equal(drawn(panel)["virtual"], [np.nan, 5.5, 5.5])
+
+
+def test_without_a_bound_its_panel_is_left_out() -> None:
+    single = progress_of(eps_m_by_estimator={"unexplained": 0.1, "total_variation": None, "released": 0.2})
+    figure = trust(single, facts_of(bound=None))
+    assert [axes.get_visible() for axes in figure.axes] == [True, True, True, False]
+
+
+def test_the_base_is_called_by_its_name() -> None:
+    picture = data_uri(examples(facts_of(base="none")))
+    text = base64.b64decode(picture.partition(",")[2]).decode()
+    assert re.search("<!-- nothing changes -->", text)

@@ -1,0 +1,271 @@
+"""What the report says and draws of a run's virtual environment."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib import rc_context
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from unjam.reports.figures import INK, LINES, MUTED, STYLE, new_figure
+from unjam.reports.results import Results
+
+NUMBERS = {
+    "speed": ("own speed", "m/s"),
+    "leader_speed": ("leader's speed", "m/s"),
+    "leader_gap": ("gap to the leader", "m"),
+    "follower_speed": ("follower's speed", "m/s"),
+    "follower_gap": ("gap of the follower", "m"),
+    "reward": ("reward", ""),
+}
+"""what is predicted: its words and its unit"""
+KINDS = ("change", "base", "model")
+"""root mean squares: of what there was to predict, of the base's error, of the model's"""
+_PHYSICS = "physics, with a follower that drives as"
+BASES = {
+    "idm": ("IDM alone", f"{_PHYSICS} the IDM"),
+    "population": ("typical driver alone", f"{_PHYSICS} the typical one of a calibrated population"),
+    "acc": ("ACC alone", f"{_PHYSICS} adaptive cruise control"),
+    "ovm": ("OVM alone", f"{_PHYSICS} the optimal velocity model"),
+    "none": ("nothing changes", "nothing known but that nothing changes"),
+}
+"""what the base alone is called, and what it is"""
+NOTHING = 1e-5
+"""errors below this are those of single precision [m/s, m, reward]"""
+
+MODEL, BASE, CHANGE, ACTUAL = LINES[2], LINES[1], LINES[0], INK
+"""colours"""
+ESTIMATORS = {"unexplained": LINES[2], "total_variation": LINES[3], "released": LINES[4]}
+REPLAYED = ("leader_speed", "leader_gap", "follower_gap")
+"""numbers whose errors are drawn over the time ahead"""
+PLACED = (("leader_speed", "leader_gap"), ("leader_speed", "speed"), ("reward", "leader_gap"))
+"""what is drawn over what"""
+
+
+def error_rows(facts: dict[str, Any]) -> list[dict[str, Any]]:
+    """Return the errors of base and model by number: one step ahead, and at the end of the replay.
+
+    Each has its `KINDS`, and with `later_` before the name the same at the end; None for the reward, which is
+    not replayed.
+    """
+    rows = []
+    for name, (label, unit) in NUMBERS.items():
+        later = facts["replay"]["numbers"].get(name)
+        at_end = {f"later_{kind}": later[kind][-1] if later else None for kind in KINDS}
+        rows.append({"number": label, "unit": unit, **facts["one_step"][name], **at_end})
+    return rows
+
+
+def headings(facts: dict[str, Any]) -> list[str]:
+    """Return the headings of the table of `error_rows`, after the number's own."""
+    names = ("change", BASES[facts["base"]][0], "model")
+    return [
+        f"{name}, {after:g} s"
+        for after in (facts["decision_step"], facts["replay"]["seconds"][-1])
+        for name in names
+    ]
+
+
+def cells(row: dict[str, Any]) -> list[str]:
+    """Return the cells of a row of `error_rows`, as `headings` has them."""
+    return [error_text(row[f"{prefix}{kind}"]) for prefix in ("", "later_") for kind in KINDS]
+
+
+def error_text(value: float | None) -> str:
+    """Return an error to two digits, or that there is none."""
+    if value is None:
+        return "–"
+    if abs(value) < NOTHING:
+        return "0"
+    return f"{value:.2g}" if abs(value) < 10 else f"{value:.0f}"
+
+
+def verdict_of(facts: dict[str, Any]) -> str:
+    """Return where the model is better than its base, one step ahead and at the end, and where not."""
+    sentences = []
+    for prefix, after in (("", "One step"), ("later_", f"{facts['replay']['seconds'][-1]:g} s")):
+        better, worse = [], []
+        for row in error_rows(facts):
+            base, model = row[f"{prefix}base"], row[f"{prefix}model"]
+            if base is None or max(base, model) < NOTHING:
+                continue
+            change = f"{row['number']} (by {100 * abs(1.0 - model / base):.0f}\u00a0%)"
+            if model < 0.98 * base:
+                better.append(change)
+            elif model > 1.02 * base:
+                worse.append(change)
+        found = (("less wrong than the base in ", better), ("more wrong in ", worse))
+        words = ", and ".join(start + ", ".join(changes) for start, changes in found if changes)
+        sentences.append(f"{after} ahead the model is {words or 'as wrong as its base'}.")
+    return " ".join(sentences)
+
+
+def trust_of(progress: Sequence[dict[str, Any]]) -> str:
+    """Return how far the model was trusted in the last iteration, and what came of it."""
+    newest = progress[-1]["virtual"]
+    words = (
+        f"In the last iteration rollouts are k* = {newest['k_star']} decisions long: the model error "
+        f"eps_m is {newest['eps_m']:.3g}."
+    )
+    virtual, actual = newest.get("return_virtual"), newest.get("return_actual")
+    if virtual is None or actual is None:
+        return words
+    return (
+        f"{words} In so many decisions from the same actual states the same policy earns {virtual:.2f} in "
+        f"the virtual environment, and earned {actual:.2f} in the actual one."
+    )
+
+
+def bound_of(facts: dict[str, Any]) -> str:
+    """Return what the bound C says: nothing, at these discounts, and how it moves with k."""
+    bound = facts["bound"]
+    if bound is None:
+        return ""
+    k, values, most = bound["k"], bound["C"], bound["largest_return"]
+    smallest = min(values)
+    verdict = (
+        f"even at its best it is {smallest / most:,.0f} times that, so it says nothing"
+        if smallest > most
+        else f"at its best it is {smallest / most:.2f} of that"
+    )
+    return (
+        f"The paper's bound C, by which the actual return may fall short of the virtual one, moves with the "
+        f"length of rollouts from {values[0]:,.0f} (k = {k[0]}) over {smallest:,.0f} "
+        f"(k = {k[values.index(smallest)]:,}) to {values[-1]:,.0f} (k = {k[-1]:,}). No discounted return is "
+        f"larger than R_max / (1 - gamma) = {most:,.0f}: {verdict}."
+    )
+
+
+def model_section(result: Results) -> dict[str, Any] | None:
+    """Return what the page says of the virtual environment; None without one."""
+    facts = result.model
+    if facts is None or not result.progress:
+        return None
+    return {
+        "about": (
+            "Between actual episodes the agent also learns in a virtual environment: "
+            f"{BASES[facts['base']][1]}, plus an ensemble of {facts['members']} networks for what "
+            f"that leaves. All that follows is measured on {facts['held_out']:,} decisions of episodes that "
+            "no network learned from."
+        ),
+        "replay": facts["replay"],
+        "verdict": verdict_of(facts),
+        "trust": f"{trust_of(result.progress)} {bound_of(facts)}",
+        "headings": headings(facts),
+        "table": [
+            {"label": row["number"], "unit": row["unit"], "cells": cells(row)} for row in error_rows(facts)
+        ],
+    }
+
+
+@rc_context(STYLE)
+def trust(progress: Sequence[dict[str, Any]], facts: dict[str, Any]) -> Figure:
+    """Draw over training how far the model is trusted, why, and what came of it; and the bound by length.
+
+    Args:
+        progress: rows of progress of a run with a virtual environment.
+        facts: of its `model.json`.
+    """
+    figure, (lengths, estimates, returns, bounds) = _panels(2, 2, 2.3)
+    steps = np.array([row["actual_steps"] for row in progress]) / 1000
+    virtual = [row["virtual"] for row in progress]
+
+    def over_steps(axes: Axes, values: list[Any], colour: str, label: str, **style: Any) -> None:
+        known = np.array([np.nan if value is None else value for value in values], float)
+        axes.plot(steps, known, color=colour, lw=1.4, marker="o", ms=2.5, label=label, **style)
+
+    over_steps(lengths, [each["k_star"] for each in virtual], MODEL, "k*")
+    lengths.set_ylim(bottom=0)
+    _titled(lengths, "rollout length k* [decisions]", "actual steps [thousands]")
+    for name, colour in ESTIMATORS.items():
+        found = [each["eps_m_by_estimator"][name] for each in virtual]
+        over_steps(estimates, found, colour, name.replace("_", " "))
+    estimates.set_ylim(bottom=0)
+    estimates.legend(fontsize=8)
+    _titled(estimates, "model error eps_m, by estimator", "actual steps [thousands]")
+    over_steps(returns, [each.get("return_actual") for each in virtual], ACTUAL, "actual")
+    over_steps(returns, [each.get("return_virtual") for each in virtual], MODEL, "virtual", ls="--")
+    returns.legend(fontsize=8)
+    _titled(returns, "earned in k* decisions from the same states", "actual steps [thousands]")
+    bound = facts["bound"]
+    if bound is None:
+        bounds.set_visible(False)
+        return figure
+    most = bound["largest_return"]
+    bounds.plot(bound["k"], bound["C"], color=MODEL, lw=1.4, label="bound C")
+    bounds.axhline(most, color=MUTED, lw=1.1, ls="--", label="largest return there can be")
+    bounds.set_xscale("log")
+    bounds.set_yscale("log")
+    bounds.set_ylim(bottom=most / 3)
+    bounds.legend(fontsize=8)
+    _titled(bounds, "the paper's bound C on virtual less actual return", "rollout length k [decisions]")
+    return figure
+
+
+@rc_context(STYLE)
+def errors(facts: dict[str, Any]) -> Figure:
+    """Draw how wrong model and base are: the longer ahead; and one step ahead, by gap and by speed."""
+    figure, panels = _panels(2, 3, 2.4)
+    seconds = facts["replay"]["seconds"]
+    for axes, name in zip(panels[:3], REPLAYED, strict=True):
+        found = facts["replay"]["numbers"][name]
+        axes.plot(seconds, found["change"], color=CHANGE, lw=1.1, ls=":", label="how far it changes")
+        axes.plot(seconds, found["base"], color=BASE, lw=1.4, ls="--", label=BASES[facts["base"]][0])
+        axes.plot(seconds, found["model"], color=MODEL, lw=1.6, label="model, a member")
+        axes.plot(seconds, found["spread"], color=MODEL, lw=0.9, ls="-.", label="spread of the members")
+        if facts["k_star"]:
+            trusted = facts["k_star"] * facts["decision_step"]
+            axes.axvline(trusted, color=MUTED, lw=0.9, label="k*, the end of rollouts")
+        axes.set_ylim(bottom=0)
+        _titled(axes, f"error: {_named(name)}", "time ahead [s]")
+    for axes, (name, by) in zip(panels[3:], PLACED, strict=True):
+        found = facts["where"][by]
+        axes.plot(found["at"], found["base"][name], color=BASE, lw=1.4, ls="--", marker="o", ms=3)
+        axes.plot(found["at"], found["model"][name], color=MODEL, lw=1.6, marker="o", ms=3)
+        axes.set_ylim(bottom=0)
+        _titled(axes, f"error one step ahead: {NUMBERS[name][0]}", _named(by))
+    _legend(figure, panels[0], 5)
+    return figure
+
+
+@rc_context(STYLE)
+def examples(facts: dict[str, Any]) -> Figure:
+    """Draw virtual against actual: the same accelerations from the same start, each member a thin line."""
+    found, seconds = facts["replay"]["examples"], facts["replay"]["seconds"]
+    numbers = list(found[0]["numbers"])
+    figure, panels = _panels(len(numbers), len(found), 2.1)
+    pairs = [(name, each) for name in numbers for each in found]
+    for axes, (name, each) in zip(panels, pairs, strict=True):
+        example = each["numbers"][name]
+        for number, member in enumerate(example["members"]):
+            label = "model, each member" if number == 0 else None
+            axes.plot(seconds, member, color=MODEL, lw=0.9, alpha=0.8, label=label)
+        axes.plot(seconds, example["base"], color=BASE, lw=1.1, ls="--", label=BASES[facts["base"]][0])
+        axes.plot(seconds, example["actual"], color=ACTUAL, lw=1.6, label="actual")
+        if name == "leader_gap":
+            axes.set_ylim(bottom=0)
+        _titled(axes, f"{_named(name)}, from {each['begins']:.0f} s on", "time ahead [s]")
+    _legend(figure, panels[0], 3)
+    return figure
+
+
+def _panels(rows: int, columns: int, height: float) -> tuple[Figure, np.ndarray]:
+    """Return a figure and its panels, row by row, each `height` inches high."""
+    figure = new_figure(height * rows + 0.4)
+    return figure, figure.subplots(rows, columns, squeeze=False).ravel()
+
+
+def _named(name: str) -> str:
+    label, unit = NUMBERS[name]
+    return f"{label} [{unit}]" if unit else label
+
+
+def _titled(axes: Axes, title: str, horizontal: str) -> None:
+    axes.set_title(title, loc="left", fontsize=9, color=INK)
+    axes.set_xlabel(horizontal)
+    axes.margins(x=0.02)
+
+
+def _legend(figure: Figure, axes: Axes, columns: int) -> None:
+    figure.legend(*axes.get_legend_handles_labels(), loc="outside upper left", ncols=columns, fontsize=9)
