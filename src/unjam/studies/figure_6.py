@@ -207,8 +207,7 @@ def run(
     about = about_study(folder)
     parts: dict[str, Part] = {task.name: (measure, (task,)) for task in tasks(repeats)}
     rows = measure_parts(folder / "parts", parts, workers, on_progress)
-    # Losses are kept of the whole data alone.
-    kept = [
+    kept = [  # losses of the whole data alone
         {key: value for key, value in row.items() if row["size"] == 1.0 or not key.endswith("_loss")}
         for row in rows
     ]

@@ -65,8 +65,8 @@ def _write(studies: StudyFolder, seeds: int, folder: Path, workers: int) -> None
         variant: sorted(turns, key=lambda parts: sum(parts.values()))[len(turns) // 2]
         for variant, turns in found.items()
     }
-    total = {variant: sum(parts.values()) for variant, parts in medians.items()}
-    over_trpo = {variant: seconds / total["trpo"] for variant, seconds in total.items()}
+    of_trpo = sum(medians["trpo"].values())
+    over_trpo = {variant: sum(parts.values()) / of_trpo for variant, parts in medians.items()}
     numbers = {"turns": found, "median": medians, "over_trpo": over_trpo}
     write_whole(folder / "time.json", to_json(numbers, indent=1))
     draw(medians).savefig(folder / "time.png")

@@ -37,17 +37,9 @@ PAPER: dict[tuple[str, str], tuple[float, float, float]] = {
 """Tables 1 and 2, by road and variant: reward, and of the CAV's own speed, start-up and exploration included,
 the mean (`average speed`) and the standard deviation over time (`speed std`) [m/s]"""
 HONEST = (
-    "return",
-    "return_eq16",
-    "mean_speed",
-    "mean_speed_steady",
-    "speed_limit_ratio_steady",
-    "speed_std_fleet",
-    "time_to_dissolve",
-    "throughput_veh_per_h",
-    "backlog_veh",
-    "min_headway",
-    "collisions",
+    *("return", "return_eq16", "mean_speed", "mean_speed_steady", "speed_limit_ratio_steady"),
+    *("speed_std_fleet", "time_to_dissolve", "throughput_veh_per_h", "backlog_veh"),
+    *("min_headway", "collisions"),
 )
 """metrics of the deterministic policy on held-out seeds"""
 EXPERTS = tuple(label for label in REFERENCES if label not in ("human", "zero", "constant +0.1"))
@@ -77,16 +69,11 @@ def table_rows(studies: StudyFolder, road: str, variants: Sequence[str], seeds: 
     rows: Table = []
     for label, found in references.items():
         row = {"road": road, "name": label, "learns": False, "trainings": 0, "episodes": len(found)}
-        row |= {"best_expert": label == best}
-        row |= estimates(found, HONEST)
-        row["paper_convention"] = {
-            key: _mean_and_std(_finite(found, name)) for key, (name, _) in CONVENTION.items()
-        }
-        row["steady_by_draw"] = _by_draw(road, found)
-        rows.append(row)
-    for variant in variants:
-        rows.append(_of_variant(road, variant, studies.trained(road, variant, seeds), references))
-    return rows
+        row |= {"best_expert": label == best, **estimates(found, HONEST)}
+        convention = {key: _mean_and_std(_finite(found, name)) for key, (name, _) in CONVENTION.items()}
+        rows.append({**row, "paper_convention": convention, "steady_by_draw": _by_draw(road, found)})
+    trained = {variant: studies.trained(road, variant, seeds) for variant in variants}
+    return [*rows, *(_of_variant(road, variant, runs, references) for variant, runs in trained.items())]
 
 
 def _of_variant(
