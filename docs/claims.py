@@ -7,9 +7,10 @@ import numpy as np
 import pandas as pd
 from tables import RESULTS
 
-from studies import interval, number, rows_of
+from studies import rows_of
 from unjam.measures.statistics import estimate
-from unjam.studies.plan import VARIANTS
+from unjam.studies.study import VARIANTS
+from unjam.studies.table import interval, number
 
 Claim = tuple[str, str, str]
 """what the paper says, whether it held, by which numbers"""

@@ -9,7 +9,8 @@ from IPython.display import Image
 from matplotlib.figure import Figure
 from tables import RESULTS
 
-from studies import interval, rows_of
+from studies import rows_of
+from unjam.studies.table import interval
 
 LABELS = {"ours": "with the virtual environment", "ours-without-model": "without"}
 COLOURS = {"ours": "#2b6cb0", "ours-without-model": "#e07a1f"}

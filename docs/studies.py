@@ -8,12 +8,18 @@ import pandas as pd
 from tables import RESULTS, metrics_of
 from tables import rows_of as rows_of_file
 
-from unjam.studies.plan import VARIANTS
-from unjam.studies.pool import REFERENCES
+from unjam.studies import STUDIES
+from unjam.studies.study import REFERENCES, VARIANTS
+from unjam.studies.table import interval, number, unbroken
 
 FREE = 15.0
 """mean speed of an episode on the merge in which no jam stayed [m/s]"""
 PAPER = {"reward": "return", "speed": "CAV's speed [m/s]", "std": "its std [m/s]"}
+
+
+def page_table(study: str, name: str) -> pd.DataFrame:
+    """Return a table that a study itself makes for its page."""
+    return STUDIES[study].tables[name](RESULTS / study)
 
 
 def rows_of(study: str, road: str) -> list[dict[str, Any]]:
@@ -92,21 +98,6 @@ def by_draw(study: str, road: str, names: tuple[str, ...]) -> pd.DataFrame:
     return pd.DataFrame(table)
 
 
-def robustness(road: str) -> pd.DataFrame:
-    """Return the mean speed of all vehicles by condition and driver, and what training has added."""
-    rows = json.loads((RESULTS / "robustness" / "robustness.json").read_text())
-    table: dict[str, dict[str, str]] = {}
-    for row in rows:
-        if row["road"] == road:
-            cells = table.setdefault(row["condition"], {"": row["condition"]})
-            cells[f"{row['driver']} [m/s]"] = number(row["mean_speed"]["mean"], 2)
-            if row["driver"] == "trained":
-                cells["beyond its expert [m/s]"] = interval(row["faster_than_expert"], 2, "+")
-                cells["its smallest headway [s]"] = number(row["min_headway"]["mean"], 2)
-                cells["its collisions"] = number(row["collisions"]["mean"], 2)
-    return pd.DataFrame(table.values())
-
-
 def merge_capacity() -> pd.DataFrame:
     """Return how people alone fare on the merge, by how many want to enter and how the road begins."""
     names = ("mean_speed", "mean_speed_steady", "throughput_veh_per_h", "backlog_veh")
@@ -131,38 +122,6 @@ def closing_absorber() -> pd.DataFrame:
     return table
 
 
-def carried_over() -> pd.DataFrame:
-    """Return the mean speed by driver and traffic; those that learn did so among 22 vehicles."""
-    rows = json.loads((RESULTS / "figure-10" / "carried-over.json").read_text())
-    means: dict[str, dict[str, list[float]]] = {}
-    for row in rows:
-        by_driver = means.setdefault(row["road"], {})
-        by_driver.setdefault(row["driver"].rstrip(" 0123456789"), []).append(row["mean_speed"]["mean"])
-    return pd.DataFrame(
-        [
-            {"": road, **{driver: over_trainings(found) for driver, found in by_driver.items()}}
-            for road, by_driver in means.items()
-        ]
-    )
-
-
-def over_trainings(means: list[float]) -> str:
-    """Return the mean of a number over trainings, with the smallest and the largest."""
-    text = f"{sum(means) / len(means):.2f}"
-    return text if len(means) == 1 else unbroken(f"{text} [{min(means):.2f}, {max(means):.2f}]")
-
-
-def training_time() -> pd.DataFrame:
-    """Return the wall time per 1,000 actual steps by variant and part, and how many times TRPO's it is."""
-    found = json.loads((RESULTS / "figure-8" / "time.json").read_text())
-    table = []
-    for variant, parts in found["median"].items():
-        cells = {"": VARIANTS[variant].label}
-        cells |= {f"{part} [s]": f"{seconds:.2f}" for part, seconds in parts.items()}
-        table.append({**cells, "times TRPO's": f"{found['over_trpo'][variant]:.2f}"})
-    return pd.DataFrame(table).fillna("")
-
-
 def commands() -> pd.DataFrame:
     """Return the command that repeats the training of a row, on the ring and with the first seed."""
     table = []
@@ -178,20 +137,3 @@ def commands() -> pd.DataFrame:
 def drivers() -> pd.DataFrame:
     """Return how drivers that do not learn are named on the command line."""
     return pd.DataFrame([{"row": label, "--driver": name} for label, name in REFERENCES.items()])
-
-
-def number(value: float | None, digits: int) -> str:
-    """Return a number as tables show it; a dash where there is none."""
-    return "–" if value is None else f"{value:.{digits}f}"
-
-
-def interval(entries: dict[str, Any], digits: int, sign: str = "") -> str:
-    """Return an estimate with its interval."""
-    values = [entries[name] for name in ("mean", "low", "high")]
-    mean, low, high = ("–" if value is None else f"{value:{sign}.{digits}f}" for value in values)
-    return unbroken(f"{mean} [{low}, {high}]")
-
-
-def unbroken(text: str) -> str:
-    """Return a text that stays on one line of a table."""
-    return text.replace(" ", "\N{NO-BREAK SPACE}")

@@ -7,8 +7,8 @@ import numpy as np
 import pandas as pd
 from tables import RESULTS
 
-from studies import interval
-from unjam.studies.plan import VARIANTS
+from unjam.studies.study import VARIANTS
+from unjam.studies.table import interval
 
 
 def measured() -> dict[str, Any]:

@@ -11,4 +11,4 @@ from unjam.studies.field import run
 
 if __name__ == "__main__":
     folder, ngsim, astazero = map(Path, sys.argv[1:4])
-    run(folder, ngsim, astazero, workers=int(sys.argv[4]) if len(sys.argv) > 4 else 2, told=print)
+    run(folder, ngsim, astazero, workers=int(sys.argv[4]) if len(sys.argv) > 4 else 2, on_progress=print)

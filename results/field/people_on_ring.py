@@ -12,4 +12,4 @@ from unjam.studies.people_on_ring import run
 if __name__ == "__main__":
     folder, controller, headway, everything = map(Path, sys.argv[1:5])
     populations = {"own headways": headway, "all parameters own": everything}
-    run(folder, populations, controller, int(sys.argv[5]) if len(sys.argv) > 5 else 2, told=print)
+    run(folder, populations, controller, int(sys.argv[5]) if len(sys.argv) > 5 else 2, on_progress=print)

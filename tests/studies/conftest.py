@@ -7,11 +7,11 @@ from typing import Any
 import pytest
 
 from unjam.cli import app
-from unjam.studies import STUDIES, plan, pool
+from unjam.studies import STUDIES, study, table
 from unjam.studies import reproduce as reproduction
-from unjam.studies.comparison import comparison
-from unjam.studies.plan import Variant
+from unjam.studies.comparison import comparison_of
 from unjam.studies.reproduce import make_plan, reproduce
+from unjam.studies.study import StudyFolder, Variant
 from unjam.training.executors import Command
 
 SMALL: dict[str, Any] = {
@@ -25,7 +25,7 @@ SMALL: dict[str, Any] = {
     "virtual.epochs": 1,
     "virtual.members": 2,
 }
-LITTLE = comparison("two ways to learn on a little ring", ("plain", "virtual"), ("little",))
+LITTLE = comparison_of("two ways to learn on a little ring", ("plain", "virtual"), "little")
 
 
 REFERENCES = {"human": "human", "PI": "pi", "ACC": "acc"}
@@ -40,11 +40,11 @@ def little() -> Iterator[pytest.MonkeyPatch]:
     """Have the study `little` beside the others."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(STUDIES, "little", LITTLE)
-        patch.setitem(plan.ROADS, "little", SMALL)
+        patch.setitem(study.ROADS, "little", SMALL)
         for name, variant in VARIANTS.items():
-            patch.setitem(plan.VARIANTS, name, variant)
+            patch.setitem(study.VARIANTS, name, variant)
         patch.setattr(reproduction, "REFERENCES", REFERENCES)
-        patch.setattr(pool, "EXPERTS", ("PI", "ACC"))
+        patch.setattr(table, "EXPERTS", ("PI", "ACC"))
         yield patch
 
 
@@ -55,15 +55,17 @@ def reproduced(
     """A study that was made, its trainings in this process and without reports: its folder, what was told."""
     little.setattr(reproduction, "run_all", run_here)
     little.setattr("unjam.training.train.write_report", lambda folders, path: path.touch())
-    folder, told = tmp_path_factory.mktemp("pool"), []
-    to_do = make_plan(["little"], 2, pool.Pool(folder))
+    folder, told = tmp_path_factory.mktemp("studies"), []
+    to_do = make_plan(["little"], 2, StudyFolder(folder))
     assert len(to_do.runs) == 4
-    reproduce(to_do, 2, told=told.append)
+    reproduce(to_do, 2, on_line=told.append)
     return folder, told
 
 
-def run_here(commands: dict[str, Command], workers: int, executor: str, told: Callable[[str], None]) -> None:
+def run_here(
+    commands: dict[str, Command], workers: int, executor: str, on_line: Callable[[str], None]
+) -> None:
     """Run command lines of `unjam` in this process."""
     for name, command in commands.items():
         app(command.line()[3:], standalone_mode=False)
-        told(name)
+        on_line(name)

@@ -29,7 +29,8 @@ def ngsim(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
     quick = MultiStepSettings(hidden=(4,), seconds=3.0, batch=4, steps=2, validate_every=1)
     monkeypatch.setattr(field, "MULTI_STEP", quick)
     monkeypatch.setattr(field, "ONE_STEP", NetworkSettings(hidden=(4,), epochs=2))
-    monkeypatch.setattr(field, "_calibration", lambda model: CalibrationSettings(generations=2))
+    settings = dict.fromkeys(field.CALIBRATED, CalibrationSettings(generations=2))
+    monkeypatch.setattr(field, "CALIBRATED", settings)
     splits = ["paper_train"] * 5 + ["paper_test"] * 2 + ["extra"]
     groups = [{"split": split, "period": 400, "follower": number} for number, split in enumerate(splits)]
     return table(tmp_path / "ngsim.parquet", groups)

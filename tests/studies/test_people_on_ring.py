@@ -13,7 +13,7 @@ def test_people_are_put_on_the_ring_with_and_without_a_cav(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     road = {"length": (80, 80), "vehicles": 8, "warmup": 300, "horizon": 200}
-    monkeypatch.setattr(people_on_ring, "ROAD", road)
+    monkeypatch.setattr(people_on_ring, "SCENARIO_CHANGES", road)
     monkeypatch.setattr(people_on_ring, "EPISODES", 1)
     drivers = (PAPER_IDM, IDMParameters(time_headway=1.4))
     write_population(tmp_path / "drivers.json", Population(PAPER_IDM, drivers, (-4.0, 2.0)))

@@ -9,10 +9,9 @@ import pytest
 
 from unjam.errors import InputError
 from unjam.files import write_whole
-from unjam.studies import STUDIES, TOGETHER, plan
-from unjam.studies.plan import PlannedRun
-from unjam.studies.pool import Pool
+from unjam.studies import STUDIES, TOGETHER, study
 from unjam.studies.reproduce import estimated_seconds, make_plan, reproduce, studies_of
+from unjam.studies.study import PlannedRun, StudyFolder
 from unjam.training.folder import read_config
 
 Made = tuple[Path, list[str]]
@@ -38,12 +37,12 @@ def test_all_is_every_study_and_figures_are_drawn_with_their_tables() -> None:
 
 def test_an_unknown_study_lists_the_known(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="study: 'table-9' is not allowed; allowed: table-1"):
-        make_plan(["table-9"], 1, Pool(tmp_path))
+        make_plan(["table-9"], 1, StudyFolder(tmp_path))
 
 
 def test_a_training_that_two_studies_want_is_planned_once(tmp_path: Path) -> None:
-    both = make_plan(["table-1", "table-2"], 2, Pool(tmp_path))
-    alone = [make_plan([name], 2, Pool(tmp_path)) for name in ("table-1", "table-2")]
+    both = make_plan(["table-1", "table-2"], 2, StudyFolder(tmp_path))
+    alone = [make_plan([name], 2, StudyFolder(tmp_path)) for name in ("table-1", "table-2")]
     assert len(set(both.runs)) == len(both.runs) < sum(len(part.runs) for part in alone)
     assert both.seconds(2) < sum(part.seconds(2) for part in alone)
     assert both.seconds(4) < both.seconds(2)
@@ -71,10 +70,10 @@ def test_a_study_leaves_its_trainings_numbers_picture_and_manifest(reproduced: M
 def test_what_is_there_is_not_trained_again(reproduced: Made) -> None:
     folder, _ = reproduced
     before = {path: path.stat().st_mtime_ns for path in (folder / "runs").rglob("controller.unjam")}
-    plan_now = make_plan(["little"], 2, Pool(folder))
+    plan_now = make_plan(["little"], 2, StudyFolder(folder))
     assert (plan_now.runs, plan_now.finished, plan_now.roads) == ([], 4, [])
     told: list[str] = []
-    reproduce(plan_now, 2, told=told.append)
+    reproduce(plan_now, 2, on_line=told.append)
     assert {path: path.stat().st_mtime_ns for path in before} == before
     assert len(told) == 1
 
@@ -114,7 +113,7 @@ def test_a_training_with_other_settings_is_not_taken_for_ours(reproduced: Made) 
     try:
         write_whole(config, before.replace("gamma = 0.99", "gamma = 0.9"))
         with pytest.raises(InputError, match="was trained with other settings; allowed: a new folder"):
-            make_plan(["little"], 2, Pool(folder))
+            make_plan(["little"], 2, StudyFolder(folder))
     finally:
         write_whole(config, before)
 
@@ -123,9 +122,9 @@ def test_a_stopped_training_goes_on(reproduced: Made, monkeypatch: pytest.Monkey
     """What a stop leaves: no judgement yet, and fewer steps than planned."""
     folder, _ = reproduced
     run = PlannedRun("little", "plain", 1)
-    monkeypatch.setitem(plan.VARIANTS, "plain", replace(plan.VARIANTS["plain"], steps=480))
+    monkeypatch.setitem(study.VARIANTS, "plain", replace(study.VARIANTS["plain"], steps=480))
     (folder / "runs" / run.name / "evaluation.json").unlink()
-    to_do = make_plan(["little"], 2, Pool(folder))
+    to_do = make_plan(["little"], 2, StudyFolder(folder))
     assert run in to_do.runs
     reproduce(to_do, 2)
     assert read_config(folder / "runs" / run.name).steps == 480

@@ -11,11 +11,10 @@ import pytest
 import torch
 
 from unjam.reports.results import read_rows
-from unjam.studies import figure_5, figure_8, figure_10, plan, robustness, theory
-from unjam.studies.curves import curves_of
-from unjam.studies.plan import PlannedRun
-from unjam.studies.pool import Pool
+from unjam.studies import comparison, figure_8, robustness, study, theory
+from unjam.studies.comparison import curves_of
 from unjam.studies.robustness import Condition
+from unjam.studies.study import PlannedRun, StudyFolder
 from unjam.studies.table import table_rows
 
 Made = tuple[Path, list[str]]
@@ -43,11 +42,11 @@ def test_controllers_are_carried_over_to_other_traffic(
 ) -> None:
     folder, _ = reproduced
     road = {"scenario": "ring", "road.length": [80, 80], "road.vehicles": 6, "road.horizon": 60}
-    monkeypatch.setattr(figure_10, "OTHER_ROADS", {"six": road})
-    monkeypatch.setattr(figure_10, "CARRIED", ("plain",))
-    monkeypatch.setattr(figure_10, "TRAINED_ON", "little")
-    monkeypatch.setattr(figure_10, "EPISODES", 2)
-    rows = figure_10.carried_over(Pool(folder), 2)
+    monkeypatch.setattr(comparison, "OTHER_ROADS", {"six": road})
+    monkeypatch.setattr(comparison, "CARRIED", ("plain",))
+    monkeypatch.setattr(comparison, "TRAINED_ON", "little")
+    monkeypatch.setattr(comparison, "EPISODES", 2)
+    rows = comparison.carried_over(StudyFolder(folder), 2)
     assert [row["driver"] for row in rows] == ["human", "pi", "plain 0", "plain 1"]
     assert all(row["road"] == "six" and np.isfinite(row["mean_speed"]["mean"]) for row in rows)
 
@@ -61,7 +60,7 @@ def test_controllers_and_experts_meet_what_they_have_not_trained_with(
     monkeypatch.setitem(robustness.CONDITIONS, "little", conditions)
     monkeypatch.setitem(robustness.CONTROLLERS, "little", PlannedRun("little", "plain", 0))
     monkeypatch.setitem(robustness.EXPERTS, "little", ("PI",))
-    rows = robustness.under_conditions(Pool(folder), "little", 2, episodes=2)
+    rows = robustness.under_conditions(StudyFolder(folder), "little", 2, episodes=2)
     assert [(row["condition"], row["driver"]) for row in rows] == [
         (condition.name, driver) for condition in conditions for driver in ("people", "PI", "trained")
     ]
@@ -77,8 +76,8 @@ def test_controllers_and_experts_meet_what_they_have_not_trained_with(
 
 def test_the_same_traffic_is_shown_of_all(monkeypatch: pytest.MonkeyPatch, reproduced: Made) -> None:
     folder, _ = reproduced
-    monkeypatch.setattr(figure_5, "LEARNED", VARIANTS)
-    shown = figure_5.shown_on(Pool(folder), "little")
+    monkeypatch.setattr(comparison, "SHOWN", VARIANTS)
+    shown = comparison.shown_on(StudyFolder(folder), "little")
     human, expert, *learned = (episode.driver for episode in shown)
     assert human == "human"
     assert expert in ("PI", "ACC")
@@ -91,19 +90,19 @@ def test_who_learns_from_another_reward_is_judged_by_that_one(
     monkeypatch: pytest.MonkeyPatch, reproduced: Made
 ) -> None:
     folder, _ = reproduced
-    before = table_rows(Pool(folder), "little", VARIANTS, 2)[-1]
+    before = table_rows(StudyFolder(folder), "little", VARIANTS, 2)[-1]
     assert (before["beyond"]["metric"], math.isnan(before["return"]["mean"])) == ("return", False)
-    variant = plan.VARIANTS["virtual"]
+    variant = study.VARIANTS["virtual"]
     other = replace(variant, changes={**variant.changes, "reward": "eq16"})
-    monkeypatch.setitem(plan.VARIANTS, "virtual", other)
-    row = table_rows(Pool(folder), "little", VARIANTS, 2)[-1]
+    monkeypatch.setitem(study.VARIANTS, "virtual", other)
+    row = table_rows(StudyFolder(folder), "little", VARIANTS, 2)[-1]
     assert (row["beyond"]["metric"], math.isnan(row["return"]["mean"])) == ("return_eq16", True)
     expert = np.mean(
-        [one["return_eq16"] for one in Pool(folder).references("little")[row["beyond"]["expert"]]]
+        [one["return_eq16"] for one in StudyFolder(folder).references("little")[row["beyond"]["expert"]]]
     )
     mean = np.mean([one["return_eq16"] for run in range(2) for one in rows_of_run(folder, run)])
     assert row["beyond_best_expert"]["mean"] == pytest.approx(mean - expert)
-    curves = curves_of(Pool(folder), "little", VARIANTS, 2)
+    curves = curves_of(StudyFolder(folder), "little", VARIANTS, 2)
     assert "return_mean" in curves["plain"]
     assert "return_mean" not in curves["virtual"]
     assert "cav_mean_speed" in curves["virtual"]
@@ -138,7 +137,7 @@ def test_convergence_is_counted_against_the_best_known_return(
     folder, _ = reproduced
     monkeypatch.setattr(theory, "ROAD", "little")
     monkeypatch.setattr(theory, "COMPARED", VARIANTS)
-    rows = theory.convergence(Pool(folder), 2)
+    rows = theory.convergence(StudyFolder(folder), 2)
     progress = [
         json.loads(line)["return_mean"]
         for variant in VARIANTS
@@ -154,7 +153,7 @@ def test_the_model_is_followed_over_training(monkeypatch: pytest.MonkeyPatch, re
     folder, _ = reproduced
     monkeypatch.setattr(theory, "ROAD", "little")
     monkeypatch.setattr(theory, "WITH_MODEL", ("virtual",))
-    found = theory.model_over_training(Pool(folder), 2)
+    found = theory.model_over_training(StudyFolder(folder), 2)
     run = PlannedRun("little", "virtual", 1)
     rows = (folder / "runs" / run.name / "progress.jsonl").read_text().splitlines()
     last = json.loads(rows[-1])

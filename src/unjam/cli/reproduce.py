@@ -38,11 +38,11 @@ def reproduce(
     from unjam.cli.output import aside, console, print_json
 
     runner = executor_named(executor)
-    from unjam.studies.pool import Pool
     from unjam.studies.reproduce import make_plan
     from unjam.studies.reproduce import reproduce as run
+    from unjam.studies.study import StudyFolder
 
-    plan = make_plan(studies, seeds, Pool(out))
+    plan = make_plan(studies, seeds, StudyFolder(out))
     minutes = plan.seconds(workers) / 60.0
     if dry_run:
         if json:

@@ -1,33 +1,49 @@
 """The studies of `unjam reproduce`: the paper's tables and figures."""
 
-from unjam.studies.comparison import FIGURE_9, JAMMED, LONG, ON_EXPERTS, TABLE_1, TABLE_2
-from unjam.studies.figure_5 import FIGURE_5
-from unjam.studies.figure_6 import run as run_figure_6
+from unjam.studies.comparison import FIGURE_5, FIGURE_10, comparison_of
+from unjam.studies.figure_6 import FIGURE_6
 from unjam.studies.figure_8 import FIGURE_8
-from unjam.studies.figure_10 import FIGURE_10
 from unjam.studies.robustness import ROBUSTNESS
-from unjam.studies.study import Study
+from unjam.studies.study import PAPERS_ROADS, Study
 from unjam.studies.theory import THEORY
 
-FIGURE_6 = Study(
-    "networks that learn how people drive, with knowledge and without",
-    lambda seeds: [],
-    lambda pool, seeds, folder, workers: run_figure_6(folder, workers),
-    minutes=25.0,
-)
-
+TABLE_1: dict[str, Study] = {
+    f"table-1-{road}": comparison_of(
+        f"TRPO, PPO, SAC, the proposed method and ours on {road}",
+        ("trpo", "ppo", "sac", "proposed", "without-model", "ours"),
+        road,
+    )
+    for road in PAPERS_ROADS
+}
 STUDIES: dict[str, Study] = {
     **TABLE_1,
     "figure-5": FIGURE_5,
-    "table-2": TABLE_2,
+    "table-2": comparison_of(
+        "what each part of the method is worth, on the ring",
+        ("trpo", "mb-trpo", "no-initial-policy", "without-model", "proposed", "ours-without-model", "ours"),
+    ),
     "figure-6": FIGURE_6,
     "figure-8": FIGURE_8,
-    "figure-9": FIGURE_9,
+    "figure-9": comparison_of(
+        "PPO and SAC within the framework, on the ring",
+        ("ppo", "sac", "proposed-ppo", "proposed-sac", "proposed", "without-model"),
+    ),
     "figure-10": FIGURE_10,
     "theory": THEORY,
-    "long": LONG,
-    "on-experts": ON_EXPERTS,
-    "jammed": JAMMED,
+    "long": comparison_of(
+        "the paper's four million steps, and ours trained on, on the ring",
+        ("trpo-long", "proposed-long", "best"),
+    ),
+    "on-experts": comparison_of(
+        "ours on the figure eight: on the best expert and on PI, with model and without",
+        ("ours", "ours-with-model", "ours-on-pi"),
+        "figure-eight",
+    ),
+    "jammed": comparison_of(
+        "ours on a ring whose wave has grown before the CAV takes over",
+        ("best", "ours-with-model"),
+        "ring-jammed",
+    ),
     "robustness": ROBUSTNESS,
 }
 """every study by name"""

@@ -9,12 +9,17 @@ or that very IDM (`same`), so that the base is the truth.
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from functools import cache
+from itertools import product
+from operator import itemgetter
 from pathlib import Path
 from time import perf_counter
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
-from numpy.typing import NDArray
+from matplotlib import rc_context
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
 from unjam.files import to_json, write_whole
 from unjam.following.four_regimes import SMALLEST_GAP, FourRegimes, four_regimes
@@ -23,7 +28,8 @@ from unjam.following.open_loop import always, idm_follow, with_residual
 from unjam.following.pairs import SPLITS, Floats, Moments, moments_of, of_split, split_by_trajectory
 from unjam.physics.arrays import at_least
 from unjam.physics.idm import PAPER_IDM, idm_acceleration
-from unjam.studies.parts import Part, Told, about_study, measure_parts, read_part
+from unjam.reports.figures import INK, LINES, STYLE
+from unjam.studies.study import OnProgress, Part, Study, Table, about_study, measure_parts
 
 Split = Literal["trajectories", "rows", "released"]
 """How test rows are kept from training: `trajectories`: none of their trajectory is in it. `rows`: rows are
@@ -43,6 +49,8 @@ SETTINGS = {"other": FourRegimes(), "same": FourRegimes(driver=PAPER_IDM)}
 NETWORKS = ("knowledge", "vanilla")
 NEAREST = "nearest row"
 """no network: it answers what the most similar row of training did"""
+COLOURS = {"knowledge": LINES[2], "vanilla": LINES[1]}
+LABELS = {"knowledge": "IDM + residual", "vanilla": "network alone"}
 
 
 @dataclass(frozen=True)
@@ -79,37 +87,26 @@ class Parted(NamedTuple):
 
 def tasks(repeats: int = REPEATS) -> list[Task]:
     """Return all fits of the study, the most telling first."""
+
+    def fits(
+        count: int,
+        sizes: Sequence[float],
+        networks: Sequence[str] = NETWORKS,
+        splits: Sequence[Split] = ("trajectories",),
+        driver: str = "other",
+        longer: bool = False,
+    ) -> list[Task]:
+        found = product(range(count), splits, sizes, networks)
+        return [Task(driver, net, size, repeat, split, longer) for repeat, split, size, net in found]
+
     fewer = min(FEWER_REPEATS, repeats)
-    main = [
-        Task("other", network, size, repeat)
-        for repeat in range(repeats)
-        for size in SIZES
-        for network in NETWORKS
+    return [
+        *fits(repeats, SIZES),
+        *fits(fewer, SIZES[:1], longer=True),
+        *fits(fewer, SIZES[:2], driver="same"),
+        *fits(fewer, LEAKING_SIZES, splits=("rows", "released")),
+        *fits(1, (*LEAKING_SIZES, 1.0), networks=(NEAREST,), splits=get_args(Split)),
     ]
-    longer = [
-        Task("other", network, SIZES[0], repeat, longer=True)
-        for repeat in range(fewer)
-        for network in NETWORKS
-    ]
-    same = [
-        Task("same", network, size, repeat)
-        for repeat in range(fewer)
-        for size in SIZES[:2]
-        for network in NETWORKS
-    ]
-    leaking = [
-        Task("other", network, size, repeat, split)
-        for repeat in range(fewer)
-        for split in ("rows", "released")
-        for size in LEAKING_SIZES
-        for network in NETWORKS
-    ]
-    nearest = [
-        Task("other", NEAREST, size, 0, split)
-        for split in ("trajectories", "rows", "released")
-        for size in (*LEAKING_SIZES, 1.0)
-    ]
-    return [*main, *longer, *same, *leaking, *nearest]
 
 
 @cache
@@ -176,19 +173,13 @@ def _learned(task: Task, training: Moments, rows: Parted) -> tuple[Floats, dict[
     base = idm_follow(PAPER_IDM) if task.network == "knowledge" else None
     if task.longer:
         training = training.some(np.tile(np.arange(len(training)), LONGER))
-    validation = rows.validation.some(
-        np.random.default_rng(0).permutation(len(rows.validation))[:VALIDATION_ROWS]
-    )
+    judges = np.random.default_rng(0).permutation(len(rows.validation))[:VALIDATION_ROWS]
+    validation, test = rows.validation.some(judges), rows.test
     network, losses = fit_one_step(training, validation, base, NetworkSettings(), task.repeat)
     model = with_residual(always(base) if base else None, on_rows(network.as_driver()))
-    test = rows.test
     predicted = model(test.speed[:1], test.gap[:1])(test.speed, test.leader_speed, test.gap)
-    facts = {
-        "epochs": len(losses.training),
-        "training_loss": losses.training,
-        "validation_loss": losses.validation,
-    }
-    return predicted, facts
+    facts = {"training_loss": losses.training, "validation_loss": losses.validation}
+    return predicted, {"epochs": len(losses.training), **facts}
 
 
 def _nearest(training: Moments, test: Moments) -> Floats:
@@ -202,29 +193,84 @@ def _nearest(training: Moments, test: Moments) -> Floats:
     return training.acceleration[np.asarray(places, np.int64)]
 
 
-def _root(error: NDArray[np.float64]) -> float:
+def _root(error: Floats) -> float:
     return float(np.sqrt(np.square(error).mean()))
 
 
-def run(folder: Path, workers: int = 2, told: Told | None = None, repeats: int = REPEATS) -> None:
+def run(
+    folder: Path, workers: int = 2, on_progress: OnProgress = lambda name: None, repeats: int = REPEATS
+) -> None:
     """Measure what is missing, and write `figure-6.json` and `figure-6.png` into `folder`.
 
     The study goes on where it was stopped: what is measured lies in `folder/parts`.
     """
     about = about_study(folder)
     parts: dict[str, Part] = {task.name: (measure, (task,)) for task in tasks(repeats)}
-    measure_parts(folder / "parts", parts, workers, told)
-    rows = [read_part(folder / "parts", name) for name in parts]
-    write_whole(folder / "figure-6.json", to_json({"manifest": about, "rows": _small(rows)}, indent=1))
-    from unjam.studies.figure_6_picture import picture
-
+    rows = measure_parts(folder / "parts", parts, workers, on_progress)
+    kept = [  # losses of the whole data alone
+        {key: value for key, value in row.items() if row["size"] == 1.0 or not key.endswith("_loss")}
+        for row in rows
+    ]
+    write_whole(folder / "figure-6.json", to_json({"manifest": about, "rows": kept}, indent=1))
     picture(rows).savefig(folder / "figure-6.png", dpi=130)
 
 
-def _small(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return the rows with the losses of the whole data alone."""
-    losses = ("training_loss", "validation_loss")
-    return [
-        row if row["size"] == 1.0 else {key: value for key, value in row.items() if key not in losses}
-        for row in rows
-    ]
+def picture(rows: Table) -> Figure:
+    """Return training loss, error by the share of the data, and the same with more gradient steps."""
+    main = [row for row in rows if row["split"] == "trajectories" and row["driver"] == "other"]
+    with rc_context(STYLE):
+        figure = Figure(figsize=(11, 3.7), layout="constrained")
+        left, middle, right = figure.subplots(1, 3)
+        _losses(left, [row for row in main if row["size"] == 1.0])
+        _errors(middle, [row for row in main if not row["longer"]], "200 passes, as in the paper")
+        longer = [row for row in main if row["longer"] or row["size"] == 0.3]
+        _errors(right, longer, "at 1 % as many gradient steps as at 30 %")
+        right.sharey(middle)
+        middle.set_ylabel("error of the acceleration, noise aside [m/s²]")
+        middle.legend()
+        return figure
+
+
+def _losses(axes: Axes, rows: Table) -> None:
+    for network, colour in COLOURS.items():
+        for curve in (row["training_loss"] for row in rows if row["network"] == network):
+            axes.plot(np.arange(1, len(curve) + 1), curve, color=colour, lw=1.0, alpha=0.7)
+    noise = next(row["noise"] for row in rows)
+    axes.axhline(noise**2, color=INK, lw=0.9, ls=":")
+    axes.annotate("noise", (1.2, noise**2), va="bottom", fontsize=8, color=INK)
+    axes.set_xlabel("passes over all training rows")
+    _logarithmic(axes, "training loss [(m/s²)²]")
+
+
+def _errors(axes: Axes, rows: Table, title: str) -> None:
+    for network, colour in COLOURS.items():
+        by_size: dict[float, list[float]] = {}
+        for row in sorted(rows, key=itemgetter("size")):
+            if row["network"] == network:
+                by_size.setdefault(100 * row["size"], []).append(row["error_of_driver"])
+        mean, spread = np.array([(np.mean(found), np.std(found)) for found in by_size.values()]).T
+        look = {"color": colour, "lw": 1.5, "marker": "o", "ms": 4, "capsize": 3}
+        axes.errorbar(list(by_size), mean, spread, label=LABELS[network], **look)
+    axes.set_xlabel("share of the training rows [%]")
+    _logarithmic(axes, title)
+    ticks = sorted({100 * row["size"] for row in rows})
+    axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
+    axes.minorticks_off()
+
+
+def _logarithmic(axes: Axes, title: str) -> None:
+    """Make both axes logarithmic, the vertical one with numbers that can be read within a decade."""
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+    axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 4.0, 6.0)))
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axes.yaxis.set_minor_locator(NullLocator())
+    axes.set_title(title, loc="left", fontsize=9, color=INK)
+
+
+FIGURE_6 = Study(
+    "networks that learn how people drive, with knowledge and without",
+    lambda seeds: [],
+    lambda studies, seeds, folder, workers: run(folder, workers),
+    minutes=25.0,
+)

@@ -1,9 +1,11 @@
 """Figure 8: what training costs, all variants side by side in one run."""
 
+import json
 import tempfile
 from dataclasses import replace
 from pathlib import Path
 
+import pandas as pd
 import torch
 from matplotlib import rc_context
 from matplotlib.figure import Figure
@@ -11,9 +13,7 @@ from matplotlib.figure import Figure
 from unjam.files import to_json, write_whole
 from unjam.reports.figures import LINES, STYLE
 from unjam.reports.results import read_progress
-from unjam.studies.plan import VARIANTS, PlannedRun
-from unjam.studies.pool import Pool
-from unjam.studies.study import Study
+from unjam.studies.study import VARIANTS, PlannedRun, Study, StudyFolder
 from unjam.training.folder import start_folder
 from unjam.training.run import Run
 from unjam.worlds.workers import Workers
@@ -58,15 +58,15 @@ def _per_thousand(folder: Path) -> dict[str, float]:
     return {part: sum(row["seconds"].get(part, 0.0) for row in rows) / thousands for part in parts}
 
 
-def _write(pool: Pool, seeds: int, folder: Path, workers: int) -> None:
+def _write(studies: StudyFolder, seeds: int, folder: Path, workers: int) -> None:
     found = measured_seconds()
     # A turn that something else on the machine slowed down does not count.
     medians = {
         variant: sorted(turns, key=lambda parts: sum(parts.values()))[len(turns) // 2]
         for variant, turns in found.items()
     }
-    total = {variant: sum(parts.values()) for variant, parts in medians.items()}
-    over_trpo = {variant: seconds / total["trpo"] for variant, seconds in total.items()}
+    of_trpo = sum(medians["trpo"].values())
+    over_trpo = {variant: sum(parts.values()) / of_trpo for variant, parts in medians.items()}
     numbers = {"turns": found, "median": medians, "over_trpo": over_trpo}
     write_whole(folder / "time.json", to_json(numbers, indent=1))
     draw(medians).savefig(folder / "time.png")
@@ -91,4 +91,21 @@ def draw(seconds: dict[str, dict[str, float]]) -> Figure:
         return figure
 
 
-FIGURE_8 = Study("training time, measured side by side", lambda seeds: [], _write, minutes=12.0)
+def _table(folder: Path) -> pd.DataFrame:
+    """Return the wall time per 1,000 actual steps by variant and part, and how many times TRPO's it is."""
+    found = json.loads((folder / "time.json").read_text())
+    table = []
+    for variant, parts in found["median"].items():
+        cells = {"": VARIANTS[variant].label}
+        cells |= {f"{part} [s]": f"{seconds:.2f}" for part, seconds in parts.items()}
+        table.append({**cells, "times TRPO's": f"{found['over_trpo'][variant]:.2f}"})
+    return pd.DataFrame(table).fillna("")
+
+
+FIGURE_8 = Study(
+    "training time, measured side by side",
+    lambda seeds: [],
+    _write,
+    minutes=12.0,
+    tables={"training time": _table},
+)

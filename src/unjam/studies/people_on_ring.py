@@ -16,12 +16,12 @@ from unjam.measures.metrics import measure, wave_speed
 from unjam.reports.figures import png_bytes, space_time
 from unjam.reports.results import read_results
 from unjam.scenarios.registry import make_scenario
-from unjam.studies.parts import Told
+from unjam.studies.study import OnProgress
 from unjam.training.evaluate import Evaluation, raise_failure, save_evaluation
 from unjam.worlds.record import Episode
 from unjam.worlds.workers import EpisodeTask, Workers
 
-ROAD: dict[str, Any] = {"length": (230, 230)}
+SCENARIO_CHANGES: dict[str, Any] = {"length": (230, 230)}
 """changes to `ring-jammed`: as long as in the experiment [m]"""
 EPISODES = 10
 PAPERS = "paper's IDM"
@@ -35,7 +35,7 @@ def run(
     populations: dict[str, Path],
     controller: Path,
     workers: int = 2,
-    told: Told | None = None,
+    on_progress: OnProgress = lambda name: None,
 ) -> None:
     """Write `ring.json` and `ring.png` into `folder`: people alone, with PI, and with a trained controller.
 
@@ -44,7 +44,7 @@ def run(
         populations: files of `unjam fit-drivers`, by the label that they get.
         controller: run folder or .unjam file of a controller for the ring.
         workers: processes.
-        told: told the name of each finished group of episodes.
+        on_progress: told the name of each finished group of episodes.
     """
     make_folder(folder)
     about, rows = manifest(), []
@@ -54,7 +54,7 @@ def run(
     largest = 0
     with Workers(workers) as pool:
         for people, changes in roads.items():
-            scenario = make_scenario("ring-jammed", {**ROAD, **changes})
+            scenario = make_scenario("ring-jammed", {**SCENARIO_CHANGES, **changes})
             drivers = {name: make_driver(name, scenario.decision_step) for name in ("human", "pi")}
             drivers[TRAINED] = make_driver(str(controller), scenario.decision_step)
             for label, driver in drivers.items():
@@ -67,8 +67,7 @@ def run(
                 if label == "human":  # shown is where people alone make the largest wave
                     largest = int(np.argmax([row["speed_std_fleet_steady"] for row in found]))
                 shown[f"{people}: {TITLES[label]}"] = episodes[largest]
-                if told is not None:
-                    told(f"{people}, {label}")
+                on_progress(f"{people}, {label}")
     write_whole(folder / "ring.json", to_json({"manifest": about, "rows": rows}, indent=1))
     save_evaluation(folder / "shown", Evaluation({}, shown), {})
     pictured = list(read_results(folder / "shown").shown.values())

@@ -7,18 +7,19 @@ from pathlib import Path
 from typing import Any
 
 from unjam.controller import make_driver
+from unjam.controller.file import WEIGHTS, hash_of, unpack_parts
 from unjam.errors import InputError, wrong_name
 from unjam.files import make_folder, to_json, write_whole
 from unjam.manifest import manifest
+from unjam.reports.results import EVALUATION_FILE
 from unjam.scenarios.registry import SCENARIOS
 from unjam.studies import STUDIES, TOGETHER
-from unjam.studies.plan import ROADS, PlannedRun
-from unjam.studies.pool import REFERENCES, Pool
-from unjam.studies.study import Study
+from unjam.studies.study import REFERENCES, ROADS, OnProgress, PlannedRun, Study, StudyFolder
 from unjam.training.config import load_config
 from unjam.training.evaluate import evaluate, held_out_seeds, save_evaluation
-from unjam.training.executors import Executor, Told, run_all
+from unjam.training.executors import Executor, run_all
 from unjam.training.folder import read_config
+from unjam.training.trainings import training_command
 from unjam.worlds.episode import can_drive
 from unjam.worlds.workers import Workers
 
@@ -34,29 +35,7 @@ DRIVE_SECONDS = {"ring": 60.0, "figure-eight": 60.0, "merge": 400.0}
 """what the drivers that do not learn take on a road [s]"""
 
 
-@dataclass(frozen=True)
-class Plan:
-    """What is still to do for some studies."""
-
-    names: tuple[str, ...]
-    seeds: int
-    """of each training"""
-    pool: Pool
-    runs: list[PlannedRun]
-    """trainings, those that are finished left out"""
-    finished: int
-    """trainings that are there already"""
-    roads: list[str]
-    """where drivers that do not learn must still drive"""
-
-    def seconds(self, workers: int) -> float:
-        """Return about how long it takes on `workers` cores [s]."""
-        alone = sum(estimated_seconds(run) for run in self.runs)
-        alone += sum(DRIVE_SECONDS[_kind(road)] for road in self.roads)
-        return alone / workers + 60.0 * sum(STUDIES[name].minutes for name in self.names)
-
-
-def make_plan(names: Sequence[str], seeds: int, pool: Pool) -> Plan:
+def make_plan(names: Sequence[str], seeds: int, studies: StudyFolder) -> "Plan":
     """Return what is still to do.
 
     Raises:
@@ -65,11 +44,16 @@ def make_plan(names: Sequence[str], seeds: int, pool: Pool) -> Plan:
     chosen = studies_of(names)
     wanted = list(dict.fromkeys(run for study in chosen.values() for run in study.runs(seeds)))
     for run in wanted:
-        _check_settings(run, pool)
-    missing = [run for run in wanted if not pool.has(run)]
+        folder = studies.folder_of(run)
+        if (folder / "config.toml").is_file():
+            before = replace(read_config(folder), workers=run.config.workers, steps=run.config.steps)
+            if before != run.config:
+                words = f"out: {str(folder)!r} was trained with other settings; allowed: a new folder"
+                raise InputError(words)
+    missing = [run for run in wanted if not studies.has(run)]
     roads = dict.fromkeys(road for study in chosen.values() for road in study.roads)
-    undriven = [road for road in roads if not pool.has_drives(road)]
-    return Plan(tuple(chosen), seeds, pool, missing, len(wanted) - len(missing), undriven)
+    undriven = [road for road in roads if not (studies.drives_of(road) / EVALUATION_FILE).is_file()]
+    return Plan(tuple(chosen), seeds, studies, missing, len(wanted) - len(missing), undriven)
 
 
 def studies_of(names: Sequence[str]) -> dict[str, Study]:
@@ -92,20 +76,8 @@ def _kind(road: str) -> str:
     return SCENARIOS[ROADS[road]["scenario"]].title
 
 
-def _check_settings(run: PlannedRun, pool: Pool) -> None:
-    folder = pool.folder_of(run)
-    if not (folder / "config.toml").is_file():
-        return
-    before, wanted = read_config(folder), run.config
-    if replace(before, workers=wanted.workers, steps=wanted.steps) != wanted:
-        raise InputError(f"out: {str(folder)!r} was trained with other settings; allowed: a new folder")
-
-
 def reproduce(
-    plan: Plan,
-    workers: int,
-    executor: Executor = "local",
-    told: Told = lambda line: None,
+    plan: "Plan", workers: int, executor: Executor = "local", on_line: OnProgress = lambda line: None
 ) -> list[Path]:
     """Make what is missing for some studies, draw them, and return their folders.
 
@@ -115,39 +87,44 @@ def reproduce(
         plan: of `make_plan`.
         workers: trainings at once.
         executor: `ray`: on a Ray cluster whose machines share the folder.
-        told: told a line when something is done.
+        on_line: told a line when something is done.
 
     Raises:
         UnjamError: a training failed; the others are there.
     """
-    pool = plan.pool
-    make_folder(pool.folder)
+    studies = plan.studies
+    make_folder(studies.folder)
     for road in plan.roads:
-        told(f"drivers that do not learn: {road}")
-        drive_references(road, pool, workers)
-    commands = {run.name: pool.command(run) for run in plan.runs}
-    run_all(commands, workers, executor, told)
-    written = []
+        on_line(f"drivers that do not learn: {road}")
+        drive_references(road, studies, workers)
+    plans, logs = studies.folder / "plans", studies.folder / "logs"
+    commands = {
+        run.name: training_command(
+            run.config, studies.folder_of(run), plans / f"{run.name}.toml", logs / f"{run.name}.log"
+        )
+        for run in plan.runs
+    }
+    run_all(commands, workers, executor, on_line)
     for name in plan.names:
-        study = STUDIES[name]
-        told(f"writing {name}: {study.title}")
-        target = pool.folder / name
+        study, target = STUDIES[name], studies.folder / name
+        on_line(f"writing {name}: {study.title}")
         make_folder(target)
-        study.write(pool, plan.seeds, target, workers)
+        study.write(studies, plan.seeds, target, workers)
         about = {"study": name, "title": study.title, "seeds": plan.seeds, **manifest()}
-        about["trainings"] = [_trained_by(run, pool) for run in study.runs(plan.seeds)]
+        about["trainings"] = [_trained_by(run, studies) for run in study.runs(plan.seeds)]
         write_whole(target / "manifest.json", to_json(about, indent=1))
-        written.append(target)
-    return written
+    return [studies.folder / name for name in plan.names]
 
 
-def _trained_by(run: PlannedRun, pool: Pool) -> dict[str, Any]:
-    """Return what is needed to repeat a training, and what its controller is known by."""
-    made = json.loads((pool.folder_of(run) / "manifest.json").read_text())
-    return {"run": run.name, "commit": made["commit"], "weights_sha256": pool.weights_sha256(run)}
+def _trained_by(run: PlannedRun, studies: StudyFolder) -> dict[str, Any]:
+    """Return what is needed to repeat a training, and what its network is known by, whoever repeats it."""
+    folder = studies.folder_of(run)
+    commit = json.loads((folder / "manifest.json").read_text())["commit"]
+    weights = unpack_parts(folder / "controller.unjam")[WEIGHTS]
+    return {"run": run.name, "commit": commit, "weights_sha256": hash_of(weights)}
 
 
-def drive_references(road: str, pool: Pool, workers: int) -> None:
+def drive_references(road: str, studies: StudyFolder, workers: int) -> None:
     """Drive a road with the drivers that do not learn, on the held-out seeds of the trainings."""
     config = load_config(changes=ROADS[road])
     scenario = config.make_scenario()
@@ -155,4 +132,26 @@ def drive_references(road: str, pool: Pool, workers: int) -> None:
     drivers = {label: driver for label, driver in made.items() if can_drive(driver, scenario)}
     with Workers(workers) as processes:
         found = evaluate(scenario, drivers, held_out_seeds(config.evaluation.episodes), processes)
-    save_evaluation(pool.drives_of(road), found, {"scenario": config.scenario, "manifest": manifest()})
+    save_evaluation(studies.drives_of(road), found, {"scenario": config.scenario, "manifest": manifest()})
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is still to do for some studies."""
+
+    names: tuple[str, ...]
+    seeds: int
+    """of each training"""
+    studies: StudyFolder
+    runs: list[PlannedRun]
+    """trainings, those that are finished left out"""
+    finished: int
+    """trainings that are there already"""
+    roads: list[str]
+    """where drivers that do not learn must still drive"""
+
+    def seconds(self, workers: int) -> float:
+        """Return about how long it takes on `workers` cores [s]."""
+        alone = sum(estimated_seconds(run) for run in self.runs)
+        alone += sum(DRIVE_SECONDS[_kind(road)] for road in self.roads)
+        return alone / workers + 60.0 * sum(STUDIES[name].minutes for name in self.names)

@@ -1,18 +1,20 @@
 """Robustness: trained controllers and experts on roads, and with sensors, that are not those of training."""
 
+import json
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
+
+import pandas as pd
 
 from unjam.controller import make_driver
 from unjam.drivers.driver import Driver
 from unjam.files import to_json, write_whole
-from unjam.measures.statistics import estimate, paired_difference
+from unjam.measures.statistics import paired_difference
 from unjam.studies.impaired import impaired
-from unjam.studies.plan import ROADS, PlannedRun
-from unjam.studies.pool import REFERENCES, Pool
-from unjam.studies.study import Study
-from unjam.studies.table import entries
+from unjam.studies.study import REFERENCES, ROADS, PlannedRun, Study, StudyFolder, Table
+from unjam.studies.table import entries, estimates, interval, number
 from unjam.training.config import load_config
 from unjam.training.evaluate import evaluate, held_out_seeds
 from unjam.worlds.workers import Workers
@@ -35,8 +37,7 @@ class Condition:
     """What differs from training."""
 
     name: str
-    road: dict[str, Any] = field(default_factory=dict)
-    """changes to the road"""
+    scenario_changes: dict[str, Any] = field(default_factory=dict)
     impaired: dict[str, float] = field(default_factory=dict)
     """arguments of `impaired`"""
 
@@ -92,14 +93,14 @@ EXPERTS = {
 """the shipped controller's own comes first"""
 
 
-def under_conditions(pool: Pool, road: str, processes: int, episodes: int = EPISODES) -> list[dict[str, Any]]:
+def under_conditions(studies: StudyFolder, road: str, processes: int, episodes: int = EPISODES) -> Table:
     """Return a row per condition and driver: people alone, experts, the trained controller."""
     rows = []
     names = {"people": "human", **{label: REFERENCES[label] for label in EXPERTS[road]}}
-    names[TRAINED] = str(pool.folder_of(CONTROLLERS[road]))
+    names[TRAINED] = str(studies.folder_of(CONTROLLERS[road]))
     with Workers(processes) as workers:
         for condition in CONDITIONS[road]:
-            changes = {f"road.{key}": value for key, value in condition.road.items()}
+            changes = {f"road.{key}": value for key, value in condition.scenario_changes.items()}
             scenario = load_config(changes={**ROADS[road], **changes}).make_scenario()
             step = scenario.decision_step
             drivers: dict[str, Driver] = {}
@@ -107,18 +108,30 @@ def under_conditions(pool: Pool, road: str, processes: int, episodes: int = EPIS
                 how = {} if name == "human" else condition.impaired
                 drivers[label] = impaired(name, step, **how) if how else make_driver(name, step)
             found = evaluate(scenario, drivers, held_out_seeds(episodes), workers).rows
-            expert = found[EXPERTS[road][0]]
-            for label, episodes_of in found.items():
+            for label, driven in found.items():
                 row: dict[str, Any] = {"road": road, "condition": condition.name, "driver": label}
-                row |= {key: entries(estimate([one[key] for one in episodes_of])) for key in SHOWN}
-                row["faster_than_expert"] = entries(paired_difference(episodes_of, expert, "mean_speed"))
-                rows.append(row)
+                gain = paired_difference(driven, found[EXPERTS[road][0]], "mean_speed")
+                rows.append({**row, **estimates(driven, SHOWN), "faster_than_expert": entries(gain)})
     return rows
 
 
-def _write(pool: Pool, seeds: int, folder: Path, workers: int) -> None:
-    rows = [row for road in CONDITIONS for row in under_conditions(pool, road, workers)]
+def _write(studies: StudyFolder, seeds: int, folder: Path, workers: int) -> None:
+    rows = [row for road in CONDITIONS for row in under_conditions(studies, road, workers)]
     write_whole(folder / "robustness.json", to_json(rows, indent=1))
+
+
+def _table(road: str, folder: Path) -> pd.DataFrame:
+    """Return the mean speed of all vehicles by condition and driver, and what training has added."""
+    table: dict[str, dict[str, str]] = {}
+    for row in json.loads((folder / "robustness.json").read_text()):
+        if row["road"] == road:
+            cells = table.setdefault(row["condition"], {"": row["condition"]})
+            cells[f"{row['driver']} [m/s]"] = number(row["mean_speed"]["mean"], 2)
+            if row["driver"] == TRAINED:
+                cells["beyond its expert [m/s]"] = interval(row["faster_than_expert"], 2, "+")
+                cells["its smallest headway [s]"] = number(row["min_headway"]["mean"], 2)
+                cells["its collisions"] = number(row["collisions"]["mean"], 2)
+    return pd.DataFrame(table.values())
 
 
 ROBUSTNESS = Study(
@@ -126,4 +139,5 @@ ROBUSTNESS = Study(
     lambda seeds: list(CONTROLLERS.values()),
     _write,
     minutes=40.0,
+    tables={road: partial(_table, road) for road in CONDITIONS},
 )

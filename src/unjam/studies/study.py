@@ -1,11 +1,226 @@
-"""What a study is: which trainings it needs, and what is made of them."""
+"""What a study is, what it is made of - trainings, drives, measured parts - and where all that lies."""
 
-from collections.abc import Callable
-from dataclasses import dataclass
+import json
+import multiprocessing
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass, field
+from functools import cached_property
+from itertools import product
+from math import ceil
 from pathlib import Path
+from typing import Any
 
-from unjam.studies.plan import PlannedRun
-from unjam.studies.pool import Pool
+import numpy as np
+import pandas as pd
+
+from unjam.files import make_folder, to_json, write_whole
+from unjam.manifest import manifest
+from unjam.reports.results import EVALUATION_FILE, read_progress, read_rows
+from unjam.training.config import RunConfig, load_config
+from unjam.training.folder import read_config
+from unjam.training.judge import TRAINED
+from unjam.training.presets import CLOSING_ABSORBER
+
+BUDGET = 300_000
+"""actual steps of every learner"""
+LONG_BUDGET = 4_000_000
+"""the paper's own"""
+
+ROADS: dict[str, dict[str, Any]] = {
+    "ring": {"scenario": "ring"},
+    "ring-jammed": {"scenario": "ring-jammed"},
+    "ring-11": {"scenario": "ring", "road.vehicles": 11},
+    "ring-5": {"scenario": "ring", "road.vehicles": 5},
+    "figure-eight": {"scenario": "figure-eight"},
+    "merge": {"scenario": "merge"},
+}
+PAPERS_ROADS = ("ring", "figure-eight", "merge")
+LAST_SHARE = 0.1
+"""share of the iterations, the last ones, that the paper's convention is read from"""
+
+Table = list[dict[str, Any]]
+"""rows, of results or of metrics of episodes"""
+Part = tuple[Callable[..., Any], tuple[Any, ...]]
+"""a function of a module, and its arguments; it answers what JSON can hold"""
+OnProgress = Callable[[str], None]
+"""told the name of what is there, when it is there"""
+
+
+def planned(roads: Iterable[str], variants: Sequence[str], seeds: int) -> "list[PlannedRun]":
+    """Return the runs of all variants on all roads: all of one seed first."""
+    return [
+        PlannedRun(road, variant, seed)
+        for seed, road, variant in product(range(seeds), tuple(roads), variants)
+    ]
+
+
+def about_study(folder: Path) -> dict[str, Any]:
+    """Return where a study comes from: the manifest of its first call, and when it went on, by what."""
+    make_folder(folder)
+    path, about = folder / "manifest.json", manifest()
+    if path.is_file():
+        went_on = {"commit": about["commit"], "started": about["started"]}
+        about = json.loads(path.read_text(encoding="utf-8"))
+        about["went_on"] = [*about.get("went_on", []), went_on]
+    write_whole(path, to_json(about, indent=1))
+    return about
+
+
+def measure_parts(
+    folder: Path, parts: dict[str, Part], workers: int, on_progress: OnProgress = lambda name: None
+) -> list[Any]:
+    """Return the answers of all parts; those without a `folder/NAME.json` are measured, and get one."""
+
+    def keep(name: str, answer: Any) -> None:
+        write_whole(folder / f"{name}.json", to_json(answer))
+        on_progress(name)
+
+    make_folder(folder)
+    missing = {name: part for name, part in parts.items() if not (folder / f"{name}.json").is_file()}
+    if workers == 1 or len(missing) < 2:
+        for name, (function, arguments) in missing.items():
+            keep(name, function(*arguments))
+    else:
+        # Fresh processes: a forked one would inherit threads of torch that are not there.
+        context = multiprocessing.get_context("spawn")
+        with ProcessPoolExecutor(workers, mp_context=context) as pool:
+            running = {pool.submit(function, *given): name for name, (function, given) in missing.items()}
+            for done in as_completed(running):
+                keep(running[done], done.result())
+    return [read_part(folder, name) for name in parts]
+
+
+def read_part(folder: Path, name: str) -> Any:
+    """Return what a part has answered."""
+    return json.loads((folder / f"{name}.json").read_text(encoding="utf-8"))
+
+
+@dataclass(frozen=True)
+class Variant:
+    """A way to learn, as changes to a preset."""
+
+    label: str
+    preset: str
+    changes: dict[str, Any]
+    steps: int | None = BUDGET
+    """None: those of the preset"""
+
+
+ALONE = {"expert": "none", "virtual.virtual_ratio": 0.0}
+VARIANTS: dict[str, Variant] = {
+    "trpo": Variant("TRPO", "paper", ALONE),
+    "ppo": Variant("PPO", "paper", {"agent": "ppo", **ALONE}),
+    "sac": Variant("SAC", "paper", {"agent": "sac", **ALONE}),
+    "mb-trpo": Variant("MB-TRPO", "paper", {"expert": "none", "virtual.base": "none"}),
+    "no-initial-policy": Variant("no initial policy", "paper", {"expert": "none"}),
+    "without-model": Variant("residual without model", "paper", {"virtual.virtual_ratio": 0.0}),
+    "proposed": Variant("proposed", "paper", {}),
+    "proposed-ppo": Variant("proposed with PPO", "paper", {"agent": "ppo"}),
+    "proposed-sac": Variant("proposed with SAC", "paper", {"agent": "sac"}),
+    "trpo-long": Variant("TRPO, 4 M steps", "paper", ALONE, LONG_BUDGET),
+    "proposed-long": Variant("proposed, 4 M steps", "paper", {}, LONG_BUDGET),
+    "ours": Variant("ours", "best", {}),
+    "ours-without-model": Variant("ours without model", "best", {"virtual.virtual_ratio": 0.0}),
+    "ours-with-model": Variant("ours with model", "best", {"virtual.virtual_ratio": 5.0}),
+    "ours-on-pi": Variant("ours on PI", "best", {"expert": "pi"}),
+    "best": Variant("ours, all its steps", "best", {}, None),
+}
+"""the paper's methods with the paper's settings, and what we make of them"""
+
+
+REFERENCES: dict[str, str] = {
+    "human": "human",
+    "zero": "constant",
+    "constant +0.1": "constant:acceleration=0.1",
+    "PI (paper)": "pi:time_constant=0",
+    "PI": "pi",
+    "FollowerStopper": "follower-stopper",
+    "IDM": "idm",
+    "ACC": "acc",
+    "LACC": "lacc",
+    "BCM": "bcm",
+    "OVM": "ovm",
+    "pacer": "pacer",
+    "varying pacer": "pacer:varying=true",
+    "gentle varying pacer": "pacer:varying=true,time_constant=1",
+    "jam absorber": "jam-absorber",
+    "closing jam absorber": CLOSING_ABSORBER,
+}
+"""drivers that do not learn, beside those that do: label and how `unjam drive` names them"""
+
+
+@dataclass(frozen=True)
+class PlannedRun:
+    """A training that a study needs."""
+
+    road: str
+    variant: str
+    seed: int
+
+    @property
+    def name(self) -> str:
+        """Its place among all trainings of the studies."""
+        return f"{self.road}/{self.variant}/{self.seed}"
+
+    @cached_property
+    def config(self) -> RunConfig:
+        """Its configuration: one worker, judged without drivers that all trainings would share."""
+        variant = VARIANTS[self.variant]
+        changes = {**ROADS[self.road], "seed": self.seed, "workers": 1, "evaluation.baselines": []}
+        changes |= variant.changes
+        if variant.steps is not None:
+            changes["steps"] = variant.steps
+        return load_config(preset=variant.preset, changes=changes)
+
+
+@dataclass(frozen=True)
+class TrainedRun:
+    """A finished training."""
+
+    run: PlannedRun
+    progress: Table
+    rows: Table
+    """of the trained controller, deterministic, on held-out seeds"""
+
+    def in_training(self, name: str) -> float:
+        """Return a number of the training batches, exploration included, in the last tenth of them."""
+        last = self.progress[-ceil(LAST_SHARE * len(self.progress)) :]
+        return float(np.mean([row[name] for row in last]))
+
+    @property
+    def seconds(self) -> float:
+        """Wall time of its iterations."""
+        return float(sum(sum(row["seconds"].values()) for row in self.progress))
+
+
+@dataclass(frozen=True)
+class StudyFolder:
+    """A folder with the trainings and drives of all studies, each made once; nothing need be there yet."""
+
+    folder: Path
+
+    def folder_of(self, run: PlannedRun) -> Path:
+        """Return where a training is."""
+        return self.folder / "runs" / run.name
+
+    def drives_of(self, road: str) -> Path:
+        """Return where the drivers that do not learn are, on a road."""
+        return self.folder / "drives" / road
+
+    def has(self, run: PlannedRun) -> bool:
+        """Return whether a training is finished, with these settings."""
+        folder = self.folder_of(run)
+        return (folder / EVALUATION_FILE).is_file() and read_config(folder) == run.config
+
+    def trained(self, road: str, variant: str, seeds: int) -> list[TrainedRun]:
+        """Return the finished trainings of a variant on a road, one of each seed."""
+        runs = {run: self.folder_of(run) for run in planned([road], [variant], seeds)}
+        return [TrainedRun(run, read_progress(at), read_rows(at)[TRAINED]) for run, at in runs.items()]
+
+    def references(self, road: str) -> dict[str, Table]:
+        """Return the rows of the drivers that do not learn, by label, on the seeds that judge."""
+        return read_rows(self.drives_of(road))
 
 
 @dataclass(frozen=True)
@@ -15,10 +230,12 @@ class Study:
     title: str
     runs: Callable[[int], list[PlannedRun]]
     """the trainings for a number of seeds"""
-    write: Callable[[Pool, int, Path, int], None]
-    """measures what else it needs, and writes numbers and pictures into a folder: (pool, seeds, folder,
+    write: Callable[[StudyFolder, int, Path, int], None]
+    """measures what else it needs, and writes numbers and pictures into a folder: (studies, seeds, folder,
     processes)"""
     roads: tuple[str, ...] = ()
     """where drivers that do not learn are driven beside them"""
     minutes: float = 0.0
     """what it takes beside trainings and drives, on two cores"""
+    tables: Mapping[str, Callable[[Path], pd.DataFrame]] = field(default_factory=dict)
+    """of its page, by name, made of what it wrote into a folder"""

@@ -19,9 +19,7 @@ from unjam.drivers.residual import ResidualDriver
 from unjam.files import to_json, write_whole
 from unjam.measures.statistics import estimate
 from unjam.reports.figures import INK, LINES, STYLE
-from unjam.studies.plan import PAPERS_ROADS, VARIANTS, PlannedRun, planned
-from unjam.studies.pool import Pool
-from unjam.studies.study import Study
+from unjam.studies.study import PAPERS_ROADS, VARIANTS, PlannedRun, Study, StudyFolder, Table, planned
 from unjam.studies.table import entries
 from unjam.training.evaluate import evaluate, held_out_seeds
 from unjam.worlds.workers import Workers
@@ -37,21 +35,17 @@ TOLERANCE = 0.05
 def random_network(inputs: int, authority: float, seed: int, hidden: int = 64) -> Network:
     """Return a policy network whose weights nobody has trained, drawn like those of torch's linear layers."""
     generator = np.random.default_rng(np.random.SeedSequence([seed]))
-    sizes = (inputs, hidden, hidden, 1)
     layers = []
-    for rows, columns in pairwise(sizes):
+    for rows, columns in pairwise((inputs, hidden, hidden, 1)):
         width = rows**-0.5
-        weight, bias = (
-            generator.uniform(-width, width, (rows, columns)),
-            generator.uniform(-width, width, columns),
-        )
-        layers.append((weight, bias))
+        weight = generator.uniform(-width, width, (rows, columns))
+        layers.append((weight, generator.uniform(-width, width, columns)))
     return Network(tuple(layers), authority)
 
 
 def untrained(
     roads: Sequence[str] = PAPERS_ROADS, policies: int = RANDOM_POLICIES, processes: int = 2
-) -> list[dict[str, Any]]:
+) -> Table:
     """A1: return of the expert plus a random residual beside a random network alone, on the same seeds."""
     rows = []
     with Workers(processes) as workers:
@@ -73,27 +67,21 @@ def untrained(
     return rows
 
 
-def convergence(pool: Pool, seeds: int) -> list[dict[str, Any]]:
+def convergence(studies: StudyFolder, seeds: int) -> Table:
     """A2: which trainings come to within a share of the best return that is known, and when."""
-    runs = {
-        variant: pool.trained([PlannedRun(ROAD, variant, seed) for seed in range(seeds)])
-        for variant in COMPARED
-    }
+    runs = {variant: studies.trained(ROAD, variant, seeds) for variant in COMPARED}
     best = max(row["return_mean"] for found in runs.values() for run in found for row in run.progress)
     enough = best - TOLERANCE * abs(best)
     rows = []
     for variant, found in runs.items():
-        arrivals = []
-        for run in found:
-            near = [row for row in run.progress if row["return_mean"] >= enough]
-            arrivals.append(near[0]["actual_steps"] if near else None)
+        near = [[row for row in run.progress if row["return_mean"] >= enough] for run in found]
         last = [run.in_training("return_mean") for run in found]
         rows.append(
             {
                 "variant": variant,
                 "name": VARIANTS[variant].label,
                 "best_known": best,
-                "arrivals": arrivals,
+                "arrivals": [there[0]["actual_steps"] if there else None for there in near],
                 "stayed": sum(value >= enough for value in last),
                 "trainings": len(found),
                 "last": entries(estimate(last)),
@@ -102,13 +90,14 @@ def convergence(pool: Pool, seeds: int) -> list[dict[str, Any]]:
     return rows
 
 
-def model_over_training(pool: Pool, seeds: int) -> dict[str, list[list[dict[str, Any]]]]:
+def model_over_training(studies: StudyFolder, seeds: int) -> dict[str, list[Table]]:
     """A3: eps_m, k*, the bound, and how far virtual returns are from actual ones; by variant and seed."""
-    found = {}
-    for variant in WITH_MODEL:
-        runs = pool.trained([PlannedRun(ROAD, variant, seed) for seed in range(seeds)])
-        found[variant] = [[_model_facts(row) for row in run.progress] for run in runs]
-    return found
+    return {
+        variant: [
+            [_model_facts(row) for row in run.progress] for run in studies.trained(ROAD, variant, seeds)
+        ]
+        for variant in WITH_MODEL
+    }
 
 
 def _model_facts(row: dict[str, Any]) -> dict[str, Any]:
@@ -119,7 +108,7 @@ def _model_facts(row: dict[str, Any]) -> dict[str, Any]:
     return {"steps": row["actual_steps"], "gap": gap, **{name: virtual.get(name) for name in names}}
 
 
-def draw(by_variant: dict[str, list[list[dict[str, Any]]]]) -> Figure:
+def draw(by_variant: dict[str, list[Table]]) -> Figure:
     """Draw the model error and the rollout length over training, a line per training."""
     with rc_context(STYLE):
         figure = Figure(figsize=(10.5, 3.4), layout="constrained", dpi=130)
@@ -138,15 +127,14 @@ def draw(by_variant: dict[str, list[list[dict[str, Any]]]]) -> Figure:
         return figure
 
 
-def _write(pool: Pool, seeds: int, folder: Path, workers: int) -> None:
-    by_variant = model_over_training(pool, seeds)
+def _write(studies: StudyFolder, seeds: int, folder: Path, workers: int) -> None:
     found = {
         "untrained": untrained(processes=workers),
-        "convergence": convergence(pool, seeds),
-        "model": by_variant,
+        "convergence": convergence(studies, seeds),
+        "model": model_over_training(studies, seeds),
     }
     write_whole(folder / "theory.json", to_json(found, indent=1))
-    draw(by_variant).savefig(folder / "model.png")
+    draw(found["model"]).savefig(folder / "model.png")
 
 
 THEORY = Study(

@@ -3,7 +3,7 @@ from pathlib import Path
 
 import pytest
 
-from unjam.studies.parts import Part, about_study, measure_parts, read_part
+from unjam.studies.study import Part, about_study, measure_parts, read_part
 
 
 def square(number: int) -> dict[str, int]:
