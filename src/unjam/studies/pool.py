@@ -12,11 +12,10 @@ from unjam.controller.archive import WEIGHTS, unpack_parts
 from unjam.controller.file import hash_of
 from unjam.reports.results import EVALUATION_FILE, Results, read_progress, read_results, read_rows
 from unjam.studies.plan import PlannedRun
-from unjam.training.executors import Command
+from unjam.training.evaluate import TRAINED
+from unjam.training.executors import Command, training_command
 from unjam.training.folder import read_config
-from unjam.training.judge import TRAINED
 from unjam.training.presets import CLOSING_ABSORBER
-from unjam.training.trainings import training_command
 
 REFERENCES: dict[str, str] = {
     "human": "human",

@@ -17,7 +17,7 @@ from unjam.studies.pool import REFERENCES, Pool
 from unjam.studies.study import Study
 from unjam.training.config import load_config
 from unjam.training.evaluate import evaluate, held_out_seeds, save_evaluation
-from unjam.training.executors import Executor, Told, run_all
+from unjam.training.executors import Executor, OnLine, run_all
 from unjam.training.folder import read_config
 from unjam.worlds.drive import can_drive
 from unjam.worlds.workers import Workers
@@ -105,7 +105,7 @@ def reproduce(
     plan: Plan,
     workers: int,
     executor: Executor = "local",
-    told: Told = lambda line: None,
+    told: OnLine = lambda line: None,
 ) -> list[Path]:
     """Make what is missing for some studies, draw them, and return their folders.
 

@@ -18,8 +18,8 @@ from unjam.learners.imagination import Imagination
 from unjam.learners.state import restore_imagination
 from unjam.reports.results import MODEL_FILE, read_model, read_progress
 from unjam.scenarios.scenario import Scenario
-from unjam.training.checkpoint import load_checkpoint
 from unjam.training.config import RunConfig
+from unjam.training.folder import load_checkpoint
 from unjam.virtual.comparison import OneStepErrors, one_step_errors, open_loop, recorded, replay
 from unjam.virtual.data import ActualData
 from unjam.virtual.model import NUMBERS, TARGETS, EnvironmentModel

@@ -11,8 +11,8 @@ from unjam.drivers.registry import describe
 from unjam.measures.statistics import Estimate, paired_difference
 from unjam.reports.html import write_report
 from unjam.training.config import RunConfig
+from unjam.training.evaluate import TRAINED, judge
 from unjam.training.folder import check_possible, continue_folder, start_folder
-from unjam.training.judge import TRAINED, judge
 from unjam.training.model_facts import write_model_facts
 from unjam.training.run import Run, Told
 from unjam.worlds.workers import Workers
