@@ -46,12 +46,12 @@ def scenarios(
         if json:
             print_json({key: scenario_recipe(scenario) for key, scenario in SCENARIOS.items()})
             return
-        table = new_table(("scenario", "road", "vehicles", "limit", "decisions", "warm-up"))
+        shown = ("road", "vehicles", "limit")
+        table = new_table(("scenario", *shown, "decisions", "warm-up"))
         for key, scenario in SCENARIOS.items():
             facts = dict(scenario.facts())
             warmup = f"{scenario.warmup * scenario.simulation_step:g} s"
-            words = (facts["road"], facts["vehicles"], facts["limit"])
-            table.add_row(key, *words, f"{scenario.horizon:,}", warmup)
+            table.add_row(key, *(facts[fact] for fact in shown), f"{scenario.horizon:,}", warmup)
         console.print(table)
         return
     scenario = _scenario(name)
@@ -100,13 +100,10 @@ def _draw(scenario: Any, name: str, path: Path) -> None:
 def _common_facts(scenario: Any) -> list[tuple[str, str]]:
     from unjam.drivers.local_state import OBSERVED
 
-    step = scenario.simulation_step
+    warmup, seconds = scenario.warmup, scenario.warmup * scenario.simulation_step
     return [
         ("episode", f"{scenario.horizon:,} decisions of {scenario.decision_step:g} s; a collision ends it"),
-        (
-            "warm-up",
-            f"{scenario.warmup} all-human steps ({scenario.warmup * step:g} s), before control, not counted",
-        ),
+        ("warm-up", f"{warmup} all-human steps ({seconds:g} s), before control, not counted"),
         ("people", scenario.people_in_words),
         ("action", f"acceleration within ±{scenario.action_limit:g} m/s2, {scenario.actuation}"),
         ("observation", "; ".join(map(str, OBSERVED["local"]))),
@@ -124,24 +121,22 @@ def drivers(json: JsonOption = False) -> None:
     from unjam.controller.naming import SHIPPED, shipped_names
     from unjam.drivers.registry import DRIVERS
 
-    if json:
-        named = {
-            name: {"about": _first_line(kind), "parameters": parameter_rows(kind())}
-            for name, kind in DRIVERS.items()
-        }
-        shipped = {
-            f"{SHIPPED}{name}": {"about": _about_shipped(name), "parameters": []} for name in shipped_names()
-        }
-        print_json(named | shipped)
-        return
+    listed: dict[str, dict[str, Any]] = {}
     for name, kind in DRIVERS.items():
-        console.print(f"[bold]{name}[/bold]  {_first_line(kind)}")
-        rows = [row for row in parameter_rows(kind()) if row["name"] != "time_step"]
+        about = (kind.__doc__ or "").strip().splitlines()[0]
+        listed[name] = {"about": about, "parameters": parameter_rows(kind())}
+    for name in shipped_names():
+        listed[f"{SHIPPED}{name}"] = {"about": _about_shipped(name), "parameters": []}
+    if json:
+        print_json(listed)
+        return
+    for name, entry in listed.items():
+        console.print(f"[bold]{name}[/bold]  {entry['about']}")
+        rows = [row for row in entry["parameters"] if row["name"] != "time_step"]
         if rows:
             console.print(_parameter_table(rows, "parameter"))
-        console.print()
-    for name in shipped_names():
-        console.print(f"[bold]{SHIPPED}{name}[/bold]  {_about_shipped(name)}")
+        if name in DRIVERS:
+            console.print()
     console.print(
         "\nYour own: --driver path.py:name, a function or a class; check it with unjam.check_driver."
     )
@@ -159,10 +154,6 @@ def _about_shipped(name: str) -> str:
         f"{expert} + residual, trained on {road}: {ours:.2f} m/s of all vehicles on "
         f"{metrics['trained']['episodes']} held-out seeds, its expert {theirs:.2f}"
     )
-
-
-def _first_line(kind: type) -> str:
-    return (kind.__doc__ or "").strip().splitlines()[0]
 
 
 def parameter_rows(instance: Any) -> list[dict[str, Any]]:

@@ -16,7 +16,6 @@ from unjam.training.executors import EXECUTORS, Executor
 ScenarioArgument = Annotated[
     str, typer.Argument(help="A scenario's name (`unjam scenarios` lists them), or your own .sumocfg file.")
 ]
-RunArgument = Annotated[Path, typer.Argument(help="Folder of a training run.")]
 RewardOption = Annotated[
     str,
     typer.Option(

@@ -37,7 +37,6 @@ def evaluate(
       unjam evaluate runs/ring-001 --humans drivers.json --out runs/among-others
     """
     from unjam.drivers.registry import DRIVERS
-    from unjam.measures.statistics import summarise
     from unjam.reports.html import write_report
     from unjam.reports.story import signed
     from unjam.training.evaluate import among, comparison, judge
@@ -56,11 +55,10 @@ def evaluate(
     result = TrainResult(out or run, found.rows, gain_of(config, found.rows))
     write_report([result.folder], result.report)
     if json:
-        gain = asdict(result.gain) if result.gain else None
-        drivers = []
-        for driver, rows in found.rows.items():
-            means = {name: entry.mean for name, entry in summarise(rows).items()}
-            drivers.append({"driver": driver, "episodes": rows, "mean": means})
+        gain, means = asdict(result.gain) if result.gain else None, found.means()
+        drivers = [
+            {"driver": driver, "episodes": rows, "mean": means[driver]} for driver, rows in found.rows.items()
+        ]
         print_json({"run": str(run), "scenario": config.scenario, "gain": gain, "drivers": drivers})
         return
     console.print(metrics_table(found.rows))

@@ -74,20 +74,16 @@ def train(
         config = load_config(asked.file, asked.preset, changes)
         folder = new_folder(out, config.scenario)
     check_possible(config)
-    from unjam.measures.statistics import summarise
-    from unjam.reports.story import signed
-    from unjam.training.train import train as run  # torch: seconds that nobody waits for a wrong word
+    from unjam.reports.story import signed  # and torch: seconds that nobody waits for a wrong word
+    from unjam.training.evaluate import Evaluation
+    from unjam.training.train import train as run
 
     with nullcontext() if json else _Progress(config.steps, folder) as shown:
         result = run(config, folder, resume is not None, shown and shown.iteration, shown and shown.judging)
     if json:
-        means = {
-            driver: {name: found.mean for name, found in summarise(rows).items()}
-            for driver, rows in result.rows.items()
-        }
         files = {name: str(getattr(result, name)) for name in ("folder", "controller", "report")}
         gain = asdict(result.gain) if result.gain else None
-        print_json({**files, "gain": gain, "drivers": means})
+        print_json({**files, "gain": gain, "drivers": Evaluation(result.rows, {}).means()})
         return
     console.print(metrics_table(result.rows))
     if result.gain is not None:

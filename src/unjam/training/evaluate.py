@@ -20,7 +20,7 @@ from unjam.errors import DiskError, EpisodeError, InputError, MissingPartError, 
 from unjam.files import make_folder, to_json, write_whole
 from unjam.manifest import manifest
 from unjam.measures.metrics import METRICS, measure
-from unjam.measures.statistics import Estimate, estimate, summarise
+from unjam.measures.statistics import Estimate, summarise
 from unjam.reports.html import write_report
 from unjam.reports.results import PICTURED
 from unjam.scenarios.registry import make_scenario
@@ -58,7 +58,7 @@ class Evaluation:
     def means(self) -> dict[str, dict[str, float]]:
         """Return the mean of each metric, by driver."""
         return {
-            label: {name: estimate([row[name] for row in rows]).mean for name in METRICS}
+            label: {name: found.mean for name, found in summarise(rows).items()}
             for label, rows in self.rows.items()
         }
 

@@ -9,11 +9,13 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, as_completed
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 from unjam.errors import MissingPartError, UnjamError
 from unjam.files import make_folder, write_whole
-from unjam.training.config import RunConfig, to_toml
+
+if TYPE_CHECKING:  # the command line asks which executors there are: it is to be quick
+    from unjam.training.config import RunConfig
 
 Executor = Literal["local", "ray"]
 EXECUTORS: tuple[Executor, ...] = ("local", "ray")
@@ -41,7 +43,7 @@ class Command(NamedTuple):
         return [sys.executable, "-m", "unjam", *(self.again if begun else self.words)]
 
 
-def training_command(config: RunConfig, folder: Path, plan: Path, log: Path) -> Command:
+def training_command(config: "RunConfig", folder: Path, plan: Path, log: Path) -> Command:
     """Return the command line that begins a training, or goes on with it.
 
     Args:
@@ -50,6 +52,8 @@ def training_command(config: RunConfig, folder: Path, plan: Path, log: Path) -> 
         plan: file for the configuration, written here.
         log: where what it prints is added.
     """
+    from unjam.training.config import to_toml
+
     make_folder(plan.parent)
     write_whole(plan, to_toml(config))
     once = ["--workers", str(config.workers)]

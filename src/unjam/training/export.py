@@ -66,16 +66,17 @@ def export_controller(source: str | Path, to: str | Path, onnx: bool = False, sc
         why = f"{Path(code[0]['path']).name} is Python code" if code else "human is the simulator itself"
         raise InputError(f"export: {describe(driver)} is not allowed: {why}; allowed: drivers that are data")
     limit = driver.action_limit if isinstance(driver, ResidualDriver) else road.action_limit
-    graph = _graph(driver, limit) if onnx else None
+    graph: dict[str, bytes] = {}
+    if onnx:
+        from unjam.controller.onnx_graph import onnx_graph  # torch.onnx takes its time, and not all want it
+
+        graph = {GRAPH: onnx_graph(driver, limit)}
     states = _perceived(road, driver)
-    parts = {SAMPLE: sample_bytes(driver, states, limit)}
-    if graph is not None:
-        parts[GRAPH] = graph
-    write_whole(to, controller_bytes(driver, about, parts))
+    write_whole(to, controller_bytes(driver, about, {SAMPLE: sample_bytes(driver, states, limit), **graph}))
     verify_controller(to)
-    beside = to.with_suffix(".onnx") if graph is not None else None
-    if beside is not None and graph is not None:
-        write_whole(beside, graph)
+    beside = to.with_suffix(".onnx") if graph else None
+    if beside is not None:
+        write_whole(beside, graph[GRAPH])
     return Exported(to, beside, describe(driver), len(states.speed))
 
 
@@ -116,12 +117,6 @@ def _held_out(folder: Path) -> dict[str, Any] | None:
             estimates = {name: each.__dict__ for name, each in summarise(rows).items() if each.count}
             measured[label] = {"episodes": len(rows), **estimates}
     return measured
-
-
-def _graph(driver: Driver, limit: float) -> bytes:
-    from unjam.controller.onnx_graph import onnx_graph  # torch.onnx takes its time, and not all want it
-
-    return onnx_graph(driver, limit)
 
 
 def _perceived(road: Scenario, driver: Driver) -> LocalState:
