@@ -69,9 +69,10 @@ def fit_drivers(
         return
     for line in found.words:
         aside.print(line)
-    typical = asdict(found.population.typical)
+    population: Any = found.population
+    typical = asdict(population.typical)
     table = new_table(("parameter",), ("one for all", "mean", "std", "quartiles of the drivers"))
-    for name, spread in found.population.spread().items():
+    for name, spread in population.spread().items():
         quartiles = "  ".join(f"{value:.2f}" for value in spread["quartiles"])
         values = (typical[name], spread["mean"], spread["std"])
         table.add_row(name, *(f"{value:.2f}" for value in values), quartiles)

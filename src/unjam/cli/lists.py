@@ -147,8 +147,8 @@ def _about_shipped(name: str) -> str:
     from unjam.controller.file import read_controller
     from unjam.controller.naming import shipped_file
 
-    told = read_controller(shipped_file(name)).manifest
-    expert, metrics, road = told["expert"], told["metrics"], told["run"]["scenario"]
+    manifest = read_controller(shipped_file(name)).manifest
+    expert, metrics, road = manifest["expert"], manifest["metrics"], manifest["run"]["scenario"]
     ours, theirs = (metrics[label]["mean_speed"]["mean"] for label in ("trained", expert))
     return (
         f"{expert} + residual, trained on {road}: {ours:.2f} m/s of all vehicles on "

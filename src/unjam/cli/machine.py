@@ -159,13 +159,13 @@ def bench(
     if json:
         print_json(found)
         return
-    looks, bare = "run_episode, residual that looks", "{:.2f} of bare"
+    residual, bare = "run_episode, residual that looks", "{:.2f} of bare"
     rows = [
         ("bare SUMO", found["bare_steps_per_s"], "1"),
-        (f"{looks} once a second", found["episode_steps_per_s"], bare.format(found["over_bare"])),
+        (f"{residual} once a second", found["episode_steps_per_s"], bare.format(found["over_bare"])),
     ]
     every_step, slower = bare.format(found["over_bare_every_step"]), f"{found['over_traci']:.1f} times slower"
-    rows.append((f"{looks} in every step", found["every_step_steps_per_s"], every_step))
+    rows.append((f"{residual} in every step", found["every_step_steps_per_s"], every_step))
     rows.append(("the first of these over TraCI", found["traci_steps_per_s"], slower))
     for rollouts in found["virtual"].values():
         words = f"{rollouts['rows']:,} rollouts of {rollouts['decisions']} decisions"

@@ -23,6 +23,7 @@ from unjam.training.folder import check_possible
 if TYPE_CHECKING:
     from optuna import Study
     from optuna.trial import FrozenTrial
+    from optuna.trial import Trial as OptunaTrial
 
 CONFIG, FOUND, BEST = "config.toml", "search.json", "best.toml"
 JOURNAL = "journal.log"
@@ -48,12 +49,23 @@ class Range:
         """What is checked before the search: if these can be, those between can."""
         return self.low, self.high
 
+    def suggest(self, trial: "OptunaTrial", key: str) -> None:
+        """Let Optuna choose one."""
+        if self.whole:
+            trial.suggest_int(key, int(self.low), int(self.high), log=self.log)
+        else:
+            trial.suggest_float(key, self.low, self.high, log=self.log)
+
 
 @dataclass(frozen=True)
 class Choice:
     """One of several values."""
 
     ends: tuple[Any, ...]
+
+    def suggest(self, trial: "OptunaTrial", key: str) -> None:
+        """Let Optuna choose one."""
+        trial.suggest_categorical(key, self.ends)
 
 
 Space = dict[str, Range | Choice]
@@ -70,14 +82,13 @@ def space_of(texts: Sequence[str]) -> Space:
         key, equals, values = (part.strip() for part in text.partition("="))
         if not (key and equals and values):
             raise wrong("vary", text, "key=low..high, key=low..high:log or key=a,b,c")
-        space[key] = _range(text, values) if ".." in values else Choice(_values(values))
+        if ".." in values:
+            space[key] = _range(text, values)
+        else:
+            space[key] = Choice(tuple(parse_value(value.strip()) for value in values.split(",")))
     if not space:
         raise InputError("vary: at least one key is needed: --vary trpo.target_kl=0.003..0.1:log")
     return space
-
-
-def _values(text: str) -> tuple[Any, ...]:
-    return tuple(parse_value(value.strip()) for value in text.split(","))
 
 
 def _range(text: str, values: str) -> Range:
@@ -155,10 +166,7 @@ def search(
             for done in wait(jobs, return_when=FIRST_COMPLETED).done:
                 number = jobs.pop(done)
                 gain = None if done.result() else gain_of(_trial_folder(folder, number))
-                if gain is None or not math.isfinite(gain):
-                    study.tell(number, state=_state("FAIL"))
-                else:
-                    study.tell(number, gain)
+                _tell(study, number, gain)
                 on_line(_words(study, number, trials))
     found = [
         Trial(trial.number, trial.params, _trial_folder(folder, trial.number), trial.value)
@@ -222,24 +230,22 @@ def _next(
         stopped = waiting.pop(0)
         if stopped.params.keys() == space.keys():
             return stopped.number, stopped.params
-        study.tell(stopped.number, state=_state("FAIL"))  # it was stopped before it had all its values
+        _tell(study, stopped.number, None)  # it was stopped before it had all its values
     if len(study.get_trials(deepcopy=False)) >= trials:
         return None
     trial = study.ask()
     for key, values in space.items():
-        if isinstance(values, Choice):
-            trial.suggest_categorical(key, values.ends)
-        elif values.whole:
-            trial.suggest_int(key, int(values.low), int(values.high), log=values.log)
-        else:
-            trial.suggest_float(key, values.low, values.high, log=values.log)
+        values.suggest(trial, key)
     return trial.number, trial.params
 
 
-def _state(name: str) -> Any:
+def _tell(study: "Study", number: int, gain: float | None) -> None:
     from optuna.trial import TrialState
 
-    return TrialState[name]
+    if gain is None or not math.isfinite(gain):
+        study.tell(number, state=TrialState.FAIL)
+    else:
+        study.tell(number, gain)
 
 
 def gain_of(folder: Path) -> float | None:

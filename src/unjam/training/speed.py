@@ -64,8 +64,8 @@ def measure_speed(rounds: int = ROUNDS, on_line: OnLine = lambda line: None) -> 
     """Return steps per second, ratios, and the cost of a vehicle-step by size; on one core.
 
     `over_bare`: steps/s of `run_episode` (loading and recording included) over those of SUMO alone, with the
-    residual driver that training makes by default, whose network looks once a second.
-    `over_bare_every_step`: the same with a network that looks in every step.
+    residual driver that training makes by default, whose network chooses once a second.
+    `over_bare_every_step`: the same with a network that chooses in every step.
     `over_traci`: steps/s of the same driving loop with libsumo over those through TraCI.
     `virtual`: decisions/s of virtual rollouts, with the default ensemble and beginning them included, over
     those of `run_episode`.
