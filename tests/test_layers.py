@@ -227,7 +227,7 @@ def test_help_loads_nothing_that_takes_time(arguments: list[str]) -> None:
 
 
 @pytest.mark.parametrize(
-    "module", ["worlds.worker", "training.drive", "training.judge", "training.config", "controller"]
+    "module", ["worlds.worker", "training.evaluate", "training.folder", "training.config", "controller"]
 )
 def test_what_learns_nothing_loads_no_learning_library(module: str) -> None:
     found = loaded_by(f"import unjam.{module}")

@@ -18,7 +18,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 
-from unjam.drivers.residual import ResidualDriver, observation_size
+from unjam.drivers.observation import observation_size
+from unjam.drivers.residual import ResidualDriver
 from unjam.files import to_json, write_whole
 from unjam.learners.algorithms import LEARNERS
 from unjam.learners.episodic import Training

@@ -26,14 +26,14 @@ if TYPE_CHECKING:
     from unjam.environments.several import parallel_env
     from unjam.reports.html import write_report
     from unjam.training.config import load_config
-    from unjam.training.drive import drive
+    from unjam.training.evaluate import drive
     from unjam.training.export import export_controller
     from unjam.training.train import train
     from unjam.worlds.episode import run_episode
 
 # Imported when first used: workers must stay free of torch, and the command line quick.
 _PLACES = {
-    "drive": "unjam.training.drive",
+    "drive": "unjam.training.evaluate",
     "train": "unjam.training.train",
     "load_config": "unjam.training.config",
     "load_controller": "unjam.controller",

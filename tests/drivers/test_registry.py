@@ -1,7 +1,7 @@
 import pytest
 
 from unjam.drivers import Constant, FollowerStopper, PISaturation
-from unjam.drivers.registry import describe, named_driver, recipe_of
+from unjam.drivers.registry import named_driver, recipe_of
 from unjam.errors import InputError
 
 
@@ -15,8 +15,8 @@ def test_names_take_parameters() -> None:
 
 
 def test_description_names_what_differs_from_the_defaults() -> None:
-    assert describe(named_driver("pi", 0.5)) == "pi"
-    assert describe(named_driver("pi:window=10", 0.1)) == "pi:window=10.0"
+    assert named_driver("pi", 0.5).describe() == "pi"
+    assert named_driver("pi:window=10", 0.1).describe() == "pi:window=10.0"
 
 
 @pytest.mark.parametrize(

@@ -12,8 +12,8 @@ from tests.faults.outcome import Outcome, one_line
 from unjam.controller import controller_bytes, load_controller
 from unjam.controller.verify import verify_controller
 from unjam.errors import DiskError, InputError
-from unjam.training.checkpoint import STATE, TENSORS, load_checkpoint, save_checkpoint
 from unjam.training.config import load_config, to_toml
+from unjam.training.folder import STATE, TENSORS, load_checkpoint, save_checkpoint
 
 MUTATIONS = ("change", "cut", "insert", "double", "swap")
 LONGEST = 2.0

@@ -21,7 +21,7 @@ from tests.worlds.test_workers import processes
 from unjam.drivers import IDM, PISaturation
 from unjam.errors import InputError
 from unjam.scenarios import Ring, make_scenario
-from unjam.training.checkpoint import load_checkpoint
+from unjam.training.folder import load_checkpoint
 from unjam.worlds.episode import run_episode
 from unjam.worlds.sumo.simulation import Simulation
 from unjam.worlds.workers import EpisodeTask, Workers

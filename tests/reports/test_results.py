@@ -12,7 +12,7 @@ from unjam.errors import InputError
 from unjam.measures.metrics import METRICS
 from unjam.reports.results import Results, command_to_repeat, read_progress, read_results
 from unjam.scenarios import Ring
-from unjam.training.drive import DriveResult
+from unjam.training.evaluate import DriveResult
 from unjam.worlds.episode import run_episode
 
 ROAD = {"length": (120, 120), "vehicles": 8, "horizon": 150}

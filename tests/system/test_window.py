@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 
 from tests.system.conftest import Run
+from unjam.cli.drive import watch_in_window
 from unjam.drivers import PISaturation
 from unjam.scenarios import Ring
-from unjam.training.watch import watch_in_window
 from unjam.worlds.episode import run_episode
 
 XVFB = shutil.which("Xvfb")

@@ -15,7 +15,7 @@ import torch._dynamo  # noqa: F401  # what the first optimiser of a process impo
 
 import unjam.cli
 import unjam.cli.output
-import unjam.training.drive
+import unjam.training.evaluate
 import unjam.training.model_facts
 import unjam.training.train
 from tests.pictures import empty_pictures

@@ -13,8 +13,8 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from unjam.errors import DiskError, InputError
-from unjam.training import checkpoint
-from unjam.training.checkpoint import STATE, TENSORS, load_checkpoint, save_checkpoint
+from unjam.training import folder as run_folder
+from unjam.training.folder import STATE, TENSORS, load_checkpoint, save_checkpoint
 
 Content = tuple[dict[str, Any], dict[str, torch.Tensor]]
 
@@ -81,7 +81,7 @@ def test_what_else_lies_in_the_folder_is_left_alone(tmp_path: Path) -> None:
 def test_what_another_version_made_is_refused_in_one_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(checkpoint, "FORMAT", 1)
+    monkeypatch.setattr(run_folder, "FORMAT", 1)
     save_all(tmp_path, 1)
     monkeypatch.undo()
     with pytest.raises(InputError, match=r"000001 has format 1, of another version of unjam; allowed: \d+$"):

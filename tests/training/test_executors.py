@@ -16,8 +16,7 @@ from unjam.errors import MissingPartError, UnjamError
 from unjam.reports.results import read_progress
 from unjam.training import executors
 from unjam.training.config import RunConfig
-from unjam.training.executors import Command, Processes, run_all
-from unjam.training.trainings import training_command
+from unjam.training.executors import Command, Processes, run_all, training_command
 
 FAST = small_config(evaluation__every=0, evaluation__episodes=1, evaluation__baselines=[])
 

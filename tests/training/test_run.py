@@ -15,10 +15,9 @@ from unjam.controller import load_controller
 from unjam.drivers import PISaturation, ResidualDriver
 from unjam.errors import InputError
 from unjam.reports.results import read_progress
-from unjam.training.checkpoint import TENSORS, load_checkpoint, save_checkpoint
 from unjam.training.config import RunConfig, load_config
 from unjam.training.evaluate import HELD_OUT, VALIDATION
-from unjam.training.folder import continue_folder, start_folder
+from unjam.training.folder import TENSORS, continue_folder, load_checkpoint, save_checkpoint, start_folder
 from unjam.training.run import Run
 from unjam.worlds.workers import Workers
 

@@ -13,8 +13,7 @@ from unjam.errors import InputError, MissingPartError, UnjamError
 from unjam.files import to_json
 from unjam.training.config import load_config
 from unjam.training.executors import Command, Processes
-from unjam.training.search import gain_of, search
-from unjam.training.search_space import Choice, Range, check_space, space_of, trial_config
+from unjam.training.search import Choice, Range, check_space, gain_of, search, space_of, trial_config
 
 BASE = small_config(evaluation__every=1)
 SPACE = space_of(["trpo.target_kl=0.001..0.1:log", "trpo.critic_batch=8,16", "trpo.critic_epochs=1..9"])
@@ -167,7 +166,7 @@ def test_a_search_of_which_all_fails_says_so(tmp_path: Path, trainings: Training
     trainings.failing = True
     told: list[str] = []
     with pytest.raises(UnjamError, match="all 3 trainings failed; what they said is in"):
-        search(BASE, SPACE, 3, tmp_path, 2, told=told.append)
+        search(BASE, SPACE, 3, tmp_path, 2, on_line=told.append)
     assert all(line.endswith("failed") for line in told)
 
 

@@ -14,7 +14,6 @@ from tests.training.test_run import STEPS, learn_with, outcome, small_config
 from unjam.controller import load_controller
 from unjam.drivers import ResidualDriver
 from unjam.drivers.constant import Constant
-from unjam.drivers.registry import describe
 from unjam.errors import InputError, UnjamError
 from unjam.measures.metrics import METRICS
 from unjam.reports.results import read_progress, read_results
@@ -197,7 +196,7 @@ def test_a_file_in_the_place_of_the_folder_is_left_alone(tmp_path: Path) -> None
 
 def test_the_gain_is_that_over_an_expert_with_parameters() -> None:
     config = small_config(expert="pi:window=30")
-    expert = describe(config.make_expert())
+    expert = config.make_expert().describe()
     rows = {
         "pi": [{"seed": (1, 0), "return": 100.0}],
         expert: [{"seed": (1, 0), "return": 5.0}, {"seed": (1, 1), "return": 6.0}],

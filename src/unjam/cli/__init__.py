@@ -1,4 +1,4 @@
-"""The command line: `unjam VERB`. Each verb is a file of this package."""
+"""The command line: `unjam VERB`. Verbs that are about the same share a file of this package."""
 
 import os
 import signal
@@ -10,20 +10,14 @@ from typing import Annotated
 import typer
 
 from unjam import __version__
-from unjam.cli.bench import bench
-from unjam.cli.doctor import doctor
-from unjam.cli.drive import drive
-from unjam.cli.evaluate import evaluate
-from unjam.cli.export import export
+from unjam.cli.controllers import export, verify
+from unjam.cli.drive import drive, watch
 from unjam.cli.fit_drivers import fit_drivers
 from unjam.cli.lists import drivers, scenarios
-from unjam.cli.model import model
-from unjam.cli.report import report
-from unjam.cli.reproduce import reproduce
-from unjam.cli.search import search
+from unjam.cli.machine import bench, doctor
+from unjam.cli.results import evaluate, model, report
+from unjam.cli.search import reproduce, search
 from unjam.cli.train import train
-from unjam.cli.verify import verify
-from unjam.cli.watch import watch
 from unjam.errors import DISK_ERRNOS, UnjamError, disk_error
 
 INTERRUPTED, TERMINATED = 130, 143

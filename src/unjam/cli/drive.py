@@ -1,34 +1,39 @@
-"""`unjam drive`: run episodes with a driver, print metrics, write a report."""
+"""Episodes with a driver: `unjam drive` measures them, `unjam watch` shows one."""
 
+import os
+import sys
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from unjam.cli.options import (
     DEFAULT_WORKERS,
-    CavShareOption,
-    CavsOption,
-    CavTypesOption,
-    EpisodesOption,
-    HumansOption,
     JsonOption,
-    LengthOption,
     OutOption,
-    RadiusOption,
     RewardOption,
     ScenarioArgument,
+    ScenarioSettingsOption,
     SeedOption,
-    VehiclesOption,
-    WarmupOption,
     WorkersOption,
     assignments,
     new_folder,
-    road_changes,
+    scenario_changes,
+    with_options,
 )
+from unjam.cli.output import aside, console, counting_steps, metrics_table, print_json
+from unjam.errors import MissingPartError
+
+if TYPE_CHECKING:
+    from unjam.drivers.driver import Driver
+    from unjam.scenarios.scenario import Scenario
+    from unjam.worlds.record import Episode
 
 
+@with_options(changes=scenario_changes)
 def drive(
+    *,
     scenario: ScenarioArgument,
     driver: Annotated[
         list[str],
@@ -40,23 +45,14 @@ def drive(
             "the same traffic.",
         ),
     ],
-    episodes: EpisodesOption = 5,
+    episodes: Annotated[int, typer.Option("--episodes", "-n", min=1, help="Number of episodes.")] = 5,
     seed: SeedOption = 0,
     held_out: Annotated[
         bool, typer.Option("--held-out", help="On the seeds that judge trainings, instead of --seed.")
     ] = False,
-    length: LengthOption = None,
-    radius: RadiusOption = None,
-    vehicles: VehiclesOption = None,
-    cavs: CavsOption = None,
-    warmup: WarmupOption = None,
-    cav_share: CavShareOption = None,
-    cav_types: CavTypesOption = None,
-    humans: HumansOption = None,
+    changes: dict[str, Any],
     reward: RewardOption = "",
-    settings: Annotated[
-        list[str] | None, typer.Option("--set", help="Any parameter of the scenario: key=value.")
-    ] = None,
+    settings: ScenarioSettingsOption = None,
     workers: WorkersOption = DEFAULT_WORKERS,
     out: OutOption = None,
     report: Annotated[bool, typer.Option(help="Write the results and a report.html into a folder.")] = True,
@@ -80,19 +76,15 @@ def drive(
 
       unjam drive ring -d pi -d runs/ring-001 --held-out --episodes 20
     """
-    from unjam.cli.output import aside, console, counting_steps, metrics_table, print_json
     from unjam.scenarios.registry import make_scenario
-    from unjam.training.drive import drive as run
-    from unjam.training.drive import raise_failures
+    from unjam.training.evaluate import drive as run
+    from unjam.training.evaluate import raise_failures
 
-    road = {
-        **road_changes(length, radius, vehicles, cavs, warmup, cav_share, cav_types, humans),
-        **assignments(settings),
-    }
-    total = make_scenario(scenario, road).horizon * episodes * len(driver)
+    changes |= assignments(settings)
+    total = make_scenario(scenario, changes).horizon * episodes * len(driver)
     folder = new_folder(out, f"drive-{Path(scenario).stem}") if report else None
     with counting_steps(f"driving {Path(scenario).name}", total) as steps:
-        result = run(scenario, driver, episodes, seed, road, reward, workers, folder, steps, held_out)
+        result = run(scenario, driver, episodes, seed, changes, reward, workers, folder, steps, held_out)
     if json:
         print_json(result.document())
     elif any(row["status"] != "failed" for rows in result.rows.values() for row in rows):
@@ -100,3 +92,76 @@ def drive(
         if result.report is not None:
             aside.print(f"report: {result.report}")
     raise_failures(result)
+
+
+@with_options(changes=scenario_changes)
+def watch(
+    *,
+    scenario: ScenarioArgument,
+    driver: Annotated[
+        str, typer.Option("--driver", "-d", help="As in drive; a run folder shows its trained controller.")
+    ],
+    seed: SeedOption = 0,
+    video: Annotated[
+        Path | None, typer.Option(help="Write a film (.gif, .webp, .mp4) instead; needs no display.")
+    ] = None,
+    pace: Annotated[float, typer.Option(min=0.1, max=1000.0, help="Times as fast as life.")] = 10.0,
+    changes: dict[str, Any],
+    settings: ScenarioSettingsOption = None,
+    json: JsonOption = False,
+) -> None:
+    """Watch an episode in SUMO's window, or write a film of it without a display.
+
+    Examples:
+
+      unjam watch ring --driver pi
+
+      unjam watch ring-jammed --driver runs/ring-001 --video wave.mp4
+    """
+    from unjam.controller import make_driver
+        from unjam.files import check_folder
+    from unjam.measures.metrics import measure
+    from unjam.reports.film import check_format, write_video
+    from unjam.scenarios.registry import make_scenario
+    from unjam.training.evaluate import raise_failure
+    from unjam.worlds.workers import EpisodeTask, Workers
+
+    road = make_scenario(scenario, changes | assignments(settings))
+    driven = make_driver(driver, road.decision_step)
+    if video is None:
+        episode = watch_in_window(road, driven, (seed,), pace)
+    else:
+        check_format(video)
+        check_folder(video)
+        aside.print("driving")
+        with Workers(1) as workers:
+            episode = workers.run([EpisodeTask(road, driven, (seed,), full=True)])[0]
+    row = measure(episode)
+    if episode.ok and video is not None:
+        aside.print("drawing")
+        write_video(episode, video, driven.describe(), pace)
+    if json:
+        film = str(video) if video else None
+        print_json({"scenario": scenario, "driver": driver, "video": film, "episode": row})
+    raise_failure([row])
+    if not json and video is not None:
+        console.print(str(video))
+
+
+def watch_in_window(scenario: "Scenario", driver: "Driver", seed: Sequence[int], pace: float) -> "Episode":
+    """Run an episode in SUMO's window, `pace` times as fast as life; return it.
+
+    Raises:
+        MissingPartError: there is no display.
+    """
+    from unjam.worlds.episode import run_episode
+    from unjam.worlds.sumo.simulation import Simulation
+
+    if sys.platform == "linux" and not os.environ.get("DISPLAY"):
+        raise MissingPartError(
+            "watch: no display; write a film: --video FILE, or use xvfb-run unjam watch ..."
+        )
+    delay = 1000.0 / pace  # [ms] for a second of simulation, however many steps it has
+    options = ("--start", "true", "--quit-on-end", "true", "--delay", str(delay))
+    with Simulation("gui", gui_options=options) as window:
+        return run_episode(scenario, driver, seed, simulation=window)

@@ -1,11 +1,13 @@
 """`unjam fit-drivers`: calibrate a population of drivers on recorded trajectories."""
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
 from unjam.cli.options import JsonOption, SeedOption, assignments
+from unjam.cli.output import Counted, aside, console, new_table, print_json
 
 
 def fit_drivers(
@@ -53,39 +55,28 @@ def fit_drivers(
 
       unjam drive ring-jammed -d human -d pi --humans drivers.json
     """
-    from unjam.cli.output import Counted, aside, console, print_json
     from unjam.following.fit_drivers import fit_from_files
     from unjam.scenarios.population import write_population
 
     changes: dict[str, Any] = {"residual": residual, "seed": seed, **assignments(settings)}
     columns = tuple(name for name in driver.split(",") if name)
-    with Counted("calibrating drivers") as told:
-        chosen = {name: str(value) for name, value in assignments(only).items()}
-        found = fit_from_files(data, changes, format, cut_bad, columns, chosen, out, told)
+    chosen = {name: str(value) for name, value in assignments(only).items()}
+    with Counted("calibrating drivers") as counted:
+        found = fit_from_files(data, changes, format, cut_bad, columns, chosen, out, counted)
     write_population(out, found.population)
     if json:
         print_json({"population": str(out), "read": found.words, **found.facts()})
         return
     for line in found.words:
         aside.print(line)
-    console.print(_table(found.population))
-    for line in found.verdict():
-        console.print(line)
-    aside.print(f"population: {out}")
-
-
-def _table(population: Any) -> Any:
-    """Return the table of the parameters' spread."""
-    from dataclasses import asdict
-
-    from rich.table import Table
-
+    population: Any = found.population
     typical = asdict(population.typical)
-    table = Table(box=None, pad_edge=False, header_style="bold")
-    for heading in ("parameter", "one for all", "mean", "std", "quartiles of the drivers"):
-        table.add_column(heading, justify="left" if heading == "parameter" else "right")
+    table = new_table(("parameter",), ("one for all", "mean", "std", "quartiles of the drivers"))
     for name, spread in population.spread().items():
         quartiles = "  ".join(f"{value:.2f}" for value in spread["quartiles"])
         values = (typical[name], spread["mean"], spread["std"])
         table.add_row(name, *(f"{value:.2f}" for value in values), quartiles)
-    return table
+    console.print(table)
+    for line in found.verdict():
+        console.print(line)
+    aside.print(f"population: {out}")

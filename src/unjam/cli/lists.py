@@ -1,12 +1,14 @@
 """`unjam scenarios` and `unjam drivers`: what there is."""
 
-from dataclasses import fields, is_dataclass
+from dataclasses import asdict, fields, is_dataclass
+from io import BytesIO
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
 from unjam.cli.options import JsonOption
+from unjam.cli.output import console, new_table, print_json
 from unjam.errors import InputError
 
 SHOWN_SHARE = 0.1
@@ -33,9 +35,7 @@ def scenarios(
       unjam scenarios figure-eight --picture eight.png
     """
     from rich.markup import escape
-    from rich.table import Table
 
-    from unjam.cli.output import console, print_json
     from unjam.scenarios.registry import SCENARIOS, scenario_recipe
 
     if picture is not None:
@@ -46,29 +46,25 @@ def scenarios(
         if json:
             print_json({key: scenario_recipe(scenario) for key, scenario in SCENARIOS.items()})
             return
-        table = Table(box=None, pad_edge=False, header_style="bold")
-        for column in ("scenario", "road", "vehicles", "limit", "decisions", "warm-up"):
-            table.add_column(column)
+        shown = ("road", "vehicles", "limit")
+        table = new_table(("scenario", *shown, "decisions", "warm-up"))
         for key, scenario in SCENARIOS.items():
             facts = dict(scenario.facts())
             warmup = f"{scenario.warmup * scenario.simulation_step:g} s"
-            table.add_row(
-                key, facts["road"], facts["vehicles"], facts["limit"], f"{scenario.horizon:,}", warmup
-            )
+            table.add_row(key, *(facts[fact] for fact in shown), f"{scenario.horizon:,}", warmup)
         console.print(table)
         return
     scenario = _scenario(name)
     facts = [*scenario.facts(), *_common_facts(scenario)]
-    parameters = parameter_rows(type(scenario), scenario)
     if json:
         print_json({"name": name, "facts": dict(facts), "parameters": scenario_recipe(scenario)})
         return
     console.print(f"[bold]{name}[/bold]")
-    table = Table(box=None, pad_edge=False, show_header=False)
+    table = new_table()
     for fact in facts:
         table.add_row(*map(escape, fact))
     console.print(table)
-    console.print(_parameter_table(parameters, "parameter (--set key=value)"))
+    console.print(_parameter_table(parameter_rows(scenario), "parameter (--set key=value)"))
 
 
 def _scenario(name: str) -> Any:
@@ -80,8 +76,6 @@ def _scenario(name: str) -> Any:
 
 def _draw(scenario: Any, name: str, path: Path) -> None:
     """Write a picture of the road that seed 0 draws: at the start, or a minute later where vehicles come."""
-    from io import BytesIO
-
     from unjam.files import check_folder, write_whole
     from unjam.reports.film import draw_road
     from unjam.scenarios.road import ClosedRoad
@@ -106,13 +100,10 @@ def _draw(scenario: Any, name: str, path: Path) -> None:
 def _common_facts(scenario: Any) -> list[tuple[str, str]]:
     from unjam.drivers.observation import FEATURES
 
-    step = scenario.simulation_step
+    warmup, seconds = scenario.warmup, scenario.warmup * scenario.simulation_step
     return [
         ("episode", f"{scenario.horizon:,} decisions of {scenario.decision_step:g} s; a collision ends it"),
-        (
-            "warm-up",
-            f"{scenario.warmup} all-human steps ({scenario.warmup * step:g} s), before control, not counted",
-        ),
+        ("warm-up", f"{warmup} all-human steps ({seconds:g} s), before control, not counted"),
         ("people", scenario.people_in_words),
         ("action", f"acceleration within ±{scenario.action_limit:g} m/s2, {scenario.actuation}"),
         ("observation", "; ".join(map(str, FEATURES["local"].numbers or ()))),
@@ -127,28 +118,25 @@ def drivers(json: JsonOption = False) -> None:
 
       unjam drivers
     """
-    from unjam.cli.output import console, print_json
     from unjam.controller.naming import SHIPPED, shipped_names
     from unjam.drivers.registry import DRIVERS
 
-    if json:
-        named = {
-            name: {"about": _first_line(kind), "parameters": parameter_rows(kind, kind())}
-            for name, kind in DRIVERS.items()
-        }
-        shipped = {
-            f"{SHIPPED}{name}": {"about": _about_shipped(name), "parameters": []} for name in shipped_names()
-        }
-        print_json(named | shipped)
-        return
+    listed: dict[str, dict[str, Any]] = {}
     for name, kind in DRIVERS.items():
-        console.print(f"[bold]{name}[/bold]  {_first_line(kind)}")
-        rows = [row for row in parameter_rows(kind, kind()) if row["name"] != "time_step"]
+        about = (kind.__doc__ or "").strip().splitlines()[0]
+        listed[name] = {"about": about, "parameters": parameter_rows(kind())}
+    for name in shipped_names():
+        listed[f"{SHIPPED}{name}"] = {"about": _about_shipped(name), "parameters": []}
+    if json:
+        print_json(listed)
+        return
+    for name, entry in listed.items():
+        console.print(f"[bold]{name}[/bold]  {entry['about']}")
+        rows = [row for row in entry["parameters"] if row["name"] != "time_step"]
         if rows:
             console.print(_parameter_table(rows, "parameter"))
-        console.print()
-    for name in shipped_names():
-        console.print(f"[bold]{SHIPPED}{name}[/bold]  {_about_shipped(name)}")
+        if name in DRIVERS:
+            console.print()
     console.print(
         "\nYour own: --driver path.py:name, a function or a class; check it with unjam.check_driver."
     )
@@ -159,8 +147,8 @@ def _about_shipped(name: str) -> str:
     from unjam.controller.file import read_controller
     from unjam.controller.naming import shipped_file
 
-    told = read_controller(shipped_file(name)).manifest
-    expert, metrics, road = told["expert"], told["metrics"], told["run"]["scenario"]
+    manifest = read_controller(shipped_file(name)).manifest
+    expert, metrics, road = manifest["expert"], manifest["metrics"], manifest["run"]["scenario"]
     ours, theirs = (metrics[label]["mean_speed"]["mean"] for label in ("trained", expert))
     return (
         f"{expert} + residual, trained on {road}: {ours:.2f} m/s of all vehicles on "
@@ -168,21 +156,15 @@ def _about_shipped(name: str) -> str:
     )
 
 
-def _first_line(kind: type) -> str:
-    return (kind.__doc__ or "").strip().splitlines()[0]
-
-
-def parameter_rows(kind: type, instance: Any) -> list[dict[str, Any]]:
+def parameter_rows(instance: Any) -> list[dict[str, Any]]:
     """Return name, value and meaning of each parameter of a parameter dataclass."""
-    from dataclasses import asdict
-
+    if not is_dataclass(instance) or isinstance(instance, type):
+        return []
     about: dict[str, str] = {}
-    for base in reversed(kind.__mro__):  # pydantic forgets the texts of inherited fields
+    for base in reversed(type(instance).__mro__):  # pydantic forgets the texts of inherited fields
         own = getattr(base, "__pydantic_fields__", {})
         about |= {name: field.description for name, field in own.items() if field.description}
-    if not is_dataclass(instance):
-        return []
-    values = asdict(instance)  # pyright: ignore[reportArgumentType]
+    values = asdict(instance)
     return [
         {"name": field.name, "default": values[field.name], "about": about.get(field.name, "")}
         for field in fields(instance)
@@ -191,22 +173,11 @@ def parameter_rows(kind: type, instance: Any) -> list[dict[str, Any]]:
 
 def _parameter_table(rows: list[dict[str, Any]], title: str) -> Any:
     from rich.markup import escape
-    from rich.table import Table
 
-    table = Table(box=None, pad_edge=False, header_style="dim")
-    for column in (title, "default", "meaning"):
-        table.add_column(column)
+    table = new_table((title, "default", "meaning"), style="dim")
     for row in rows:
-        table.add_row(
-            f"  {row['name']}", escape(_brief(row["default"])), escape(" ".join(row["about"].split()))
-        )
+        value = row["default"]
+        if isinstance(value, dict):
+            value = ", ".join(f"{key}={entry:g}" for key, entry in value.items())
+        table.add_row(f"  {row['name']}", escape(str(value)), escape(" ".join(row["about"].split())))
     return table
-
-
-def _brief(value: Any) -> str:
-    """Return a default as a table shows it."""
-    return (
-        ", ".join(f"{key}={entry:g}" for key, entry in value.items())
-        if isinstance(value, dict)
-        else str(value)
-    )

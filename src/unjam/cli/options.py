@@ -1,8 +1,11 @@
-"""Options that several verbs share, each defined once."""
+"""Options that several verbs share, each defined once: by itself, or in a group."""
 
+import inspect
 import os
+from collections.abc import Callable
+from functools import wraps
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import typer
 
@@ -19,70 +22,74 @@ RewardOption = Annotated[
         "--reward", help="Reward by name, or your own: path.py:name.", show_default="the scenario's"
     ),
 ]
-EpisodesOption = Annotated[int, typer.Option("--episodes", "-n", min=1, help="Number of episodes.")]
 SeedOption = Annotated[int, typer.Option("--seed", min=0, help="First seed.")]
+ScenarioSettingsOption = Annotated[
+    list[str] | None, typer.Option("--set", help="Any parameter of the scenario: key=value.")
+]
 WorkersOption = Annotated[
     int, typer.Option("--workers", min=1, help="Worker processes; the result does not depend on it.")
 ]
+TrainingsOption = Annotated[int, typer.Option("--workers", min=1, help="Trainings at once.")]
+ExecutorOption = Annotated[str, typer.Option(help="local, or ray: a cluster that shares the folder.")]
 OutOption = Annotated[
     Path | None, typer.Option("--out", help="Folder for the results.", show_default="a new one under runs/")
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON document and nothing else.")]
-LengthOption = Annotated[
-    str | None, typer.Option("--length", help="Length of the ring [m]: one, or a range like 220-270.")
-]
-RadiusOption = Annotated[
-    str | None, typer.Option("--radius", help="Radius of the figure eight [m]: one, or a range like 32-35.")
-]
-VehiclesOption = Annotated[int | None, typer.Option("--vehicles", help="Number of vehicles.")]
-CavsOption = Annotated[int | None, typer.Option("--cavs", help="Number of CAVs among them.")]
-CavShareOption = Annotated[
-    float | None,
-    typer.Option("--cav-share", help="Share of CAVs among the vehicles of your own network."),
-]
-CavTypesOption = Annotated[
-    str | None,
-    typer.Option("--cav-types", help="Vehicle types that are CAVs, on your own network: car,truck."),
-]
 HumansOption = Annotated[
     Path | None,
     typer.Option("--humans", help="Calibrated drivers, of `unjam fit-drivers`: the people on the road."),
-]
-OwnScenarioArgument = Annotated[
-    str | None, typer.Argument(help="Name of the scenario; the configuration's if left out.")
-]
-PresetOption = Annotated[str, typer.Option(help="Named starting point: demo, best, paper.")]
-ConfigOption = Annotated[Path | None, typer.Option(help="TOML file with any keys of the configuration.")]
-SettingsOption = Annotated[
-    list[str] | None,
-    typer.Option("--set", help="Any key of the configuration: key=value, trpo.gamma=0.995."),
-]
-StepsOption = Annotated[int | None, typer.Option(min=1, help="Actual simulator steps to train for.")]
-RunSeedOption = Annotated[int | None, typer.Option(min=0, help="Seed of the whole run.")]
-AgentOption = Annotated[str | None, typer.Option(help="Learner: trpo, ppo, sac.")]
-ExpertOption = Annotated[
-    str | None,
-    typer.Option(help="Driver that the residual is added to, as in drive --driver; none: no expert."),
-]
-ExecutorOption = Annotated[str, typer.Option(help="local, or ray: a cluster that shares the folder.")]
-WarmupOption = Annotated[
-    int | None, typer.Option("--warmup", help="All-human simulation steps before the CAVs take over.")
 ]
 
 DEFAULT_WORKERS = os.cpu_count() or 1
 
 
-def road_changes(
-    length: str | None,
-    radius: str | None,
-    vehicles: int | None,
-    cavs: int | None,
-    warmup: int | None,
-    cav_share: float | None,
-    cav_types: str | None,
-    humans: Path | None = None,
+def with_options(**groups: Callable[..., Any]) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Give a verb the options of whole groups.
+
+    A group is a function whose parameters are options. They take the place of the verb's parameter of the
+    group's name, which gets what the function makes of them.
+    """
+    members = {name: inspect.signature(group).parameters for name, group in groups.items()}
+
+    def give(verb: Callable[..., None]) -> Callable[..., None]:
+        @wraps(verb)
+        def called(**given: Any) -> None:
+            for name, group in groups.items():
+                given[name] = group(**{option: given.pop(option) for option in members[name]})
+            verb(**given)
+
+        options = [
+            option.replace(kind=inspect.Parameter.KEYWORD_ONLY)
+            for name, parameter in inspect.signature(verb).parameters.items()
+            for option in members.get(name, {name: parameter}).values()
+        ]
+        called.__signature__ = inspect.Signature(options)  # pyright: ignore[reportAttributeAccessIssue]
+        return called
+
+    return give
+
+
+def scenario_changes(
+    length: Annotated[
+        str | None, typer.Option(help="Length of the ring [m]: one, or a range like 220-270.")
+    ] = None,
+    radius: Annotated[
+        str | None, typer.Option(help="Radius of the figure eight [m]: one, or a range like 32-35.")
+    ] = None,
+    vehicles: Annotated[int | None, typer.Option(help="Number of vehicles.")] = None,
+    cavs: Annotated[int | None, typer.Option(help="Number of CAVs among them.")] = None,
+    warmup: Annotated[
+        int | None, typer.Option(help="All-human simulation steps before the CAVs take over.")
+    ] = None,
+    cav_share: Annotated[
+        float | None, typer.Option(help="Share of CAVs among the vehicles of your own network.")
+    ] = None,
+    cav_types: Annotated[
+        str | None, typer.Option(help="Vehicle types that are CAVs, on your own network: car,truck.")
+    ] = None,
+    humans: HumansOption = None,
 ) -> dict[str, Any]:
-    """Return the changes to a scenario that the road options ask for."""
+    """Return the changes to a scenario that the options of a road ask for."""
     asked = {
         "length": parse_range("length", length),
         "radius": parse_range("radius", radius),
@@ -94,6 +101,42 @@ def road_changes(
         "population": str(humans.absolute()) if humans else None,
     }
     return {name: value for name, value in asked.items() if value is not None}
+
+
+class AskedRun(NamedTuple):
+    """What the options of a training ask for."""
+
+    preset: str
+    file: Path | None
+    flags: dict[str, Any]
+    """keys of the configuration that have an option of their own, where it was given"""
+    settings: dict[str, Any]
+    """what `--set` says"""
+
+
+def asked_run(
+    scenario: Annotated[
+        str | None, typer.Argument(help="Name of the scenario; the configuration's if left out.")
+    ] = None,
+    preset: Annotated[str, typer.Option(help="Named starting point: demo, best, paper.")] = "",
+    config: Annotated[Path | None, typer.Option(help="TOML file with any keys of the configuration.")] = None,
+    settings: Annotated[
+        list[str] | None,
+        typer.Option("--set", help="Any key of the configuration: key=value, trpo.gamma=0.995."),
+    ] = None,
+    steps: Annotated[int | None, typer.Option(min=1, help="Actual simulator steps to train for.")] = None,
+    seed: Annotated[int | None, typer.Option(min=0, help="Seed of the whole run.")] = None,
+    agent: Annotated[str | None, typer.Option(help="Learner: trpo, ppo, sac.")] = None,
+    expert: Annotated[
+        str | None,
+        typer.Option(help="Driver that the residual is added to, as in drive --driver; none: no expert."),
+    ] = None,
+    reward: RewardOption = "",
+) -> AskedRun:
+    """Return what the options of a training ask for."""
+    flags = {"scenario": scenario, "steps": steps, "seed": seed, "agent": agent, "expert": expert}
+    given = {key: value for key, value in {**flags, "reward": reward or None}.items() if value is not None}
+    return AskedRun(preset, config, given, assignments(settings))
 
 
 def parse_range(name: str, text: str | None) -> tuple[int, int] | None:
@@ -109,20 +152,6 @@ def parse_range(name: str, text: str | None) -> tuple[int, int] | None:
 def assignments(texts: list[str] | None) -> dict[str, Any]:
     """Return what `--set key=value` options say."""
     return parse_assignments(texts or [], "--set")
-
-
-def run_changes(
-    scenario: str | None,
-    steps: int | None,
-    seed: int | None,
-    agent: str | None,
-    expert: str | None,
-    reward: str,
-) -> dict[str, Any]:
-    """Return what the flags of a training say, where they were given, as changes to its configuration."""
-    flags = {"scenario": scenario, "steps": steps, "seed": seed, "agent": agent, "expert": expert}
-    given = {key: value for key, value in flags.items() if value is not None}
-    return {**given, "reward": reward} if reward else given
 
 
 def new_folder(out: Path | None, name: str) -> Path:

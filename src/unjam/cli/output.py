@@ -2,9 +2,9 @@
 
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, Self
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -28,16 +28,22 @@ def print_json(document: Any) -> None:
     sys.stdout.write(to_json(document, indent=1) + "\n")
 
 
+def new_table(words: Sequence[str] = (), numbers: Sequence[str] = (), style: str = "bold") -> Table:
+    """Return an empty table: columns of words (that of units dim), then of numbers; headings in `style`."""
+    table = Table(box=None, pad_edge=False, header_style=style, show_header=bool(words))
+    for heading in words:
+        table.add_column(heading, style="dim" if heading == "unit" else None)
+    for heading in numbers:
+        table.add_column(heading, justify="right")
+    return table
+
+
 def metrics_table(rows_by_driver: dict[str, list[dict[str, Any]]]) -> Table:
     """Return the table of all metrics: mean and 95 % bootstrap interval over the episodes."""
     from unjam.measures.metrics import METRICS
     from unjam.measures.statistics import estimate
 
-    table = Table(box=None, pad_edge=False, header_style="bold")
-    table.add_column("metric")
-    table.add_column("unit", style="dim")
-    for driver in rows_by_driver:
-        table.add_column(driver, justify="right")
+    table = new_table(("metric", "unit"), list(rows_by_driver))
     for name, metric in METRICS.items():
         cells = []
         for rows in rows_by_driver.values():
@@ -58,17 +64,20 @@ def metrics_table(rows_by_driver: dict[str, list[dict[str, Any]]]) -> Table:
 class Counted:
     """Progress of things that are counted: a bar on a terminal, plain lines now and then elsewhere."""
 
-    def __init__(self, label: str, unit: str = "") -> None:
+    def __init__(self, label: str, unit: str = "", total: int | None = None) -> None:
         """Prepare to count what is called `label`, in `unit`."""
         self._label = label
         self._unit = f" {unit}" if unit else ""
-        self._bar = bar() if aside.is_terminal else None
+        self._total = total
+        self._bar: Progress | None = None
         self._last_line = time.monotonic()
 
-    def __enter__(self) -> "Counted":
-        if self._bar is not None:
+    def __enter__(self) -> Self:
+        if aside.is_terminal:
+            columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
+            self._bar = Progress(*columns, TimeRemainingColumn(), console=aside, transient=True)
             self._bar.start()
-            self._task = self._bar.add_task(self._label, total=None)
+            self._task = self._bar.add_task(self._label, total=self._total)
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -95,15 +104,3 @@ def counting_steps(label: str, total: int) -> Iterator[Callable[[Any, int], None
             counted(sum(done.values()), total)
 
         yield note
-
-
-def bar() -> Progress:
-    """Return a progress bar on standard error, gone when it is done."""
-    return Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeRemainingColumn(),
-        console=aside,
-        transient=True,
-    )

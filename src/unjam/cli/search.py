@@ -1,4 +1,4 @@
-"""`unjam search`: find settings that learn better."""
+"""Many trainings: `unjam search` finds settings that learn better, `unjam reproduce` makes the paper anew."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -8,41 +8,29 @@ import typer
 
 from unjam.cli.options import (
     DEFAULT_WORKERS,
-    AgentOption,
-    ConfigOption,
+    AskedRun,
     ExecutorOption,
-    ExpertOption,
     JsonOption,
     OutOption,
-    OwnScenarioArgument,
-    PresetOption,
-    RewardOption,
-    RunSeedOption,
-    SettingsOption,
-    StepsOption,
-    assignments,
+    TrainingsOption,
+    asked_run,
     executor_named,
     new_folder,
-    run_changes,
+    with_options,
 )
+from unjam.cli.output import aside, console, print_json
 
 
+@with_options(asked=asked_run)
 def search(
-    scenario: OwnScenarioArgument = None,
+    *,
     vary: Annotated[
         list[str] | None,
         typer.Option(help="What is varied: key=low..high, key=low..high:log, or key=a,b,c."),
     ] = None,
     trials: Annotated[int, typer.Option(min=1, help="Trainings in all.")] = 20,
-    preset: PresetOption = "",
-    config: ConfigOption = None,
-    settings: SettingsOption = None,
-    steps: StepsOption = None,
-    seed: RunSeedOption = None,
-    agent: AgentOption = None,
-    expert: ExpertOption = None,
-    reward: RewardOption = "",
-    workers: Annotated[int, typer.Option(min=1, help="Trainings at once.")] = DEFAULT_WORKERS,
+    asked: AskedRun,
+    workers: TrainingsOption = DEFAULT_WORKERS,
     executor: ExecutorOption = "local",
     out: OutOption = None,
     json: JsonOption = False,
@@ -60,15 +48,11 @@ def search(
 
       unjam search ring --vary policy.exploration_std=0.05..0.5 --executor ray --workers 64 --out /shared/it
     """
-    from unjam.cli.output import aside, console, print_json
     from unjam.training.config import load_config
-    from unjam.training.search import BEST
+    from unjam.training.search import BEST, check_space, space_of
     from unjam.training.search import search as run
-    from unjam.training.search_space import check_space, space_of
 
-    changes = run_changes(scenario, steps, seed, agent, expert, reward)
-    changes |= assignments(settings)
-    base, space = load_config(config, preset, changes), space_of(vary or [])
+    base, space = load_config(asked.file, asked.preset, asked.flags | asked.settings), space_of(vary or [])
     runner = executor_named(executor)
     base = replace(base, workers=1)
     check_space(base, space)
@@ -84,3 +68,59 @@ def search(
         gain = "failed" if one.gain is None else f"{one.gain:+.1f}"
         console.print(f"trial {one.number}: {gain} beyond the expert, validation seeds: {values}")
     console.print(f"train with the best: unjam train --config {best}", soft_wrap=True)
+
+
+def reproduce(
+    studies: Annotated[
+        list[str], typer.Argument(help="Names of studies: table-1, figure-4 ..., or all.", metavar="STUDY...")
+    ],
+    seeds: Annotated[int, typer.Option(min=1, help="Trainings of each variant.")] = 3,
+    workers: TrainingsOption = DEFAULT_WORKERS,
+    executor: ExecutorOption = "local",
+    out: Annotated[Path, typer.Option(help="Folder of all studies; what is there already is used.")] = Path(
+        "runs/reproduce"
+    ),
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="List the trainings and the time they take; start nothing.")
+    ] = False,
+    json: JsonOption = False,
+) -> None:
+    """Reproduce tables and figures of the paper: train what they need, and draw them.
+
+    Trainings that several studies share are made once. After a stop the same command goes on.
+
+    Examples:
+
+      unjam reproduce table-2 --seeds 5
+
+      unjam reproduce all --dry-run
+
+      unjam reproduce table-1 --executor ray --workers 64 --out /shared/unjam
+    """
+    runner = executor_named(executor)
+    from unjam.studies.reproduce import make_plan
+    from unjam.studies.reproduce import reproduce as run
+    from unjam.studies.study import StudyFolder
+
+    plan = make_plan(studies, seeds, StudyFolder(out))
+    minutes = plan.seconds(workers) / 60.0
+    names = [planned.name for planned in plan.runs]
+    if dry_run and json:
+        there = {"finished": plan.finished, "drives": plan.roads, "minutes": minutes}
+        print_json({"missing": names, **there})
+        return
+    if dry_run:
+        for name in names:
+            console.print(name)
+    takes = f"{minutes / 60.0:.1f} hours" if minutes > 90 else f"{max(1.0, minutes):.0f} minutes"
+    aside.print(
+        f"{len(names)} trainings to make, {plan.finished} there already; about {takes} with {workers} at once"
+    )
+    if dry_run:
+        return
+    folders = [str(folder) for folder in run(plan, workers, runner, aside.print)]
+    if json:
+        print_json({"folders": folders})
+        return
+    for folder in folders:
+        console.print(folder)

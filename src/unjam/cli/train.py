@@ -9,55 +9,27 @@ import typer
 
 from unjam.cli.options import (
     DEFAULT_WORKERS,
-    AgentOption,
-    CavShareOption,
-    CavsOption,
-    CavTypesOption,
-    ConfigOption,
-    ExpertOption,
-    HumansOption,
+    AskedRun,
     JsonOption,
-    LengthOption,
     OutOption,
-    OwnScenarioArgument,
-    PresetOption,
-    RadiusOption,
-    RewardOption,
-    RunSeedOption,
-    SettingsOption,
-    StepsOption,
-    VehiclesOption,
-    WarmupOption,
     WorkersOption,
-    assignments,
+    asked_run,
     new_folder,
-    road_changes,
-    run_changes,
+    scenario_changes,
+    with_options,
 )
+from unjam.cli.output import Counted, aside, console, metrics_table, print_json
 from unjam.errors import InputError
 
 LINE_EVERY = 5
 """iterations between two plain lines of progress where there is no terminal"""
 
 
+@with_options(asked=asked_run, road=scenario_changes)
 def train(
-    scenario: OwnScenarioArgument = None,
-    preset: PresetOption = "",
-    config: ConfigOption = None,
-    settings: SettingsOption = None,
-    steps: StepsOption = None,
-    seed: RunSeedOption = None,
-    agent: AgentOption = None,
-    expert: ExpertOption = None,
-    reward: RewardOption = "",
-    length: LengthOption = None,
-    radius: RadiusOption = None,
-    vehicles: VehiclesOption = None,
-    cavs: CavsOption = None,
-    warmup: WarmupOption = None,
-    cav_share: CavShareOption = None,
-    cav_types: CavTypesOption = None,
-    humans: HumansOption = None,
+    *,
+    asked: AskedRun,
+    road: dict[str, Any],
     workers: WorkersOption = DEFAULT_WORKERS,
     out: OutOption = None,
     resume: Annotated[
@@ -87,58 +59,45 @@ def train(
     from unjam.training.config import load_config
     from unjam.training.folder import check_possible, read_config
 
-    changes = run_changes(scenario, steps, seed, agent, expert, reward)
-    changes |= {
-        f"road.{key}": value
-        for key, value in road_changes(
-            length, radius, vehicles, cavs, warmup, cav_share, cav_types, humans
-        ).items()
-    }
-    changes |= {"workers": workers}
-    for key, value in assignments(settings).items():
-        if key == "out":
-            out = Path(str(value))
-        else:
-            changes[key] = value
-
+    settings = dict(asked.settings)
+    if "out" in settings:
+        out = Path(str(settings.pop("out")))
+    changes = {**asked.flags, **{f"road.{key}": value for key, value in road.items()}, "workers": workers}
+    changes |= settings
     if resume is not None:
-        if out is not None or preset or config is not None:
+        if out is not None or asked.preset or asked.file is not None:
             raise InputError("resume: --out, --preset and --config are not allowed beside it")
         before = read_config(resume)
-        made = load_config(resume / "config.toml", changes={"steps": before.steps, **changes})
+        config = load_config(resume / "config.toml", changes={"steps": before.steps, **changes})
         folder = resume
     else:
-        made = load_config(config, preset, changes)
-        folder = new_folder(out, made.scenario)
-    check_possible(made)
-    from unjam.training.train import train as run  # torch: seconds that nobody waits for a wrong word
+        config = load_config(asked.file, asked.preset, changes)
+        folder = new_folder(out, config.scenario)
+    check_possible(config)
+    from unjam.reports.story import signed  # and torch: seconds that nobody waits for a wrong word
+    from unjam.training.evaluate import Evaluation
+    from unjam.training.train import train as run
 
-    with nullcontext() if json else _Progress(made.steps, folder) as shown:
-        result = run(made, folder, resume is not None, shown and shown.iteration, shown and shown.judging)
-    _print_result(result, json)
+    with nullcontext() if json else _Progress(config.steps, folder) as shown:
+        result = run(config, folder, resume is not None, shown and shown.iteration, shown and shown.judging)
+    if json:
+        files = {name: str(getattr(result, name)) for name in ("folder", "controller", "report")}
+        gain = asdict(result.gain) if result.gain else None
+        print_json({**files, "gain": gain, "drivers": Evaluation(result.rows, {}).means()})
+        return
+    console.print(metrics_table(result.rows))
+    if result.gain is not None:
+        console.print(f"return beyond the expert, held-out seeds, 95 % interval: {signed(result.gain)}")
+    aside.print(f"controller: {result.controller}\nreport: {result.report}")
 
 
-class _Progress:
+class _Progress(Counted):
     """Progress of training: a bar with the newest returns on a terminal, plain lines elsewhere."""
 
     def __init__(self, steps: int, folder: Path) -> None:
-        from unjam.cli.output import aside, bar
-
-        self._console = aside
+        super().__init__(f"training into {folder}", "steps", steps)
         self._steps = steps
-        self._folder = folder
-        self._bar = bar() if aside.is_terminal else None
         self._validated = "-"
-
-    def __enter__(self) -> "_Progress":
-        if self._bar is not None:
-            self._bar.start()
-            self._task = self._bar.add_task(f"training into {self._folder}", total=self._steps)
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self._bar is not None:
-            self._bar.stop()
 
     def iteration(self, row: dict[str, Any]) -> None:
         """Show a row of progress."""
@@ -149,7 +108,7 @@ class _Progress:
         if self._bar is not None:
             self._bar.update(self._task, completed=row["actual_steps"], description=words)
         elif row["iteration"] % LINE_EVERY == 1 or row["actual_steps"] >= self._steps:
-            self._console.print(
+            aside.print(
                 f"iteration {row['iteration']}: {row['actual_steps']:,} of {self._steps:,} steps, {words}"
             )
 
@@ -160,29 +119,4 @@ class _Progress:
             if self._bar is not None:
                 self._bar.update(self._task, description="evaluating on held-out seeds")
             else:
-                self._console.print("evaluating on held-out seeds")
-
-
-def _print_result(result: Any, json: bool) -> None:
-    from unjam.cli.output import aside, console, metrics_table, print_json
-    from unjam.measures.statistics import summarise
-    from unjam.reports.story import signed
-
-    if json:
-        print_json(
-            {
-                "folder": str(result.folder),
-                "controller": str(result.controller),
-                "report": str(result.report),
-                "gain": asdict(result.gain) if result.gain else None,
-                "drivers": {
-                    driver: {name: found.mean for name, found in summarise(rows).items()}
-                    for driver, rows in result.rows.items()
-                },
-            }
-        )
-        return
-    console.print(metrics_table(result.rows))
-    if result.gain is not None:
-        console.print(f"return beyond the expert, held-out seeds, 95 % interval: {signed(result.gain)}")
-    aside.print(f"controller: {result.controller}\nreport: {result.report}")
+                aside.print("evaluating on held-out seeds")

@@ -172,11 +172,6 @@ def _within(recipe: Any) -> Iterator[Recipe]:
             yield from _within(part)
 
 
-def describe(driver: Driver) -> str:
-    """Return a driver in a few words."""
-    return driver.describe()
-
-
 def free_label(driver: Driver, taken: dict[str, Driver]) -> str:
     """Return the description of a driver, numbered where another driver has it already."""
     recipe_of(driver)  # what no worker could make has no place among others

@@ -17,9 +17,8 @@ from unjam.studies import STUDIES, TOGETHER
 from unjam.studies.study import REFERENCES, ROADS, OnProgress, PlannedRun, Study, StudyFolder
 from unjam.training.config import load_config
 from unjam.training.evaluate import evaluate, held_out_seeds, save_evaluation
-from unjam.training.executors import Executor, run_all
+from unjam.training.executors import Executor, run_all, training_command
 from unjam.training.folder import read_config
-from unjam.training.trainings import training_command
 from unjam.worlds.episode import can_drive
 from unjam.worlds.workers import Workers
 

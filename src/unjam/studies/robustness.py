@@ -10,9 +10,9 @@ import pandas as pd
 
 from unjam.controller import make_driver
 from unjam.drivers.driver import Driver
+from unjam.drivers.wrappers import Impaired
 from unjam.files import to_json, write_whole
 from unjam.measures.statistics import paired_difference
-from unjam.studies.impaired import impaired
 from unjam.studies.study import REFERENCES, ROADS, PlannedRun, Study, StudyFolder, Table
 from unjam.studies.table import entries, estimates, interval, number
 from unjam.training.config import load_config
@@ -39,7 +39,7 @@ class Condition:
     name: str
     scenario_changes: dict[str, Any] = field(default_factory=dict)
     impaired: dict[str, float] = field(default_factory=dict)
-    """arguments of `impaired`"""
+    """arguments of `Impaired`"""
 
 
 EVERYWHERE = (
@@ -105,8 +105,8 @@ def under_conditions(studies: StudyFolder, road: str, processes: int, episodes: 
             step = scenario.decision_step
             drivers: dict[str, Driver] = {}
             for label, name in names.items():
-                how = {} if name == "human" else condition.impaired
-                drivers[label] = impaired(name, step, **how) if how else make_driver(name, step)
+                made, how = make_driver(name, step), {} if name == "human" else condition.impaired
+                drivers[label] = Impaired(made, **how, time_step=step) if how else made
             found = evaluate(scenario, drivers, held_out_seeds(episodes), workers).rows
             for label, driven in found.items():
                 row: dict[str, Any] = {"road": road, "condition": condition.name, "driver": label}

@@ -18,8 +18,8 @@ from unjam.files import make_folder, to_json, write_whole
 from unjam.manifest import manifest
 from unjam.reports.results import EVALUATION_FILE, read_progress, read_rows
 from unjam.training.config import RunConfig, load_config
+from unjam.training.evaluate import TRAINED
 from unjam.training.folder import read_config
-from unjam.training.judge import TRAINED
 from unjam.training.presets import CLOSING_ABSORBER
 
 BUDGET = 300_000

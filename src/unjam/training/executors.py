@@ -6,17 +6,21 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor, as_completed
+from concurrent.futures import Future, ThreadPoolExecutor, as_completed
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 from unjam.errors import MissingPartError, UnjamError
-from unjam.files import make_folder
+from unjam.files import make_folder, write_whole
+
+if TYPE_CHECKING:  # the command line asks which executors there are: it is to be quick
+    from unjam.training.config import RunConfig
 
 Executor = Literal["local", "ray"]
 EXECUTORS: tuple[Executor, ...] = ("local", "ray")
-Told = Callable[[str], None]
+OnLine = Callable[[str], None]
+"""gets a line of progress"""
 ATTEMPTS = 3
 """how often a command line is started that a signal kills, or whose machine is lost"""
 
@@ -39,8 +43,26 @@ class Command(NamedTuple):
         return [sys.executable, "-m", "unjam", *(self.again if begun else self.words)]
 
 
-Runner = Callable[[Command], int]
-"""runs a command line to its end and returns its exit code"""
+def training_command(config: "RunConfig", folder: Path, plan: Path, log: Path) -> Command:
+    """Return the command line that begins a training, or goes on with it.
+
+    Args:
+        config: what to train.
+        folder: of the run.
+        plan: file for the configuration, written here.
+        log: where what it prints is added.
+    """
+    from unjam.training.config import to_toml
+
+    make_folder(plan.parent)
+    write_whole(plan, to_toml(config))
+    once = ["--workers", str(config.workers)]
+    return Command(
+        ["train", "--config", str(plan), *once, "--out", str(folder)],
+        log,
+        folder / "config.toml",
+        ["train", "--resume", str(folder), *once, "--steps", str(config.steps)],
+    )
 
 
 class Processes:
@@ -81,36 +103,27 @@ class Processes:
 
 
 @contextmanager
-def running(executor: Executor, workers: int) -> Iterator[Runner]:
-    """Give what runs command lines, from several threads at once; an exception in the block ends them.
+def running(executor: Executor, workers: int) -> Iterator[Callable[[Command], Future[int]]]:
+    """Give what starts a command line and promises its exit code; an exception in the block ends them all.
 
     Args:
         executor: `ray`: on a Ray cluster whose machines share the folders.
-        workers: how many cores are asked for where there is no cluster.
+        workers: how many run at once; on a cluster that has more cores, how many are asked for.
 
     Raises:
         MissingPartError: Ray is not installed.
     """
-    if executor == "ray":
-        with _ray(workers) as run:
-            yield run
-        return
-    processes = Processes()
-    try:
-        yield processes.run
-    except BaseException:
-        processes.stop()
-        raise
+    place = _ray(workers) if executor == "ray" else _this_machine()
+    with ThreadPoolExecutor(workers) as threads, place as run:
+        try:
+            yield lambda command: threads.submit(run, command)
+        except BaseException:
+            threads.shutdown(wait=False, cancel_futures=True)
+            raise
 
 
-def run_all(commands: dict[str, Command], workers: int, executor: Executor, told: Told) -> None:
-    """Run command lines, `workers` at once.
-
-    Args:
-        commands: by name.
-        workers: how many at once; on a cluster that has more cores, how many are asked for.
-        executor: where.
-        told: told a line when one has ended.
+def run_all(commands: dict[str, Command], workers: int, executor: Executor, on_line: OnLine) -> None:
+    """Run command lines, given by name, `workers` at once; `on_line` gets a line when one has ended.
 
     Raises:
         UnjamError: one or several failed; all others have run.
@@ -119,25 +132,31 @@ def run_all(commands: dict[str, Command], workers: int, executor: Executor, told
     if not commands:
         return
     failed, started = [], time.monotonic()
-    with ThreadPoolExecutor(workers) as threads, running(executor, workers) as run:
-        names = {threads.submit(run, command): name for name, command in commands.items()}
-        try:
-            for done, future in enumerate(as_completed(names), start=1):
-                name, code = names[future], future.result()
-                minutes = (time.monotonic() - started) / 60.0
-                told(f"{done} of {len(names)}, {minutes:.0f} min: {name}{' failed' if code else ''}")
-                if code != 0:
-                    failed.append(name)
-        except BaseException:
-            threads.shutdown(wait=False, cancel_futures=True)
-            raise
+    with running(executor, workers) as start:
+        names = {start(command): name for name, command in commands.items()}
+        for done, future in enumerate(as_completed(names), start=1):
+            name, code = names[future], future.result()
+            minutes = (time.monotonic() - started) / 60.0
+            on_line(f"{done} of {len(names)}, {minutes:.0f} min: {name}{' failed' if code else ''}")
+            if code != 0:
+                failed.append(name)
     if failed:
         words = f"{len(failed)} of {len(commands)} failed: {', '.join(failed)}"
         raise UnjamError(f"{words}; what the first of them said is in {commands[failed[0]].log}")
 
 
 @contextmanager
-def _ray(workers: int) -> Iterator[Runner]:
+def _this_machine() -> Iterator[Callable[[Command], int]]:
+    processes = Processes()
+    try:
+        yield processes.run
+    except BaseException:
+        processes.stop()
+        raise
+
+
+@contextmanager
+def _ray(workers: int) -> Iterator[Callable[[Command], int]]:
     """Give what runs a command line somewhere on the Ray cluster that is there, or on one of this machine."""
     try:
         import ray  # pyright: ignore[reportMissingImports]

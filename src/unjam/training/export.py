@@ -10,7 +10,7 @@ from unjam.controller.file import GRAPH, SAMPLE, read_controller
 from unjam.controller.verify import sample_bytes, verify_controller
 from unjam.drivers.driver import Driver
 from unjam.drivers.local_state import LocalState
-from unjam.drivers.registry import describe, files_of, recipe_of
+from unjam.drivers.registry import files_of, recipe_of
 from unjam.drivers.residual import ResidualDriver
 from unjam.errors import InputError, wrong
 from unjam.files import check_folder, write_whole
@@ -19,9 +19,8 @@ from unjam.measures.statistics import summarise
 from unjam.reports.results import EVALUATION_FILE, rows_by_driver
 from unjam.scenarios.registry import make_scenario
 from unjam.scenarios.scenario import Scenario
-from unjam.training.evaluate import held_out_seeds, raise_failure
+from unjam.training.evaluate import TRAINED, held_out_seeds, raise_failure
 from unjam.training.folder import origin, read_config
-from unjam.training.judge import TRAINED
 from unjam.worlds.workers import EpisodeTask, Workers
 
 SAMPLED = 1000
@@ -63,19 +62,20 @@ def export_controller(source: str | Path, to: str | Path, onnx: bool = False, sc
     code = files_of(recipe_of(driver)[0])
     if driver.native or code:
         why = f"{Path(code[0]['path']).name} is Python code" if code else "human is the simulator itself"
-        raise InputError(f"export: {describe(driver)} is not allowed: {why}; allowed: drivers that are data")
+        raise InputError(f"export: {driver.describe()} is not allowed: {why}; allowed: drivers that are data")
     limit = driver.action_limit if isinstance(driver, ResidualDriver) else road.action_limit
-    graph = _graph(driver, limit) if onnx else None
+    graph: dict[str, bytes] = {}
+    if onnx:
+        from unjam.controller.onnx_graph import onnx_graph  # torch.onnx takes its time, and not all want it
+
+        graph = {GRAPH: onnx_graph(driver, limit)}
     states = _perceived(road, driver)
-    parts = {SAMPLE: sample_bytes(driver, states, limit)}
-    if graph is not None:
-        parts[GRAPH] = graph
-    write_whole(to, controller_bytes(driver, about, parts))
+    write_whole(to, controller_bytes(driver, about, {SAMPLE: sample_bytes(driver, states, limit), **graph}))
     verify_controller(to)
-    beside = to.with_suffix(".onnx") if graph is not None else None
-    if beside is not None and graph is not None:
-        write_whole(beside, graph)
-    return Exported(to, beside, describe(driver), len(states.speed))
+    beside = to.with_suffix(".onnx") if graph else None
+    if beside is not None:
+        write_whole(beside, graph[GRAPH])
+    return Exported(to, beside, driver.describe(), len(states.speed))
 
 
 def _of_run(folder: Path, scenario: str) -> tuple[Scenario, Driver, dict[str, Any]]:
@@ -115,12 +115,6 @@ def _held_out(folder: Path) -> dict[str, Any] | None:
             estimates = {name: each.__dict__ for name, each in summarise(rows).items() if each.count}
             measured[label] = {"episodes": len(rows), **estimates}
     return measured
-
-
-def _graph(driver: Driver, limit: float) -> bytes:
-    from unjam.controller.onnx_graph import onnx_graph  # torch.onnx takes its time, and not all want it
-
-    return onnx_graph(driver, limit)
 
 
 def _perceived(road: Scenario, driver: Driver) -> LocalState:

@@ -1,13 +1,21 @@
-"""The folder of a run: begun, read, gone on with. Free of torch, so that what is wrong is told at once."""
+"""The folder of a run: begun, read, gone on with, and its checkpoints.
 
+Free of torch until there is a checkpoint to write or read, so that what is wrong is told at once. Checkpoints
+are made at the end of iterations: written whole, checked by hash, two generations kept.
+"""
+
+import hashlib
+import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+from safetensors import SafetensorError
 
 from unjam.controller import make_driver
 from unjam.drivers.driver import Driver
 from unjam.drivers.observation import observation_size
-from unjam.drivers.registry import describe
 from unjam.errors import InputError
 from unjam.files import make_folder, to_json, write_whole
 from unjam.manifest import manifest, package_versions
@@ -15,6 +23,14 @@ from unjam.scenarios.registry import scenario_recipe
 from unjam.scenarios.scenario import Scenario
 from unjam.training.config import RunConfig, load_config, to_toml
 from unjam.worlds.reward import make_reward
+
+if TYPE_CHECKING:
+    from unjam.learners.state import Tensors
+
+FORMAT = 2
+"""of what a checkpoint holds; one of another unjam is refused"""
+GENERATIONS = 2
+STATE, TENSORS = "state.json", "tensors.safetensors"
 
 
 def check_possible(config: RunConfig) -> None:
@@ -31,15 +47,20 @@ def check_possible(config: RunConfig) -> None:
         make_driver(name, scenario.decision_step)
 
 
+def make_new_folder(folder: Path, otherwise: str = "") -> None:
+    """Make a folder; raise `InputError` where it holds something already, `otherwise` is allowed too."""
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise InputError(f"out: {str(folder)!r} is not empty; allowed: a new folder{otherwise}")
+    make_folder(folder)
+
+
 def start_folder(folder: Path, config: RunConfig) -> None:
     """Make the folder of a new run and write what it is about.
 
     Raises:
         InputError: the folder holds something already.
     """
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise InputError(f"out: {str(folder)!r} is not empty; allowed: a new folder, or --resume {folder}")
-    make_folder(folder)
+    make_new_folder(folder, f", or --resume {folder}")
     write_whole(folder / "config.toml", to_toml(config))
     write_whole(folder / "manifest.json", to_json(manifest(), indent=1))
 
@@ -70,6 +91,61 @@ def origin(scenario: Scenario, expert: Driver) -> dict[str, Any]:
         "scenario": scenario_recipe(scenario),
         "time_step": scenario.decision_step,
         "action_limit": scenario.action_limit,
-        "expert": describe(expert),
+        "expert": expert.describe(),
         "versions": package_versions(),
     }
+
+
+def save_checkpoint(folder: Path, state: dict[str, Any], tensors: "Tensors") -> None:
+    """Write the checkpoint of an iteration under `folder`, and remove all but the newest two.
+
+    `state["iteration"]` names it. The state is written last and holds the hash of both: a
+    checkpoint without it does not count.
+    """
+    from safetensors.torch import save
+
+    place = folder / f"{state['iteration']:06d}"
+    make_folder(place)
+    state, data = {**state, "format": FORMAT}, save(tensors)
+    write_whole(place / TENSORS, data)
+    write_whole(place / STATE, json.dumps({**state, "sha256": _hash(state, data)}, indent=1))
+    for old in _places(folder)[:-GENERATIONS]:
+        shutil.rmtree(old, ignore_errors=True)
+
+
+def load_checkpoint(folder: Path) -> "tuple[dict[str, Any], Tensors] | None":
+    """Return the newest checkpoint that is whole; None where there was never any.
+
+    Raises:
+        InputError: there are some, and all of them are damaged, or another unjam made them.
+    """
+    from safetensors.torch import load
+
+    places = _places(folder)
+    for place in reversed(places):
+        try:
+            state = json.loads((place / STATE).read_text())
+            data = (place / TENSORS).read_bytes()
+            if state.pop("sha256") != _hash(state, data):
+                continue
+            found, known = state.pop("format", 1), load(data)
+        except (OSError, ValueError, KeyError, TypeError, AttributeError, SafetensorError):
+            continue
+        if found != FORMAT:
+            raise InputError(
+                f"checkpoint: {place} has format {found!r}, of another version of unjam; allowed: {FORMAT}"
+            )
+        return state, known
+    if places:
+        raise InputError(f"checkpoint: all {len(places)} under {folder} are damaged")
+    return None
+
+
+def _hash(state: dict[str, Any], data: bytes) -> str:
+    return hashlib.sha256(json.dumps(state, sort_keys=True).encode() + data).hexdigest()
+
+
+def _places(folder: Path) -> list[Path]:
+    if not folder.is_dir():
+        return []
+    return sorted(place for place in folder.iterdir() if place.is_dir() and place.name.isdigit())

@@ -18,8 +18,8 @@ from unjam.learners.imagination import Imagination
 from unjam.learners.state import restore_imagination
 from unjam.reports.results import MODEL_FILE, read_model, read_progress
 from unjam.scenarios.scenario import Scenario
-from unjam.training.checkpoint import load_checkpoint
 from unjam.training.config import RunConfig
+from unjam.training.folder import load_checkpoint
 from unjam.virtual.comparison import OneStepErrors, one_step_errors, open_loop, recorded, replay
 from unjam.virtual.data import ActualData
 from unjam.virtual.model import NUMBERS, TARGETS, EnvironmentModel
@@ -61,14 +61,8 @@ def newest_model_facts(folder: Path, config: RunConfig) -> dict[str, Any]:
 
 
 def write_model_facts(folder: Path, config: RunConfig) -> None:
-    """Measure the virtual environment of a run as its newest checkpoint has it, and write `model.json`.
-
-    Raises:
-        InputError: the run has no virtual environment, or no checkpoint yet.
-        DiskError: the disk is full.
-    """
-    facts = measure_model(folder, config)
-    write_whole(folder / MODEL_FILE, to_json(facts))
+    """Write what `measure_model` finds into the run's `model.json`."""
+    write_whole(folder / MODEL_FILE, to_json(measure_model(folder, config)))
 
 
 def measure_model(folder: Path, config: RunConfig) -> dict[str, Any]:
@@ -91,12 +85,11 @@ def measure_model(folder: Path, config: RunConfig) -> dict[str, Any]:
     )
     restore_imagination(imagination, state, tensors)
     scenario = imagination.scenario
-    data, model = imagination.data, imagination.model
     generator = np.random.default_rng(config.seed)
     newest = read_progress(folder)[-1]
-    actual = data.transitions(settings.holdout)
+    actual = imagination.data.transitions(settings.holdout)
     held_out = actual.chosen(generator.permutation(np.flatnonzero(actual.held_out))[:ROWS])
-    errors = one_step_errors(model, held_out, scenario, config.reward)
+    errors = one_step_errors(imagination.model, held_out, scenario, config.reward)
     return _rounded(
         {
             "iteration": state["iteration"],
@@ -125,16 +118,19 @@ def _by_bins(values: Floats, errors: OneStepErrors) -> dict[str, Any]:
     edges = np.unique(np.quantile(values, np.linspace(0, 1, BINS + 1)))
     places = np.searchsorted(edges[1:-1], values, side="right")
     bins = [places == place for place in np.unique(places)]
-    model = errors.model
+
+    def errors_of(kind: Floats) -> dict[str, list[float]]:
+        """By target, the error in each bin, of errors of shape (..., R, targets)."""
+        return {
+            name: [root_mean_square(kind[..., rows, column]) for rows in bins]
+            for column, name in enumerate(TARGETS)
+        }
+
     return {
         "at": [values[rows].mean() for rows in bins],
         "decisions": [int(rows.sum()) for rows in bins],
-        "base": {
-            name: [root_mean_square(errors.base[rows, i]) for rows in bins] for i, name in enumerate(TARGETS)
-        },
-        "model": {
-            name: [root_mean_square(model[:, rows, i]) for rows in bins] for i, name in enumerate(TARGETS)
-        },
+        "base": errors_of(errors.base),
+        "model": errors_of(errors.model),
     }
 
 
@@ -151,17 +147,17 @@ def _replayed(imagination: Imagination, scenario: Scenario, generator: np.random
     data, model = imagination.data, imagination.model
     held_out = data.held_out(imagination.settings.holdout)
     decisions = decisions_ahead([int(rows.sum()) for rows in held_out if rows.any()])
-    looks = data.looks(decisions)
-    looks = looks[[held_out[place][at] for place, at in looks]]
-    looks = looks[np.sort(generator.permutation(len(looks))[:STARTS])]
+    starts = data.looks(decisions)
+    starts = starts[[held_out[place][at] for place, at in starts]]
+    starts = starts[np.sort(generator.permutation(len(starts))[:STARTS])]
     single = replace(imagination.settings, members=1, error="unexplained")
     alone = EnvironmentModel(single, len(scenario.drawn_ranges), (0,))
     moments = np.unique(np.linspace(0, decisions - 1, MOMENTS).round().astype(int))
-    found = open_loop(model, data, looks, decisions, scenario)
-    base = open_loop(alone, data, looks, decisions, scenario)
+    found, base = (open_loop(each, data, starts, decisions, scenario) for each in (model, alone))
+    examples = starts[generator.permutation(len(starts))[:EXAMPLES]]
     return {
         "seconds": (moments + 1) * scenario.decision_step,
-        "starts": len(looks),
+        "starts": len(starts),
         "numbers": {
             name: {
                 "model": found.error[name][moments],
@@ -171,23 +167,21 @@ def _replayed(imagination: Imagination, scenario: Scenario, generator: np.random
             }
             for name in NUMBERS
         },
-        "examples": _examples(
-            data, looks[generator.permutation(len(looks))[:EXAMPLES]], moments, (model, alone), scenario
-        ),
+        "examples": _examples(data, examples, moments, (model, alone), scenario),
     }
 
 
 def _examples(
     data: ActualData,
-    looks: NDArray[np.int64],
+    starts: NDArray[np.int64],
     moments: NDArray[np.int64],
     models: tuple[EnvironmentModel, EnvironmentModel],
     scenario: Scenario,
 ) -> list[dict[str, Any]]:
-    """Return what happened from `looks` on, what each member of the model says, and what the base says."""
+    """Return what happened after `starts`, what each member of the model says, and what the base says."""
     decisions = int(moments[-1]) + 1
-    actual = recorded(data, looks, decisions)
-    model, base = (replay(each, data, looks, decisions, scenario) for each in models)
+    actual = recorded(data, starts, decisions)
+    model, base = (replay(each, data, starts, decisions, scenario) for each in models)
     return [
         {
             "begins": at * scenario.decision_step,
@@ -201,7 +195,7 @@ def _examples(
                 for name in SHOWN
             },
         }
-        for example, (place, at) in enumerate(looks)
+        for example, (place, at) in enumerate(starts)
     ]
 
 

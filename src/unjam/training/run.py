@@ -19,10 +19,9 @@ from unjam.learners.imagination import Imagination
 from unjam.learners.state import learner_state, restore_learner
 from unjam.measures.metrics import measure
 from unjam.reports.results import read_progress
-from unjam.training.checkpoint import load_checkpoint, save_checkpoint
 from unjam.training.config import RunConfig
 from unjam.training.evaluate import VALIDATION, raise_failure
-from unjam.training.folder import origin
+from unjam.training.folder import load_checkpoint, origin, save_checkpoint
 from unjam.worlds.record import Episode
 from unjam.worlds.workers import EpisodeTask, Workers
 

@@ -5,27 +5,113 @@ choose a training's controller anyway; the held-out ones stay unseen.
 """
 
 import math
-from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, wait
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from unjam.errors import InputError, MissingPartError, UnjamError
+from unjam.errors import InputError, MissingPartError, UnjamError, wrong
 from unjam.files import make_folder, to_json, write_whole
 from unjam.manifest import manifest
+from unjam.parameters import merge, nested, parse_value
 from unjam.reports.results import read_progress
 from unjam.training.config import RunConfig, load_config, to_toml
-from unjam.training.executors import Command, Executor, Told, running
-from unjam.training.search_space import Choice, Space, trial_config
-from unjam.training.trainings import training_command
+from unjam.training.executors import Command, Executor, OnLine, running, training_command
+from unjam.training.folder import check_possible
 
 if TYPE_CHECKING:
     from optuna import Study
     from optuna.trial import FrozenTrial
+    from optuna.trial import Trial as OptunaTrial
 
 CONFIG, FOUND, BEST = "config.toml", "search.json", "best.toml"
 JOURNAL = "journal.log"
 """what Optuna remembers: which trials there were, and what became of them"""
+
+
+@dataclass(frozen=True)
+class Range:
+    """Numbers between two, both included."""
+
+    low: float
+    high: float
+    log: bool = False
+    """whether as many are tried between 0.01 and 0.1 as between 0.1 and 1"""
+
+    @property
+    def whole(self) -> bool:
+        """Whether they are integers."""
+        return isinstance(self.low, int) and isinstance(self.high, int)
+
+    @property
+    def ends(self) -> tuple[Any, ...]:
+        """What is checked before the search: if these can be, those between can."""
+        return self.low, self.high
+
+    def suggest(self, trial: "OptunaTrial", key: str) -> None:
+        """Let Optuna choose one."""
+        if self.whole:
+            trial.suggest_int(key, int(self.low), int(self.high), log=self.log)
+        else:
+            trial.suggest_float(key, self.low, self.high, log=self.log)
+
+
+@dataclass(frozen=True)
+class Choice:
+    """One of several values."""
+
+    ends: tuple[Any, ...]
+
+    def suggest(self, trial: "OptunaTrial", key: str) -> None:
+        """Let Optuna choose one."""
+        trial.suggest_categorical(key, self.ends)
+
+
+Space = dict[str, Range | Choice]
+
+
+def space_of(texts: Sequence[str]) -> Space:
+    """Return what is varied, from texts `key=low..high`, `key=low..high:log` or `key=a,b,c`.
+
+    Raises:
+        InputError: a text is none of these, or the range is empty.
+    """
+    space: Space = {}
+    for text in texts:
+        key, equals, values = (part.strip() for part in text.partition("="))
+        if not (key and equals and values):
+            raise wrong("vary", text, "key=low..high, key=low..high:log or key=a,b,c")
+        if ".." in values:
+            space[key] = _range(text, values)
+        else:
+            space[key] = Choice(tuple(parse_value(value.strip()) for value in values.split(",")))
+    if not space:
+        raise InputError("vary: at least one key is needed: --vary trpo.target_kl=0.003..0.1:log")
+    return space
+
+
+def _range(text: str, values: str) -> Range:
+    values, log = values.removesuffix(":log"), values.endswith(":log")
+    low, high, *more = (parse_value(end.strip()) for end in values.split(".."))
+    numbers = all(isinstance(end, int | float) and not isinstance(end, bool) for end in (low, high))
+    if more or not numbers or not low < high or not math.isfinite(high) or (log and low <= 0):
+        raise wrong("vary", text, "low < high, with :log low > 0")
+    return Range(low, high, log)
+
+
+def check_space(base: RunConfig, space: Space) -> None:
+    """Raise `InputError` where a search cannot work: an unknown key, a value out of range, no validation."""
+    if base.evaluation.every == 0:
+        raise wrong("evaluation.every", 0, ">= 1: trials are judged by validations")
+    for key, values in space.items():
+        for end in values.ends:
+            check_possible(trial_config(base, {key: end}))
+
+
+def trial_config(base: RunConfig, values: dict[str, Any]) -> RunConfig:
+    """Return a configuration with some values changed; keys may have dots."""
+    return load_config(changes=merge(asdict(base), nested(values)))
 
 
 @dataclass(frozen=True)
@@ -46,7 +132,7 @@ def search(
     folder: Path,
     workers: int,
     executor: Executor = "local",
-    told: Told = lambda line: None,
+    on_line: OnLine = lambda line: None,
 ) -> list[Trial]:
     """Train with settings that Optuna proposes, and return all trials, the best first.
 
@@ -60,7 +146,7 @@ def search(
         folder: new, or that of a search with the same base and space.
         workers: trainings at once.
         executor: where they run.
-        told: told a line when one has ended.
+        on_line: gets a line when one has ended.
 
     Raises:
         InputError: the folder holds another search.
@@ -68,45 +154,44 @@ def search(
         UnjamError: all trainings failed.
     """
     study = _study(base, space, folder)
-    commands = _Commands(base, folder)
     waiting = [trial for trial in study.get_trials() if trial.state.name == "RUNNING"]
-    with ThreadPoolExecutor(workers) as threads, running(executor, workers) as run:
+    with running(executor, workers) as start:
         jobs: dict[Future[int], int] = {}
-        try:
-            while True:
-                while len(jobs) < workers and (trial := _next(study, space, trials, waiting)) is not None:
-                    number, values = trial
-                    jobs[threads.submit(run, commands.of(number, values))] = number
-                if not jobs:
-                    break
-                for done in wait(jobs, return_when=FIRST_COMPLETED).done:
-                    number = jobs.pop(done)
-                    _tell(study, number, commands.folder_of(number), done.result())
-                    told(_words(study, number, trials))
-        except BaseException:
-            threads.shutdown(wait=False, cancel_futures=True)
-            raise
-    found = [_found(trial, commands) for trial in study.get_trials()]
+        while True:
+            while len(jobs) < workers and (trial := _next(study, space, trials, waiting)) is not None:
+                number, values = trial
+                jobs[start(_command(base, folder, number, values))] = number
+            if not jobs:
+                break
+            for done in wait(jobs, return_when=FIRST_COMPLETED).done:
+                number = jobs.pop(done)
+                gain = None if done.result() else gain_of(_trial_folder(folder, number))
+                _tell(study, number, gain)
+                on_line(_words(study, number, trials))
+    found = [
+        Trial(trial.number, trial.params, _trial_folder(folder, trial.number), trial.value)
+        for trial in study.get_trials()
+    ]
     found.sort(key=lambda trial: -math.inf if trial.gain is None else trial.gain, reverse=True)
-    _write(base, found, folder)
+    rows = [{"trial": one.number, "gain": one.gain, "folder": str(one.folder), **one.values} for one in found]
+    write_whole(folder / FOUND, to_json({"manifest": manifest(), "trials": rows}, indent=1))
+    if found[0].gain is None:
+        raise UnjamError(f"all {len(found)} trainings failed; what they said is in {folder / 'plans'}")
+    write_whole(folder / BEST, to_toml(trial_config(base, found[0].values)))
     return found
 
 
-class _Commands:
-    """Command lines of trials."""
+def _trial_folder(folder: Path, number: int) -> Path:
+    return folder / "trials" / f"{number:04d}"
 
-    def __init__(self, base: RunConfig, folder: Path) -> None:
-        self._base, self._folder = base, folder
 
-    def folder_of(self, number: int) -> Path:
-        return self._folder / "trials" / f"{number:04d}"
-
-    def of(self, number: int, values: dict[str, Any]) -> Command:
-        config = trial_config(self._base, values)
-        few = replace(config.evaluation, baselines=(), episodes=1)  # the held-out seeds decide nothing here
-        plan, log = (self._folder / "plans" / f"{number:04d}{suffix}" for suffix in (".toml", ".log"))
-        config = replace(config, workers=1, evaluation=few)
-        return training_command(config, self.folder_of(number), plan, log)
+def _command(base: RunConfig, folder: Path, number: int, values: dict[str, Any]) -> Command:
+    """Return the command line of a trial."""
+    config = trial_config(base, values)
+    few = replace(config.evaluation, baselines=(), episodes=1)  # the held-out seeds decide nothing here
+    plan, log = (folder / "plans" / f"{number:04d}{suffix}" for suffix in (".toml", ".log"))
+    config = replace(config, workers=1, evaluation=few)
+    return training_command(config, _trial_folder(folder, number), plan, log)
 
 
 def _study(base: RunConfig, space: Space, folder: Path) -> "Study":
@@ -145,32 +230,22 @@ def _next(
         stopped = waiting.pop(0)
         if stopped.params.keys() == space.keys():
             return stopped.number, stopped.params
-        study.tell(stopped.number, state=_state("FAIL"))  # it was stopped before it had all its values
+        _tell(study, stopped.number, None)  # it was stopped before it had all its values
     if len(study.get_trials(deepcopy=False)) >= trials:
         return None
     trial = study.ask()
     for key, values in space.items():
-        if isinstance(values, Choice):
-            trial.suggest_categorical(key, values.ends)
-        elif values.whole:
-            trial.suggest_int(key, int(values.low), int(values.high), log=values.log)
-        else:
-            trial.suggest_float(key, values.low, values.high, log=values.log)
+        values.suggest(trial, key)
     return trial.number, trial.params
 
 
-def _tell(study: "Study", number: int, folder: Path, code: int) -> None:
-    gain = None if code else gain_of(folder)
-    if gain is None or not math.isfinite(gain):
-        study.tell(number, state=_state("FAIL"))
-    else:
-        study.tell(number, gain)
-
-
-def _state(name: str) -> Any:
+def _tell(study: "Study", number: int, gain: float | None) -> None:
     from optuna.trial import TrialState
 
-    return TrialState[name]
+    if gain is None or not math.isfinite(gain):
+        study.tell(number, state=TrialState.FAIL)
+    else:
+        study.tell(number, gain)
 
 
 def gain_of(folder: Path) -> float | None:
@@ -183,22 +258,9 @@ def gain_of(folder: Path) -> float | None:
 def _words(study: "Study", number: int, trials: int) -> str:
     trial = study.get_trials(deepcopy=False)[number]
     ended = sum(one.state.is_finished() for one in study.get_trials(deepcopy=False))
-    values = ", ".join(f"{key} {_short(value)}" for key, value in trial.params.items())
+    values = ", ".join(
+        f"{key} {value:.4g}" if isinstance(value, float) else f"{key} {value}"
+        for key, value in trial.params.items()
+    )
     result = "failed" if trial.value is None else f"{trial.value:+.1f}"
     return f"{ended} of {trials}: trial {number}: {values}: {result}"
-
-
-def _short(value: Any) -> str:
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
-
-
-def _found(trial: "FrozenTrial", commands: _Commands) -> Trial:
-    return Trial(trial.number, trial.params, commands.folder_of(trial.number), trial.value)
-
-
-def _write(base: RunConfig, found: list[Trial], folder: Path) -> None:
-    rows = [{"trial": one.number, "gain": one.gain, "folder": str(one.folder), **one.values} for one in found]
-    write_whole(folder / FOUND, to_json({"manifest": manifest(), "trials": rows}, indent=1))
-    if found[0].gain is None:
-        raise UnjamError(f"all {len(found)} trainings failed; what they said is in {folder / 'plans'}")
-    write_whole(folder / BEST, to_toml(trial_config(base, found[0].values)))

@@ -7,6 +7,7 @@ their parts measured in turn.
 import itertools
 import os
 import time
+from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -23,12 +24,13 @@ from unjam.learners.settings import PolicySettings
 from unjam.scenarios.registry import SCENARIOS
 from unjam.scenarios.ring import Ring
 from unjam.scenarios.scenario import Scenario
+from unjam.training.executors import OnLine
 from unjam.virtual.data import ActualData
 from unjam.virtual.model import EnvironmentModel, torch_generator
 from unjam.virtual.rollout import begin, draw_starts, imagine
 from unjam.virtual.settings import VirtualSettings
 from unjam.virtual.world import VirtualDynamics
-from unjam.worlds.drive import drive_traffic
+from unjam.worlds.drive import Drive
 from unjam.worlds.episode import run_episode
 from unjam.worlds.record import Episode
 from unjam.worlds.sumo import make_traffic
@@ -45,9 +47,12 @@ METRES_PER_VEHICLE = 245 / 22
 OTHER_ROADS = ("figure-eight", "merge")
 """roads beside the ring on which `run_episode` is compared with SUMO alone"""
 
+Rates = dict[str, list[float]]
+"""steps per second, by what was measured, of each round"""
+
 
 def neural_driver(hold: int) -> ResidualDriver:
-    """Return PI with a residual network of the paper's size that looks every `hold` decisions."""
+    """Return PI with a residual network of the paper's size that chooses every `hold` decisions."""
     generator = np.random.default_rng(0)
     sizes = [5, 64, 64, 1]
     layers = tuple(
@@ -57,92 +62,84 @@ def neural_driver(hold: int) -> ResidualDriver:
     return ResidualDriver(PISaturation(), Network(layers, 1.0, 0.1), 1.0, hold=hold)
 
 
-def measure_speed(rounds: int = ROUNDS, told: Callable[[str], None] | None = None) -> dict[str, Any]:
+def measure_speed(rounds: int = ROUNDS, on_line: OnLine = lambda line: None) -> dict[str, Any]:
     """Return steps per second, ratios, and the cost of a vehicle-step by size; on one core.
 
     `over_bare`: steps/s of `run_episode` (loading and recording included) over those of SUMO alone, with the
-    residual driver that training makes by default, whose network looks once a second.
-    `over_bare_every_step`: the same with a network that looks in every step.
+    residual driver that training makes by default, whose network chooses once a second.
+    `over_bare_every_step`: the same with a network that chooses in every step.
     `over_traci`: steps/s of the same driving loop with libsumo over those through TraCI.
     `virtual`: decisions/s of virtual rollouts, with the default ensemble and beginning them included, over
     those of `run_episode`.
     `roads`: `over_bare` on other roads.
     `growth`: the largest cost of a vehicle-step over that of the smallest road.
     """
-    say = told or (lambda _: None)
-    if hasattr(os, "sched_setaffinity"):
-        cores = os.sched_getaffinity(0)
-        os.sched_setaffinity(0, {min(cores)})
-        try:
-            return _measure(rounds, say)
-        finally:
-            os.sched_setaffinity(0, cores)
-    return _measure(rounds, say)
+    if not hasattr(os, "sched_setaffinity"):
+        return _measure(rounds, on_line)
+    cores = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {min(cores)})
+    try:
+        return _measure(rounds, on_line)
+    finally:
+        os.sched_setaffinity(0, cores)
 
 
-def _measure(rounds: int, say: Callable[[str], None]) -> dict[str, Any]:
+def _measure(rounds: int, on_line: OnLine) -> dict[str, Any]:
     ring = SCENARIOS["ring"]
-    driver = neural_driver(PolicySettings().decisions_held(ring.decision_step))
-    every_step = neural_driver(1)
-    found: dict[str, list[float]] = {"bare": [], "episode": [], "every_step": [], "loop": [], "traci": []}
-    others: dict[str, dict[str, list[float]]] = {name: {"bare": [], "episode": []} for name in OTHER_ROADS}
-    virtual: dict[str, list[float]] = {name: [] for name in VIRTUAL}
+    driver, every_step = neural_driver(PolicySettings().decisions_held(ring.decision_step)), neural_driver(1)
+    roads: dict[str, Rates] = {name: {"bare": [], "episode": []} for name in ("ring", *OTHER_ROADS)}
+    rates: Rates = {name: [] for name in ("every_step", "loop", "traci", *VIRTUAL)}
     torch.set_num_threads(1)
     with Simulation() as simulation:
         for name in OTHER_ROADS:  # networks made, caches warm
             run_episode(SCENARIOS[name], driver, (0,), explore=True, simulation=simulation)
         driven = run_episode(ring, driver, (0,), explore=True, simulation=simulation)
     for number in range(1, rounds + 1):
-        say(f"round {number} of {rounds}")
+        on_line(f"round {number} of {rounds}")
         with Simulation() as simulation:
-            make_traffic(ring, (number,), simulation)
-            found["bare"].append(_rate(partial(_step, simulation, ring.horizon), ring.horizon))
-            for name, who in (("episode", driver), ("every_step", every_step)):
-                run = partial(run_episode, ring, who, (number,), explore=True, simulation=simulation)
-                found[name].append(_rate(run, ring.horizon))
-            for name, (rows, decisions) in VIRTUAL.items():
-                virtual[name].append(_virtual_rate(driven, ring, driver, rows, decisions))
-            found["loop"].append(_loop_rate(ring, driver, simulation))
-            for name, rates in others.items():
+            for name, found in roads.items():
                 road = SCENARIOS[name]
                 make_traffic(road, (number,), simulation)
                 steps = road.horizon * road.steps_per_decision
-                rates["bare"].append(_rate(partial(_step, simulation, steps), road.horizon))
-                run = partial(run_episode, road, driver, (number,), explore=True, simulation=simulation)
-                rates["episode"].append(_rate(run, road.horizon))
+                found["bare"].append(_rate(partial(_step, simulation, steps), road.horizon))
+                found["episode"].append(_episode_rate(road, driver, number, simulation))
+            rates["every_step"].append(_episode_rate(ring, every_step, number, simulation))
+            for name, (rows, decisions) in VIRTUAL.items():
+                rates[name].append(_virtual_rate(driven, ring, driver, rows, decisions))
+            rates["loop"].append(_loop_rate(ring, driver, simulation))
         with Simulation("traci") as simulation:
-            found["traci"].append(_loop_rate(replace(ring, horizon=TRACI_STEPS), driver, simulation))
-    say("larger roads")
+            rates["traci"].append(_loop_rate(replace(ring, horizon=TRACI_STEPS), driver, simulation))
+    on_line("larger roads")
     scaling = _scaling(driver, max(1, rounds // 2))
     costs = [entry["us_per_vehicle_step"] for entry in scaling]
+    on_ring = roads.pop("ring")
     return {
-        "bare_steps_per_s": median(found["bare"]),
-        "episode_steps_per_s": median(found["episode"]),
-        "traci_steps_per_s": median(found["traci"]),
-        "every_step_steps_per_s": median(found["every_step"]),
-        "over_bare": _median_ratio(found["episode"], found["bare"]),
-        "over_bare_every_step": _median_ratio(found["every_step"], found["bare"]),
-        "over_traci": _median_ratio(found["loop"], found["traci"]),
+        **_road(on_ring),
+        "traci_steps_per_s": median(rates["traci"]),
+        "every_step_steps_per_s": median(rates["every_step"]),
+        "over_bare_every_step": _median_ratio(rates["every_step"], on_ring["bare"]),
+        "over_traci": _median_ratio(rates["loop"], rates["traci"]),
         "virtual": {
             name: {
-                "rows": VIRTUAL[name][0],
-                "decisions": VIRTUAL[name][1],
-                "steps_per_s": median(rates),
-                "over_actual": _median_ratio(rates, found["episode"]),
+                "rows": rows,
+                "decisions": decisions,
+                "steps_per_s": median(rates[name]),
+                "over_actual": _median_ratio(rates[name], on_ring["episode"]),
             }
-            for name, rates in virtual.items()
+            for name, (rows, decisions) in VIRTUAL.items()
         },
-        "roads": {
-            name: {
-                "bare_steps_per_s": median(rates["bare"]),
-                "episode_steps_per_s": median(rates["episode"]),
-                "over_bare": _median_ratio(rates["episode"], rates["bare"]),
-            }
-            for name, rates in others.items()
-        },
+        "roads": {name: _road(found) for name, found in roads.items()},
         "scaling": scaling,
         "growth": max(costs) / costs[0],
         "rounds": rounds,
+    }
+
+
+def _road(rates: Rates) -> dict[str, float]:
+    return {
+        "bare_steps_per_s": median(rates["bare"]),
+        "episode_steps_per_s": median(rates["episode"]),
+        "over_bare": _median_ratio(rates["episode"], rates["bare"]),
     }
 
 
@@ -164,10 +161,15 @@ def _rate(run: Callable[[], object], steps: int) -> float:
     return steps / (time.perf_counter() - started)
 
 
-def _loop_rate(scenario: Ring | Any, driver: ResidualDriver, simulation: Simulation) -> float:
+def _episode_rate(road: Scenario, driver: ResidualDriver, seed: int, simulation: Simulation) -> float:
+    run = partial(run_episode, road, driver, (seed,), explore=True, simulation=simulation)
+    return _rate(run, road.horizon)
+
+
+def _loop_rate(scenario: Scenario, driver: ResidualDriver, simulation: Simulation) -> float:
     """Return decisions per second of the driving loop alone."""
     traffic = make_traffic(scenario, (1,), simulation, driver.plain_numbers)
-    return _rate(lambda: drive_traffic(traffic, driver, explore=True), scenario.horizon)
+    return _rate(lambda: deque(Drive(traffic, driver, explore=True), maxlen=0), scenario.horizon)
 
 
 def _virtual_rate(
@@ -179,10 +181,10 @@ def _virtual_rate(
     model = EnvironmentModel(VirtualSettings(), len(scenario.drawn_ranges), (0,))
     generator = torch_generator((0,), "cpu")
     world = VirtualDynamics(model, scenario, "", generator)
-    looks = draw_starts(data, rows, 1, (0,))
+    starts = draw_starts(data, rows, 1, (0,))
 
     def run() -> None:
-        imagine(driver, world, begin(data, looks, driver.expert, "cpu"), decisions, generator)
+        imagine(driver, world, begin(data, starts, driver.expert, "cpu"), decisions, generator)
 
     return _rate(run, rows * decisions)
 

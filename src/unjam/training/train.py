@@ -7,14 +7,13 @@ from typing import Any
 
 import torch
 
-from unjam.drivers.registry import describe
 from unjam.kernels import child_would_be_pinned
 from unjam.measures.statistics import Estimate, paired_difference
 from unjam.reports.html import write_report
 from unjam.training.apart import train_apart
 from unjam.training.config import RunConfig
+from unjam.training.evaluate import TRAINED, judge
 from unjam.training.folder import check_possible, continue_folder, start_folder
-from unjam.training.judge import TRAINED, judge
 from unjam.training.model_facts import write_model_facts
 from unjam.training.run import Run, Told
 from unjam.worlds.workers import Workers
@@ -90,4 +89,4 @@ def gain_of(config: RunConfig, rows: dict[str, list[dict[str, Any]]]) -> Estimat
     """Return what the trained controller earns beyond its expert, same seeds paired."""
     if config.expert == "none":
         return None
-    return paired_difference(rows[TRAINED], rows[describe(config.make_expert())], "return")
+    return paired_difference(rows[TRAINED], rows[config.make_expert().describe()], "return")

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from unjam.training import health
-from unjam.training.health import RESULTS_SUMO, Check, check_health
+from unjam.cli import machine
+from unjam.cli.machine import RESULTS_SUMO, Check, check_health
 
 
 @pytest.fixture(scope="module")
@@ -62,17 +62,17 @@ def test_the_results_were_made_with_the_version_that_is_said() -> None:
 
 
 def test_another_sumo_than_that_of_the_results_is_a_warning(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(health, "version", lambda name: "1.28.1")
-    check = health._sumo_of_results()
+    monkeypatch.setattr(machine, "version", lambda name: "1.28.1")
+    check = machine._sumo_of_results()
     assert (check.ok, check.needed, check.found) == (False, False, "1.28.1")
     assert f"made with SUMO {RESULTS_SUMO}" in check.remedy
 
 
 def test_each_thing_that_can_be_missing_has_a_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
     def missing(name: str) -> str:
-        raise health.PackageNotFoundError(name)
+        raise machine.PackageNotFoundError(name)
 
-    monkeypatch.setattr(health, "version", missing)
+    monkeypatch.setattr(machine, "version", missing)
     monkeypatch.delenv("DISPLAY", raising=False)
     checks = {check.name: check for check in check_health()}
     for name in ("libsumo", "eclipse-sumo", "torch", "stable-baselines3", "sb3-contrib", "mp4 video"):
@@ -84,8 +84,8 @@ def test_each_thing_that_can_be_missing_has_a_remedy(monkeypatch: pytest.MonkeyP
 
 
 def test_another_version_of_sumo_is_not_ok(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(health, "version", lambda name: "1.27.0")
-    check = health._sumo_package("libsumo")
+    monkeypatch.setattr(machine, "version", lambda name: "1.27.0")
+    check = machine._sumo_package("libsumo")
     assert not check.ok
     assert check.found == "1.27.0"
     assert "libsumo==1.28.0" in check.remedy
@@ -96,7 +96,7 @@ def test_a_cache_that_cannot_be_made_is_told_with_its_remedy(
 ) -> None:
     (tmp_path / "file").write_text("in the way")
     monkeypatch.setenv("UNJAM_CACHE", str(tmp_path / "file" / "cache"))
-    check = health._cache()
+    check = machine._cache()
     assert not check.ok
     assert str(tmp_path) in check.found
     assert "UNJAM_CACHE" in check.remedy
@@ -104,7 +104,7 @@ def test_a_cache_that_cannot_be_made_is_told_with_its_remedy(
 
 def test_a_cache_that_is_not_there_yet_is_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("UNJAM_CACHE", str(tmp_path / "new" / "cache"))
-    assert health._cache().ok
+    assert machine._cache().ok
     assert (tmp_path / "new" / "cache").is_dir()
 
 
@@ -113,7 +113,7 @@ def test_an_episode_that_fails_is_told_in_its_own_words(
 ) -> None:
     (tmp_path / "file").write_text("in the way")
     monkeypatch.setenv("UNJAM_CACHE", str(tmp_path / "file" / "cache"))
-    check = health._try("an episode in a worker", health._episode, "see the message")
+    check = machine._try("an episode in a worker", machine._episode, "see the message")
     assert not check.ok
     assert str(tmp_path) in check.found
     assert "\n" not in check.found
