@@ -77,7 +77,7 @@ def test_policy_driver_and_graph_agree_on_a_whole_episode_of_the_ring(simulation
     driver = driver_of(policy.network(), expert)
     stay = longest_stay(Ring(), driver, simulation)
     assert len(stay.applied) == 3000
-    chosen, _ = stay.looks
+    chosen, _ = stay.choices
     assert chosen.std() > 0.1
     seen = stay.observations[:-1].astype(np.float32)
     np.testing.assert_allclose(mean_of(policy, seen), chosen, rtol=0, atol=PARITY)

@@ -81,6 +81,8 @@ def test_tensors_give_what_arrays_give(hold: int) -> None:
         np.testing.assert_allclose(
             found.command.acceleration.numpy(), expected.command.acceleration, atol=1e-12
         )
+        assert found.observation is not None
+        assert expected.observation is not None
         np.testing.assert_allclose(found.observation.numpy(), expected.observation, atol=1e-12)
 
 

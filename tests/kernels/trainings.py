@@ -10,10 +10,10 @@ import tempfile
 from pathlib import Path
 
 import torch
-from unjam.traffic.workers import Workers
 
 from tests.training.test_run import learn_with, small_config
 from unjam.learners.state import learner_state
+from unjam.worlds.workers import Workers
 
 DATA = ("virtual/data/", "replay/")
 """what was learned from, not what was learned"""

@@ -284,7 +284,7 @@ def test_the_replay_buffer_holds_what_sb3_would_have_put_there_row_by_row() -> N
         add_to_replay_buffer(ours, rows, 2.0, rows.rewards)
         for trajectory, more in zip(trajectories, extra, strict=True):
             seen = [np.append(row, more).astype(np.float32) for row in trajectory.observations]
-            residuals, earned = trajectory.looks
+            residuals, earned = trajectory.choices
             for look, (residual, reward) in enumerate(zip(residuals, earned, strict=True)):
                 done = trajectory.terminated and look == len(earned) - 1
                 action = np.array([np.float32(residual) / np.float32(2.0)])

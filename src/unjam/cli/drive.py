@@ -119,7 +119,7 @@ def watch(
       unjam watch ring-jammed --driver runs/ring-001 --video wave.mp4
     """
     from unjam.controller import make_driver
-        from unjam.files import check_folder
+    from unjam.files import check_folder
     from unjam.measures.metrics import measure
     from unjam.reports.film import check_format, write_video
     from unjam.scenarios.registry import make_scenario

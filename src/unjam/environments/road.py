@@ -33,7 +33,7 @@ class Outside(Driver):
 
     def __init__(self, expert: Driver, names: Sequence[FeatureName], limits: Limits) -> None:
         """Let `expert` drive within `limits`; features `names` are what is shown outside."""
-        self.expert, self.names, self.limits = expert, tuple(names), limits
+        self.expert, self.names, self._within = expert, tuple(names), limits
         self.actions: Any = np.zeros(0)
         """[m/s2], shape (CAVs,)"""
 
@@ -48,14 +48,14 @@ class Outside(Driver):
     def observation(self, state: LocalState, memory: Memory) -> Any:
         """Return what is shown outside now, shape (CAVs, numbers), and keep what the expert wants."""
         wanted, self._after = self.expert.act(state, memory)
-        self._wanted = self.limits.keep(wanted)
+        self._wanted = self._within.keep(wanted)
         return observe(self.names, Seen(state, self._wanted, self.expert, self._after))
 
     def decide(self, state: LocalState, memory: Memory, noise: Noise | None = None) -> Decision:
         """Return the sum of what the expert wanted when it was looked at and what was added since."""
         if not len(state.speed):
             return Decision(Command(np.zeros(0)), np.zeros(0), np.zeros(0), None, memory)
-        command = Command(self.limits.keep(self._wanted + self.actions))
+        command = Command(self._within.keep(self._wanted + self.actions))
         return Decision(command, self._wanted, self.actions, None, self._after)
 
 

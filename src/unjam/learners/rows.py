@@ -50,7 +50,7 @@ class Rows:
 
 def rows_of(trajectories: Sequence[Trajectory], critic_inputs: Sequence[tuple[float, ...]]) -> Rows:
     """Return the rows of trajectories; `critic_inputs` has, for each, what the critic alone sees."""
-    looks = [trajectory.looks for trajectory in trajectories]
+    looks = [trajectory.choices for trajectory in trajectories]
     seen = [
         np.column_stack([trajectory.observations, np.tile(extra, (len(trajectory.observations), 1))])
         for trajectory, extra in zip(trajectories, critic_inputs, strict=True)
