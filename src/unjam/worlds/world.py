@@ -109,8 +109,9 @@ class RecordedWorld:
         return len(self._answers) == len(self.states.speed)
 
     def perceive(self) -> LocalState:
-        """Return what was perceived at this moment."""
-        return self.states.each(lambda values: values[len(self._answers)])
+        """Return what was perceived at this moment; after the last one, at the last."""
+        moment = min(len(self._answers), len(self.states.speed) - 1)
+        return self.states.each(lambda values: values[moment])
 
     def advance(self, command: Command | None) -> None:
         """Note what was asked for, and go on to the next moment."""

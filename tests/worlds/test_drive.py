@@ -1,0 +1,81 @@
+"""The one loop, on a world without a simulator."""
+
+import numpy as np
+import pytest
+
+from tests.conftest import random_network
+from tests.mock_world import MockWorld
+from unjam.drivers import IDM, Human, LocalState, PISaturation, ResidualDriver
+from unjam.drivers.command import Limits
+from unjam.drivers.wrappers import Impaired, Mixed
+from unjam.worlds.drive import Drive, drive
+from unjam.worlds.world import RecordedWorld
+
+PI = PISaturation()
+RESIDUAL = ResidualDriver(PI, random_network(), 1.0, hold=4)
+
+
+def test_it_drives_until_the_world_has_ended() -> None:
+    applied, driven = drive(MockWorld(decisions=25), PI)
+    assert applied.shape == (25, 3)
+    assert driven.decisions == []
+
+
+def test_a_single_cav_in_plain_numbers_drives_as_one_row_does() -> None:
+    rows, _ = drive(MockWorld(rows=1), RESIDUAL)
+    plain, _ = drive(MockWorld(rows=1, single=True), RESIDUAL)
+    np.testing.assert_allclose(plain, rows, atol=1e-12)
+
+
+def test_it_keeps_what_was_decided_and_what_would_be_seen_at_the_end() -> None:
+    world = MockWorld()
+    applied, driven = drive(world, RESIDUAL)
+    experts, residuals, seen = (np.array(part) for part in zip(*driven.decisions, strict=True))
+    np.testing.assert_allclose(applied, (experts + residuals).clip(-1.0, 1.0))
+    assert seen.shape == (40, 3, 5)
+    assert driven.last_observation is not None
+    np.testing.assert_allclose(driven.last_observation[:, 0], world.perceive().speed / 10.0)
+    assert len(driven.memories) == 3
+    assert driven.hold == 4
+
+
+def test_it_explores_only_when_asked_to() -> None:
+    calm, _ = drive(MockWorld(), RESIDUAL)
+    again, _ = drive(MockWorld(), RESIDUAL)
+    np.testing.assert_array_equal(calm, again)
+    assert not np.array_equal(calm, drive(MockWorld(), RESIDUAL, explore=True)[0])
+
+
+@pytest.mark.parametrize("driver", [PI, RESIDUAL, Mixed((PI, IDM())), Impaired(PI, delay=0.3)])
+def test_memory_goes_with_the_vehicle_where_some_leave_and_others_enter(driver: Mixed) -> None:
+    world = MockWorld(turnover=5)
+    driving = Drive(world, driver)
+    for _ in driving:
+        assert np.asarray(world.perceive().speed).shape == (3,)
+    assert world.entered == 3 + 40 // 5
+    assert len(driving.memories) == world.entered
+
+
+def test_a_newcomer_remembers_nothing() -> None:
+    driving = Drive(MockWorld(turnover=5), PI)
+    seen = [driving.memory["seen"].tolist() for _ in driving]
+    assert seen[3:6] == [[4, 4, 4], [5, 5, 0], [6, 6, 1]]
+
+
+def test_where_the_simulator_drives_nobody_is_asked() -> None:
+    assert list(Drive(MockWorld(decisions=3), Human())) == [None] * 3
+
+
+def test_progress_is_told_now_and_then() -> None:
+    told: list[int] = []
+    drive(MockWorld(decisions=25), PI, on_progress=told.append)
+    assert told == [10, 20]
+
+
+def test_it_goes_on_from_a_memory() -> None:
+    states = LocalState(*(np.full((6, 2), value) for value in (4.0, 5.0, 10.0, 3.0, 8.0, 20.0, 250.0)))
+    whole = drive(RecordedWorld(states, Limits(-1.0, 1.0)), PI)
+    first = Drive(RecordedWorld(states.each(lambda values: values[:2]), Limits(-1.0, 1.0)), PI)
+    assert len(list(first)) == 2
+    rest = RecordedWorld(states.each(lambda values: values[2:]), Limits(-1.0, 1.0))
+    np.testing.assert_array_equal(drive(rest, PI, memory=first.memory), whole[2:])
