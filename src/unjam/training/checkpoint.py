@@ -11,7 +11,7 @@ from safetensors.torch import load, save
 
 from unjam.errors import InputError
 from unjam.files import make_folder, write_whole
-from unjam.learners.state import Tensors
+from unjam.learners.learner import Tensors
 
 FORMAT = 2
 """of what a checkpoint holds; one of another unjam is refused"""

@@ -18,7 +18,13 @@ from unjam.worlds.reward import make_reward
 
 
 def check_possible(config: RunConfig) -> None:
-    """Raise `InputError` where the expert, what the network sees, the reward or a baseline is at fault."""
+    """Raise `InputError` where an expert, what the network sees, a reward or a baseline is at fault."""
+    for road in config.roads().values():
+        _check_road(road)
+    config.make_tasks()
+
+
+def _check_road(config: RunConfig) -> None:
     scenario = config.make_scenario()
     of_a_loop = [part for part in config.policy.observe if part in ("loop_length", "place")]
     if of_a_loop and not scenario.closed:

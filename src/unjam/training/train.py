@@ -1,32 +1,54 @@
 """Train: from a configuration to a folder with everything about the run. `unjam train`, `unjam.train`."""
 
-from collections.abc import Callable
-from dataclasses import dataclass
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from math import ceil
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
+from unjam.controller import controller_bytes
+from unjam.drivers.driver import Driver
+from unjam.drivers.network import Network
 from unjam.drivers.registry import describe
+from unjam.files import append_line, make_folder, to_json, write_whole
+from unjam.learners.algorithm_1 import Driven, Iteration, algorithm_1, begin
+from unjam.learners.imagination import full_policy
+from unjam.measures.metrics import measure
 from unjam.measures.statistics import Estimate, paired_difference
 from unjam.reports.html import write_report
-from unjam.training.config import RunConfig
-from unjam.training.folder import check_possible, continue_folder, start_folder
+from unjam.reports.results import read_progress
+from unjam.training.checkpoint import load_checkpoint, save_checkpoint
+from unjam.training.config import RunConfig, to_toml
+from unjam.training.evaluate import VALIDATION, raise_failure
+from unjam.training.folder import check_possible, continue_folder, origin, start_folder
 from unjam.training.judge import TRAINED, judge
 from unjam.training.model_facts import write_model_facts
-from unjam.training.run import Run, Told
-from unjam.worlds.workers import Workers
+from unjam.worlds.workers import EpisodeTask, Workers
+
+OnIteration = Callable[[dict[str, Any]], None]
+"""called with each row of progress as it is written"""
+MEANS = (
+    *("mean_speed", "speed_std_fleet", "cav_mean_speed", "speed_std_cav", "mean_abs_accel"),
+    "shield_override_share",
+)
+"""metrics whose means over an iteration's episodes are in progress"""
 
 
 @dataclass(frozen=True)
 class TrainResult:
-    """A finished training run."""
+    """A finished training run; of several roads, each has its own result in `roads`, and no other."""
 
     folder: Path
     rows: dict[str, list[dict[str, Any]]]
     """by driver: a row of metrics per held-out episode"""
     gain: Estimate | None
     """return of the trained controller beyond its expert's, same seeds paired; None without an expert"""
+    roads: dict[str, "TrainResult"] = field(default_factory=dict)
+    """by task, each in a folder of its own; empty where there is one road alone"""
 
     @property
     def controller(self) -> Path:
@@ -43,39 +65,43 @@ def train(
     config: RunConfig,
     folder: Path | str,
     resume: bool = False,
-    told: Told | None = None,
+    on_iteration: OnIteration | None = None,
     progress: Callable[[tuple[str, int], int], None] | None = None,
 ) -> TrainResult:
     """Train as `config` says into `folder`, judge the controller on held-out seeds, and write the report.
 
     A run that was stopped goes on where it was with `resume`; one that ended goes on if `config.steps` is
-    larger than before. It then ends with the same parameters as if it had never stopped.
+    larger than before. It then ends with the same parameters as if it had never stopped. A run of several
+    roads (`config.tasks`) is judged on each of them, in a folder with the road's name.
 
     Args:
         config: what to do; see `unjam.load_config`.
         folder: new, or the run's.
         resume: whether to go on with the run in `folder`.
-        told: told a row of progress after each iteration.
-        progress: told how far the final evaluation is: ((driver, episode), decisions).
+        on_iteration: called with a row of progress after each iteration.
+        progress: called with how far the final evaluation is: ((driver, episode), decisions).
 
     Raises:
         InputError: the folder holds something else, or the driver or reward are at fault.
         DiskError: the disk is full; the last checkpoint is whole.
     """
     folder = Path(folder)
-    check_possible(config)  # what is wrong is told before anything is written
+    check_possible(config)  # what is wrong is said before anything is written
     if resume:
         continue_folder(folder, config)
     else:
         start_folder(folder, config)
     torch.set_num_threads(1)  # more threads would fight with the workers for the cores
+    results: dict[str, TrainResult] = {}
     with Workers(config.workers) as workers:
-        Run(folder, config, workers, told).train()
-        found = judge(folder, config, workers, progress=progress)
-    if config.virtual.virtual_ratio > 0:
+        Trainer(folder, config, workers, on_iteration).train()
+        for name, road in config.roads().items():
+            found = judge(folder / name, road, workers, progress=progress)
+            results[name] = TrainResult(folder / name, found.rows, gain_of(road, found.rows))
+    if config.virtual.virtual_ratio > 0 and not config.tasks:
         write_model_facts(folder, config)
-    write_report([folder], folder / "report.html")
-    return TrainResult(folder, found.rows, gain_of(config, found.rows))
+    write_report([result.folder for result in results.values()], folder / "report.html")
+    return TrainResult(folder, {}, None, results) if config.tasks else results[""]
 
 
 def gain_of(config: RunConfig, rows: dict[str, list[dict[str, Any]]]) -> Estimate | None:
@@ -83,3 +109,172 @@ def gain_of(config: RunConfig, rows: dict[str, list[dict[str, Any]]]) -> Estimat
     if config.expert == "none":
         return None
     return paired_difference(rows[TRAINED], rows[describe(config.make_expert())], "return")
+
+
+class Trainer:
+    """What Algorithm 1 needs around it: episodes from the workers, validation, and the run's folder.
+
+    Of several roads each has a folder of its own in the run's, with controller and progress. Returns of
+    the whole run are then means over the roads by weight, and so is what chooses the controllers.
+    """
+
+    def __init__(
+        self, folder: Path, config: RunConfig, workers: Workers, on_iteration: OnIteration | None = None
+    ) -> None:
+        """Prepare a run, from its newest checkpoint if it has one."""
+        self.folder = folder
+        self.config = config
+        self.workers = workers
+        self.tasks = config.make_tasks()
+        self.folders = [folder / task.name for task in self.tasks]
+        self.training = begin(self.tasks, config.policy, config.learner, config.virtual, config.seed)
+        self._on_iteration = on_iteration
+        total = sum(task.weight for task in self.tasks)
+        self._shares = [task.weight / total for task in self.tasks]
+        self._validation_best = -np.inf
+        self._expert_returns = [float("nan")] * len(self.tasks)
+        self._validated: list[float] | None = None
+        self._validation_seconds = 0.0
+        checkpoint = load_checkpoint(folder / "checkpoint")
+        if checkpoint is not None:
+            state, tensors = checkpoint
+            self.training.restore(state, tensors)
+            self._validation_best = state["validation_best"]
+            self._expert_returns = state.get("expert_returns", [state["expert_return"]])
+            for place in {folder, *self.folders}:
+                _forget_progress_after(state["iteration"], place)
+
+    def train(self) -> None:
+        """Learn until the configured number of actual steps; a stop loses at most the running iteration."""
+        if self.training.iteration == 0:
+            for place, road in zip(self.folders, self.config.roads().values(), strict=True):
+                if place != self.folder:
+                    make_folder(place)
+                    write_whole(place / "config.toml", to_toml(road))
+            self._expert_returns = self.returns_of([task.expert for task in self.tasks])
+            self._keep_controllers(self.training.learner.network())
+            self._validation_best = self._mean(self._expert_returns)
+        algorithm_1(self.training, self.config.steps, self.collect, self.validate, self.write)
+
+    def drivers(self, network: Network) -> list[Driver]:
+        """Return the full policy on each road: its expert plus this residual."""
+        return [full_policy(task, self.config.policy, network) for task in self.tasks]
+
+    def collect(self, network: Network, iteration: int) -> Driven:
+        """Return the episodes of an iteration, at least one of each road, as many as its weight asks for."""
+        steps = self.config.learner.batch_steps
+        counts = [
+            max(1, ceil(round(share * steps / task.scenario.horizon, 9)))
+            for task, share in zip(self.tasks, self._shares, strict=True)
+        ]
+        return self._drive(self.drivers(network), counts, (self.config.seed, iteration), explore=True)
+
+    def validate(self, iteration: Iteration) -> None:
+        """Now and then, and at the end, drive the validation seeds, and keep the best controller."""
+        started = time.perf_counter()
+        network, every = self.training.learner.network(), self.config.evaluation.every
+        last, self._validated = iteration.actual_steps >= self.config.steps, None
+        if every and (iteration.number % every == 0 or last):
+            self._validated = self.returns_of(self.drivers(network))
+            if self._mean(self._validated) > self._validation_best:
+                self._validation_best = self._mean(self._validated)
+                self._keep_controllers(network)
+        elif not every and last:
+            self._keep_controllers(network)
+        self._validation_seconds = time.perf_counter() - started
+
+    def write(self, iteration: Iteration) -> None:
+        """Write a row of progress, of the whole run and of each road, and a checkpoint."""
+        expert_return = self._mean(self._expert_returns)
+        of_tasks = [
+            self._row(
+                iteration,
+                [measure(episode) for episode in driven],
+                self._expert_returns[index],
+                None if self._validated is None else self._validated[index],
+                dict(iteration.virtual[index]) if iteration.virtual else {},
+            )
+            for index, driven in enumerate(iteration.episodes)
+        ]
+        row = of_tasks[0]
+        if len(of_tasks) > 1:
+            measured = [measure(episode) for driven in iteration.episodes for episode in driven]
+            validation = None if self._validated is None else self._mean(self._validated)
+            row = self._row(iteration, measured, expert_return, validation, {})
+            row["return_mean"] = self._mean([each["return_mean"] for each in of_tasks])
+            names = ("return_mean", "return_expert", "return_validation", "k_star", "eps_m")
+            row["tasks"] = {
+                task.name: {name: each[name] for name in names}
+                for task, each in zip(self.tasks, of_tasks, strict=True)
+            }
+            for place, each in zip(self.folders, of_tasks, strict=True):
+                append_line(place / "progress.jsonl", to_json(each))
+        append_line(self.folder / "progress.jsonl", to_json(row))
+        counters, tensors = self.training.state()
+        state = {**counters, "validation_best": self._validation_best, "expert_return": expert_return}
+        if len(of_tasks) > 1:
+            state["expert_returns"] = self._expert_returns
+        save_checkpoint(self.folder / "checkpoint", state, tensors)
+        if self._on_iteration is not None:
+            self._on_iteration(row)
+
+    def returns_of(self, drivers: Sequence[Driver]) -> list[float]:
+        """Return the mean return on the validation seeds, by road, each driven by its own of `drivers`."""
+        counts = [self.config.evaluation.validation_episodes] * len(self.tasks)
+        episodes = self._drive(drivers, counts, (VALIDATION,))
+        return [float(np.mean([measure(episode)["return"] for episode in driven])) for driven in episodes]
+
+    def _drive(
+        self, drivers: Sequence[Driver], counts: Sequence[int], seed: tuple[int, ...], explore: bool = False
+    ) -> Driven:
+        """Run `counts` episodes that cover the range of what each scenario draws; raise where one failed."""
+        wanted = []
+        for task, driver, count in zip(self.tasks, drivers, counts, strict=True):
+            for part in range(count):
+                scenario = task.scenario.part(part, count) if self.config.spread else task.scenario
+                wanted.append(EpisodeTask(scenario, driver, (*seed, len(wanted)), task.reward, explore))
+        episodes = self.workers.run(wanted)
+        raise_failure([measure(episode) for episode in episodes if not episode.ok])
+        ends = np.cumsum(counts)
+        return [episodes[end - count : end] for end, count in zip(ends, counts, strict=True)]
+
+    def _mean(self, by_task: Sequence[float]) -> float:
+        """Return the mean over the roads by weight."""
+        return sum(share * value for share, value in zip(self._shares, by_task, strict=True))
+
+    def _row(
+        self,
+        iteration: Iteration,
+        measured: Sequence[dict[str, Any]],
+        expert_return: float,
+        validation: float | None,
+        virtual: dict[str, Any],
+    ) -> dict[str, Any]:
+        means = {name: float(np.mean([row[name] for row in measured])) for name in ("return", *MEANS)}
+        return {
+            "iteration": iteration.number,
+            "actual_steps": iteration.actual_steps,
+            "virtual_steps": iteration.virtual_steps,
+            "k_star": virtual.get("k_star"),
+            "eps_m": virtual.get("eps_m"),
+            "return_mean": means.pop("return"),
+            "return_expert": expert_return,
+            "return_validation": validation,
+            **means,
+            "collisions": sum(row["collisions"] for row in measured),
+            "learner": iteration.log,
+            "virtual": virtual,
+            "seconds": {**iteration.seconds, "validation": self._validation_seconds},
+        }
+
+    def _keep_controllers(self, network: Network) -> None:
+        done = {"iteration": self.training.iteration, "actual_steps": self.training.actual_steps}
+        for place, task, driver in zip(self.folders, self.tasks, self.drivers(network), strict=True):
+            about = {**origin(task.scenario, task.expert), **done}
+            write_whole(place / "controller.unjam", controller_bytes(driver, about))
+
+
+def _forget_progress_after(iteration: int, folder: Path) -> None:
+    """Remove rows of iterations that the checkpoint does not know: they will be made again."""
+    kept = [to_json(row) + "\n" for row in read_progress(folder) if row["iteration"] <= iteration]
+    write_whole(folder / "progress.jsonl", "".join(kept))

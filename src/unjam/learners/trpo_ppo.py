@@ -1,16 +1,22 @@
-"""The residual policy that learns, in torch, and its NumPy twin that drives in the workers."""
+"""TRPO and PPO: learners from the rows of the newest policy alone, and the policy that they share."""
 
 import math
-from typing import Any
+from typing import Any, cast
 
-import numpy as np
+import sb3_contrib
+import stable_baselines3
 import torch
-from gymnasium import spaces
 from stable_baselines3.common.policies import ActorCriticPolicy
-from torch import nn
+from torch import Tensor, nn
+from torch.distributions import Normal
 
 from unjam.drivers.network import Network
-from unjam.learners.settings import PolicySettings
+from unjam.learners.experience import Experience, discounted_returns, fill_rollout_buffer, join
+from unjam.learners.learner import AgentSpec, Gaussians, Learner, Update, network_layers
+from unjam.learners.settings import PolicySettings, PPOSettings, TRPOSettings
+
+SIZED_LATER = 2
+"""stands for the size of rollout buffer and batch until an iteration says how many rows it has"""
 
 
 class BoundedTanh(nn.Module):
@@ -20,7 +26,7 @@ class BoundedTanh(nn.Module):
         super().__init__()
         self.authority = authority
 
-    def forward(self, features: torch.Tensor) -> torch.Tensor:
+    def forward(self, features: Tensor) -> Tensor:
         """Return the bounded mean, of the shape of `features`."""
         return self.authority * torch.tanh(features)
 
@@ -31,10 +37,10 @@ class ScaledValue(nn.Module):
     def __init__(self, inputs: int) -> None:
         super().__init__()
         self.linear = nn.Linear(inputs, 1)
-        self.scale: torch.Tensor
+        self.scale: Tensor
         self.register_buffer("scale", torch.tensor([0.0, 1.0]))
 
-    def forward(self, features: torch.Tensor) -> torch.Tensor:
+    def forward(self, features: Tensor) -> Tensor:
         """Return the value, shape (n, 1)."""
         return self.scale[0] + self.scale[1] * self.linear(features)
 
@@ -49,20 +55,19 @@ class ActorAndCritic(nn.Module):
         super().__init__()
         self.inputs = inputs
         self.policy_net = _layers(inputs, hidden)
-        self.value_net = _layers(
-            inputs + critic_inputs, hidden
-        )  # TRPO tells the critic by `value` in its name
+        # TRPO tells the critic by `value` in its name.
+        self.value_net = _layers(inputs + critic_inputs, hidden)
         self.latent_dim_pi = self.latent_dim_vf = hidden[-1]
 
-    def forward(self, features: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    def forward(self, features: Tensor) -> tuple[Tensor, Tensor]:
         """Return the last hidden layers of actor and critic."""
         return self.forward_actor(features), self.forward_critic(features)
 
-    def forward_actor(self, features: torch.Tensor) -> torch.Tensor:
+    def forward_actor(self, features: Tensor) -> Tensor:
         """Return the actor's last hidden layer."""
         return self.policy_net(features[:, : self.inputs])
 
-    def forward_critic(self, features: torch.Tensor) -> torch.Tensor:
+    def forward_critic(self, features: Tensor) -> Tensor:
         """Return the critic's last hidden layer."""
         return self.value_net(features)
 
@@ -127,26 +132,82 @@ class ResidualPolicy(ActorCriticPolicy):
         return Network(layers, self.authority, float(torch.exp(self.log_std.detach()).item()))
 
 
-def network_layers(module: nn.Module) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
-    """Return weight and bias of each linear layer as a `Network` takes them: float64 copies, inputs first."""
-    return tuple(
-        (_array(layer.weight).T.copy(), _array(layer.bias))
-        for layer in module.modules()
-        if isinstance(layer, nn.Linear)
-    )
+class OnPolicy(Learner):
+    """What learners share that learn from the rows of the current policy alone."""
+
+    def measure_units(self, actual: Experience) -> None:
+        """Scale the value head by the returns of actual rows."""
+        if self.spec.policy.normalise_value:
+            returns = discounted_returns(actual, self.gamma)
+            self.sb3.policy.scale_value(float(returns.mean()), float(max(returns.std(), 1e-3)))
+
+    def gaussians(self, observations: Tensor) -> Gaussians:
+        """Return mean and standard deviation of the residual."""
+        with torch.no_grad():
+            normal = cast(Normal, self.sb3.policy.get_distribution(observations).distribution)
+        return Gaussians(normal.mean.squeeze(1), normal.stddev.squeeze(1))
+
+    def learn(self, update: Update) -> None:
+        """Update policy and value network with actual and virtual rows together."""
+        self.fill(join([part for part in (update.actual, update.virtual) if part is not None]))
+        self.sb3.train()
+
+    def fill(self, rows: Experience) -> None:
+        """Put rows into the rollout buffer, in place of those before."""
+        fill_rollout_buffer(self.sb3.rollout_buffer, self.sb3.policy, rows)
 
 
-def _array(tensor: torch.Tensor) -> np.ndarray:
-    return tensor.detach().cpu().numpy().astype(np.float64)
+class TRPO(OnPolicy):
+    """Trust region policy optimisation from whole episodes."""
+
+    def __init__(self, spec: AgentSpec, settings: TRPOSettings) -> None:
+        super().__init__(
+            spec,
+            sb3_contrib.TRPO,
+            ResidualPolicy,
+            # SB3 drops its own eps when given arguments for the optimiser.
+            {"optimizer_kwargs": {"eps": 1e-5, "weight_decay": settings.value_l2}},
+            learning_rate=settings.critic_rate,
+            n_steps=settings.critic_batch,  # the buffer takes the size of the episodes
+            batch_size=settings.critic_batch,
+            gamma=settings.gamma,
+            gae_lambda=settings.gae_lambda,
+            target_kl=settings.target_kl,
+            cg_damping=settings.cg_damping,
+            cg_max_steps=settings.cg_steps,
+            n_critic_updates=settings.critic_epochs,
+        )
 
 
-def policy_spaces(inputs: int, critic_inputs: int, authority: float) -> tuple[spaces.Box, spaces.Box]:
-    """Return the observation and action space of a residual policy; `authority` in m/s2.
+class PPO(OnPolicy):
+    """Proximal policy optimisation from whole episodes."""
 
-    The bounds are those of the residual's mean. With its exploration noise it may lie beyond them: what is
-    clipped is the full policy, expert plus residual.
-    """
-    return (
-        spaces.Box(-np.inf, np.inf, (inputs + critic_inputs,), np.float32),
-        spaces.Box(-authority, authority, (1,), np.float32),
-    )
+    def __init__(self, spec: AgentSpec, settings: PPOSettings) -> None:
+        super().__init__(
+            spec,
+            TwoRatesPPO,
+            ResidualPolicy,
+            n_steps=SIZED_LATER,
+            batch_size=SIZED_LATER,
+            n_epochs=settings.epochs,
+            gamma=settings.gamma,
+            gae_lambda=settings.gae_lambda,
+            clip_range=settings.clip,
+            # SB3 clips the gradients of actor and critic together; they share no weight, and the critic's
+            # gradient, in the units of returns, would leave nothing of the actor's.
+            max_grad_norm=math.inf,
+        )
+        self._minibatches = settings.minibatches
+        self.sb3.policy.set_rates(settings.actor_rate, settings.critic_rate)
+
+    def fill(self, rows: Experience) -> None:
+        """Put rows into the rollout buffer, and say how many of them make a minibatch."""
+        super().fill(rows)
+        self.sb3.batch_size = math.ceil(len(rows.rewards) / self._minibatches)
+
+
+class TwoRatesPPO(stable_baselines3.PPO):
+    """SB3's PPO, with the rates of the policy's optimiser left as they are."""
+
+    def _update_learning_rate(self, optimizers: Any) -> None:
+        """Do nothing: SB3 would set one rate for actor and critic."""
