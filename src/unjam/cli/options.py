@@ -7,6 +7,7 @@ from typing import Annotated, Any
 import typer
 
 from unjam.errors import InputError, wrong_name
+from unjam.learners.settings import AGENTS
 from unjam.parameters import parse_assignments
 from unjam.training.executors import EXECUTORS, Executor
 
@@ -59,7 +60,7 @@ SettingsOption = Annotated[
 ]
 StepsOption = Annotated[int | None, typer.Option(min=1, help="Actual simulator steps to train for.")]
 RunSeedOption = Annotated[int | None, typer.Option(min=0, help="Seed of the whole run.")]
-AgentOption = Annotated[str | None, typer.Option(help="Learner: trpo, ppo, sac.")]
+AgentOption = Annotated[str | None, typer.Option(help=f"Learner: {', '.join(AGENTS)}.")]
 ExpertOption = Annotated[
     str | None,
     typer.Option(help="Driver that the residual is added to, as in drive --driver; none: no expert."),

@@ -74,6 +74,8 @@ def train(
 
       unjam train ring --agent sac --steps 120000
 
+      unjam train --config mixture.toml              (several roads together: its tables of tasks)
+
       unjam train ring-jammed --expert follower-stopper --steps 500000 --seed 3
 
       unjam train ring --expert my_driver.py:gentle --reward my_reward.py:calm
@@ -168,21 +170,27 @@ def _print_result(result: Any, json: bool) -> None:
     from unjam.measures.statistics import summarise
     from unjam.reports.story import signed
 
+    def facts(of: Any) -> dict[str, Any]:
+        return {
+            "folder": str(of.folder),
+            "controller": str(of.controller),
+            "report": str(result.report),
+            "gain": asdict(of.gain) if of.gain else None,
+            "drivers": {
+                driver: {name: found.mean for name, found in summarise(rows).items()}
+                for driver, rows in of.rows.items()
+            },
+        }
+
     if json:
-        print_json(
-            {
-                "folder": str(result.folder),
-                "controller": str(result.controller),
-                "report": str(result.report),
-                "gain": asdict(result.gain) if result.gain else None,
-                "drivers": {
-                    driver: {name: found.mean for name, found in summarise(rows).items()}
-                    for driver, rows in result.rows.items()
-                },
-            }
-        )
+        roads = {name: facts(road) for name, road in result.roads.items()}
+        print_json({**facts(result), "roads": roads} if roads else facts(result))
         return
-    console.print(metrics_table(result.rows))
-    if result.gain is not None:
-        console.print(f"return beyond the expert, held-out seeds, 95 % interval: {signed(result.gain)}")
-    aside.print(f"controller: {result.controller}\nreport: {result.report}")
+    for name, road in (result.roads or {"": result}).items():
+        if name:
+            console.print(f"{name}:")
+        console.print(metrics_table(road.rows))
+        if road.gain is not None:
+            console.print(f"return beyond the expert, held-out seeds, 95 % interval: {signed(road.gain)}")
+        aside.print(f"controller: {road.controller}")
+    aside.print(f"report: {result.report}")
