@@ -8,7 +8,7 @@ import torch
 
 from unjam.drivers import LocalState, PISaturation
 from unjam.drivers.network import Network
-from unjam.learners.algorithm_1 import Driven, Iteration, Training, algorithm_1
+from unjam.learners.algorithm_1 import Driven, Iteration, Training, Validated, algorithm_1
 from unjam.learners.learner import AgentSpec, make_learner
 from unjam.learners.settings import (
     LearnerSettings,
@@ -100,7 +100,10 @@ class Toy:
         ]
 
     def run(self, actual_steps: int) -> None:
-        algorithm_1(self.training, actual_steps, self.collect, lambda _: None, self.iterations.append)
+        algorithm_1(self.training, actual_steps, self.collect, lambda _: None, self.write)
+
+    def write(self, iteration: Iteration, _: Validated) -> None:
+        self.iterations.append(iteration)
 
     def learn(self, iterations: int) -> "Toy":
         self.run(iterations * self.episodes * DECISIONS)

@@ -82,7 +82,9 @@ class Trained:
 
     def learn(self, iterations: int) -> "Trained":
         budget = iterations * 2 * RING.horizon
-        algorithm_1(self.training, budget, self.collect, lambda _: None, self.told.append)
+        algorithm_1(
+            self.training, budget, self.collect, lambda _: None, lambda done, _: self.told.append(done)
+        )
         return self
 
 

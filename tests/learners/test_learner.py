@@ -9,9 +9,10 @@ from hypothesis import strategies as st
 from safetensors.torch import load, save
 from scipy.integrate import quad
 from scipy.stats import norm
+from torch.distributions import Normal
 
 from tests.learners.task import QUICK, Toy, same
-from unjam.learners.learner import Gaussians, policy_distance
+from unjam.learners.learner import policy_distance
 from unjam.learners.settings import AGENTS, LearnerSettings, PolicySettings, SACSettings
 
 torch.set_num_threads(1)  # more would fight for the cores over matrices of this size
@@ -122,8 +123,8 @@ means = st.floats(-3, 3)
 stds = st.floats(0.05, 3)
 
 
-def of(mean: float, std: float) -> Gaussians:
-    return Gaussians(torch.tensor([mean]), torch.tensor([std]))
+def of(mean: float, std: float) -> Normal:
+    return Normal(torch.tensor([mean]), torch.tensor([std]))
 
 
 @given(means, stds, means, stds)

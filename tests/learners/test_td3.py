@@ -91,7 +91,8 @@ def test_the_policy_is_updated_once_for_so_many_updates_of_its_critics() -> None
 def test_eps_pi_is_that_of_the_exploration_noise_about_the_residual() -> None:
     toy = Toy(agent="td3").learn(2)
     seen = torch.as_tensor(random_rows(20, INPUTS + 1))
-    mean, std = toy.learner.gaussians(seen)
+    noise = toy.learner.gaussians(seen)
+    mean, std = noise.mean, noise.stddev
     network = toy.learner.network()
     np.testing.assert_allclose(mean.numpy(), network(seen[:, :INPUTS].numpy().astype(float)), atol=1e-6)
     assert set(std.tolist()) == {np.float32(network.exploration_std)}

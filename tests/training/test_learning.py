@@ -29,7 +29,7 @@ QUICK: dict[str, dict[str, Any]] = {
     },
     "td3": {
         **{"td3.batch_steps": 3000, "td3.start_steps": 3000, "td3.updates_per_step": 0.3},
-        "steps": 24_000,
+        **{"td3.tau": 0.03, "steps": 24_000},
     },
 }
 STANDING = 60.0

@@ -29,6 +29,8 @@ COMPARED_ROWS = 2000
 
 Driven = Sequence[Sequence[Episode]]
 """the episodes of each task"""
+Validated = Sequence[float] | None
+"""return on the validation seeds of each task; None where it was not the time to validate"""
 
 
 @dataclass
@@ -107,8 +109,8 @@ def algorithm_1(
     training: Training,
     budget: int,
     collect: Callable[[Network, int], Driven],
-    validate: Callable[[Iteration], None],
-    write: Callable[[Iteration], None],
+    validate: Callable[[Iteration], Validated],
+    write: Callable[[Iteration, Validated], None],
 ) -> None:
     """Learn until `budget` actual steps were made in all; a stop loses at most the running iteration.
 
@@ -117,7 +119,8 @@ def algorithm_1(
         budget: actual steps, those of the iterations before included.
         collect: (pi_theta, iteration) -> the episodes of an iteration, driven with exploration.
         validate: judges the policy as it is now, where it is time to, and keeps it if it is the best.
-        write: writes progress and a checkpoint: what an iteration did, and the state of `training`.
+        write: writes progress and a checkpoint: what an iteration did, what `validate` says, and the state
+            of `training`.
 
     Raises:
         UnjamError: an observation, a reward or a parameter is not finite; it names the first.
@@ -175,8 +178,7 @@ def algorithm_1(
         done = Iteration(
             training.iteration, episodes, training.actual_steps, virtual_steps, facts, log, seconds
         )
-        validate(done)
-        write(done)
+        write(done, validate(done))
 
 
 def plan_updates(training: Training) -> list[tuple[bool, int, int]]:

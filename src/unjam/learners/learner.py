@@ -53,13 +53,6 @@ class Update(NamedTuple):
     """of all iterations so far"""
 
 
-class Gaussians(NamedTuple):
-    """The distribution of the residual at each state, before bounds and squashing; tensors of shape (n,)."""
-
-    mean: Tensor
-    std: Tensor
-
-
 class Learner:
     """An algorithm of SB3 for residuals; those that follow make it and fill its buffer."""
 
@@ -78,11 +71,13 @@ class Learner:
     ) -> None:
         """Make SB3's algorithm with its own `arguments`."""
         authority = spec.policy.authority * spec.action_limit
+        env = gymnasium.Env[np.ndarray, np.ndarray]()  # SB3 asks for its spaces; nobody steps it
+        env.observation_space, env.action_space = policy_spaces(spec.inputs, spec.critic_inputs, authority)
         self.spec = spec
         self.gamma = arguments["gamma"]
         self.sb3 = algorithm(
             policy=policy,
-            env=SpacesOnly(*policy_spaces(spec.inputs, spec.critic_inputs, authority)),
+            env=env,
             policy_kwargs={
                 "settings": spec.policy,
                 "inputs": spec.inputs,
@@ -110,8 +105,8 @@ class Learner:
     def measure_units(self, actual: Experience) -> None:
         """Take the units of returns from the first iteration's actual rows."""
 
-    def gaussians(self, observations: Tensor) -> Gaussians:
-        """Return the distribution of the residual at these observations, before any squashing."""
+    def gaussians(self, observations: Tensor) -> Normal:
+        """Return the distribution of the residual at n observations, before any squashing, shape (n,)."""
         raise NotImplementedError
 
     def learn(self, update: Update) -> None:
@@ -172,14 +167,6 @@ def under(prefix: str, tensors: Tensors) -> Tensors:
     return {name.removeprefix(prefix): t.clone() for name, t in tensors.items() if name.startswith(prefix)}
 
 
-class SpacesOnly(gymnasium.Env[np.ndarray, np.ndarray]):
-    """The environment that SB3 asks for its spaces; nobody steps it."""
-
-    def __init__(self, observation_space: spaces.Box, action_space: spaces.Box) -> None:
-        self.observation_space = observation_space
-        self.action_space = action_space
-
-
 def policy_spaces(inputs: int, critic_inputs: int, authority: float) -> tuple[spaces.Box, spaces.Box]:
     """Return the observation and action space of a residual policy; `authority` in m/s2.
 
@@ -202,13 +189,14 @@ def network_layers(module: nn.Module) -> tuple[tuple[np.ndarray, np.ndarray], ..
     return tuple((array(layer.weight).T.copy(), array(layer.bias)) for layer in linear)
 
 
-def policy_distance(one: Gaussians, other: Gaussians) -> Tensor:
+def policy_distance(one: Normal, other: Normal) -> Tensor:
     """Return the total variation between Gaussians, row by row, shape (n,), in [0, 1].
 
     Half the integral of |p - q|: between the places where the densities cross, the difference of the
     probabilities. It is the same after any squashing that keeps the order.
     """
-    (m, s), (n, t) = (tuple(part.double() for part in each) for each in (one, other))
+    one, other = (Normal(each.mean.double(), each.stddev.double()) for each in (one, other))
+    m, s, n, t = one.mean, one.stddev, other.mean, other.stddev
     # p = q where (x-m)^2/s^2 - (x-n)^2/t^2 + 2 log(s/t) = 0
     a = 1 / s**2 - 1 / t**2
     b = 2 * (n / t**2 - m / s**2)
@@ -217,8 +205,6 @@ def policy_distance(one: Gaussians, other: Gaussians) -> Tensor:
     root = (b**2 - 4 * a * c).clip(0).sqrt()
     # Of equal widths they cross once, half-way.
     low, high = ((-b + sign * root) / (2 * torch.where(same, torch.ones_like(a), a)) for sign in (-1, 1))
-    one_between, other_between = (
-        normal.cdf(high) - normal.cdf(low) for normal in (Normal(m, s), Normal(n, t))
-    )
+    between = ((one.cdf(high) - one.cdf(low)) - (other.cdf(high) - other.cdf(low))).abs()
     once = torch.erf((m - n).abs() / (2 * 2**0.5 * s))
-    return torch.where(same, once, (one_between - other_between).abs())
+    return torch.where(same, once, between)

@@ -11,10 +11,11 @@ from stable_baselines3.common.policies import BasePolicy, ContinuousCritic
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.sac.policies import Actor, SACPolicy
 from torch import Tensor, nn
+from torch.distributions import Normal
 
 from unjam.drivers.network import Network
 from unjam.learners.experience import Experience, MixedReplayBuffer, add_to_replay_buffer, shifted_rewards
-from unjam.learners.learner import AgentSpec, Gaussians, Learner, Tensors, Update, network_layers
+from unjam.learners.learner import AgentSpec, Learner, Tensors, Update, network_layers
 from unjam.learners.settings import OffPolicySettings, PolicySettings, SACSettings
 
 UNIFORM_STD = 0.85
@@ -195,11 +196,11 @@ class SAC(OffPolicy):
             target_entropy=settings.target_entropy,
         )
 
-    def gaussians(self, observations: Tensor) -> Gaussians:
+    def gaussians(self, observations: Tensor) -> Normal:
         """Return mean and standard deviation of the residual before the tanh."""
         with torch.no_grad():
             mean, log_std, _ = self.sb3.actor.get_action_dist_params(observations)
-        return Gaussians(mean.squeeze(1), log_std.squeeze(1).exp())
+        return Normal(mean.squeeze(1), log_std.squeeze(1).exp())
 
     def _tensors_in_place(self) -> Tensors:
         """Return the filled part of the replay buffer and, where it is learned, the temperature."""

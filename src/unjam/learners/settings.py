@@ -134,6 +134,7 @@ class TD3Settings(OffPolicySettings):
     """Twin delayed deep deterministic policy gradient; the values of Fujimoto et al. 2018 where they fit."""
 
     learner: ClassVar[str] = "unjam.learners.td3:TD3"
+    rate: Positive = 1e-3
     policy_delay: Count = 2
     """gradient steps of the critics for one of the policy and of the target networks"""
     target_noise: NotNegative = 0.2

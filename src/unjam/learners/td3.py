@@ -10,9 +10,10 @@ import torch
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.td3.policies import Actor, TD3Policy
 from torch import Tensor, nn
+from torch.distributions import Normal
 
 from unjam.drivers.network import Network
-from unjam.learners.learner import AgentSpec, Gaussians, network_layers
+from unjam.learners.learner import AgentSpec, network_layers
 from unjam.learners.sac import ActorView, OffPolicy, OffPolicyResidual
 from unjam.learners.settings import TD3Settings
 
@@ -52,9 +53,9 @@ class TD3(OffPolicy):
             target_noise_clip=settings.target_noise_clip,
         )
 
-    def gaussians(self, observations: Tensor) -> Gaussians:
+    def gaussians(self, observations: Tensor) -> Normal:
         """Return the residual and the standard deviation of its exploration noise [m/s2]."""
         policy = self.sb3.policy
         with torch.no_grad():
             mean = policy.authority * policy.actor(observations).squeeze(1)
-        return Gaussians(mean, torch.full_like(mean, policy.exploration_std))
+        return Normal(mean, torch.full_like(mean, policy.exploration_std))

@@ -7,12 +7,13 @@ import sb3_contrib
 import stable_baselines3
 import torch
 from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.torch_layers import create_mlp
 from torch import Tensor, nn
 from torch.distributions import Normal
 
 from unjam.drivers.network import Network
 from unjam.learners.experience import Experience, discounted_returns, fill_rollout_buffer, join
-from unjam.learners.learner import AgentSpec, Gaussians, Learner, Update, network_layers
+from unjam.learners.learner import AgentSpec, Learner, Update, network_layers
 from unjam.learners.settings import PolicySettings, PPOSettings, TRPOSettings
 
 SIZED_LATER = 2
@@ -54,9 +55,9 @@ class ActorAndCritic(nn.Module):
     def __init__(self, inputs: int, critic_inputs: int, hidden: tuple[int, ...]) -> None:
         super().__init__()
         self.inputs = inputs
-        self.policy_net = _layers(inputs, hidden)
+        self.policy_net = nn.Sequential(*create_mlp(inputs, -1, list(hidden)))  # -1: no output layer
         # TRPO tells the critic by `value` in its name.
-        self.value_net = _layers(inputs + critic_inputs, hidden)
+        self.value_net = nn.Sequential(*create_mlp(inputs + critic_inputs, -1, list(hidden)))
         self.latent_dim_pi = self.latent_dim_vf = hidden[-1]
 
     def forward(self, features: Tensor) -> tuple[Tensor, Tensor]:
@@ -70,14 +71,6 @@ class ActorAndCritic(nn.Module):
     def forward_critic(self, features: Tensor) -> Tensor:
         """Return the critic's last hidden layer."""
         return self.value_net(features)
-
-
-def _layers(inputs: int, hidden: tuple[int, ...]) -> nn.Sequential:
-    layers: list[nn.Module] = []
-    for size in hidden:
-        layers += [nn.Linear(inputs, size), nn.ReLU()]
-        inputs = size
-    return nn.Sequential(*layers)
 
 
 class ResidualPolicy(ActorCriticPolicy):
@@ -141,11 +134,11 @@ class OnPolicy(Learner):
             returns = discounted_returns(actual, self.gamma)
             self.sb3.policy.scale_value(float(returns.mean()), float(max(returns.std(), 1e-3)))
 
-    def gaussians(self, observations: Tensor) -> Gaussians:
+    def gaussians(self, observations: Tensor) -> Normal:
         """Return mean and standard deviation of the residual."""
         with torch.no_grad():
             normal = cast(Normal, self.sb3.policy.get_distribution(observations).distribution)
-        return Gaussians(normal.mean.squeeze(1), normal.stddev.squeeze(1))
+        return Normal(normal.mean.squeeze(1), normal.stddev.squeeze(1))
 
     def learn(self, update: Update) -> None:
         """Update policy and value network with actual and virtual rows together."""

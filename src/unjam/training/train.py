@@ -15,7 +15,7 @@ from unjam.drivers.driver import Driver
 from unjam.drivers.network import Network
 from unjam.drivers.registry import describe
 from unjam.files import append_line, make_folder, to_json, write_whole
-from unjam.learners.algorithm_1 import Driven, Iteration, algorithm_1, begin
+from unjam.learners.algorithm_1 import Driven, Iteration, Validated, algorithm_1, begin
 from unjam.learners.imagination import full_policy
 from unjam.measures.metrics import measure
 from unjam.measures.statistics import Estimate, paired_difference
@@ -36,6 +36,7 @@ MEANS = (
     "shield_override_share",
 )
 """metrics whose means over an iteration's episodes are in progress"""
+RETURNS = ("return_mean", "return_expert", "return_validation")
 
 
 @dataclass(frozen=True)
@@ -133,8 +134,6 @@ class Trainer:
         self._shares = [task.weight / total for task in self.tasks]
         self._validation_best = -np.inf
         self._expert_returns = [float("nan")] * len(self.tasks)
-        self._validated: list[float] | None = None
-        self._validation_seconds = 0.0
         checkpoint = load_checkpoint(folder / "checkpoint")
         if checkpoint is not None:
             state, tensors = checkpoint
@@ -169,54 +168,50 @@ class Trainer:
         ]
         return self._drive(self.drivers(network), counts, (self.config.seed, iteration), explore=True)
 
-    def validate(self, iteration: Iteration) -> None:
+    def validate(self, iteration: Iteration) -> Validated:
         """Now and then, and at the end, drive the validation seeds, and keep the best controller."""
-        started = time.perf_counter()
+        started, found = time.perf_counter(), None
         network, every = self.training.learner.network(), self.config.evaluation.every
-        last, self._validated = iteration.actual_steps >= self.config.steps, None
+        last = iteration.actual_steps >= self.config.steps
         if every and (iteration.number % every == 0 or last):
-            self._validated = self.returns_of(self.drivers(network))
-            if self._mean(self._validated) > self._validation_best:
-                self._validation_best = self._mean(self._validated)
+            found = self.returns_of(self.drivers(network))
+            if self._mean(found) > self._validation_best:
+                self._validation_best = self._mean(found)
                 self._keep_controllers(network)
         elif not every and last:
             self._keep_controllers(network)
-        self._validation_seconds = time.perf_counter() - started
+        iteration.seconds["validation"] = time.perf_counter() - started
+        return found
 
-    def write(self, iteration: Iteration) -> None:
+    def write(self, iteration: Iteration, validated: Validated) -> None:
         """Write a row of progress, of the whole run and of each road, and a checkpoint."""
-        expert_return = self._mean(self._expert_returns)
-        of_tasks = [
-            self._row(
-                iteration,
-                [measure(episode) for episode in driven],
-                self._expert_returns[index],
-                None if self._validated is None else self._validated[index],
-                dict(iteration.virtual[index]) if iteration.virtual else {},
-            )
-            for index, driven in enumerate(iteration.episodes)
-        ]
-        row = of_tasks[0]
-        if len(of_tasks) > 1:
-            measured = [measure(episode) for driven in iteration.episodes for episode in driven]
-            validation = None if self._validated is None else self._mean(self._validated)
-            row = self._row(iteration, measured, expert_return, validation, {})
-            row["return_mean"] = self._mean([each["return_mean"] for each in of_tasks])
-            names = ("return_mean", "return_expert", "return_validation", "k_star", "eps_m")
-            row["tasks"] = {
-                task.name: {name: each[name] for name in names}
-                for task, each in zip(self.tasks, of_tasks, strict=True)
+        rows = [self._row(iteration, validated, index) for index in range(len(self.tasks))]
+        whole, several = rows[0], len(rows) > 1
+        if several:
+            for place, row in zip(self.folders, rows, strict=True):
+                append_line(place / "progress.jsonl", to_json(row))
+            names = [*RETURNS, *MEANS] if validated else [*RETURNS[:-1], *MEANS]
+            whole = {
+                **rows[0],
+                **{name: self._mean([row[name] for row in rows]) for name in names},
+                **{"k_star": None, "eps_m": None, "virtual": {}},
+                "collisions": sum(row["collisions"] for row in rows),
+                "tasks": {
+                    task.name: {name: row[name] for name in (*RETURNS, "k_star", "eps_m")}
+                    for task, row in zip(self.tasks, rows, strict=True)
+                },
             }
-            for place, each in zip(self.folders, of_tasks, strict=True):
-                append_line(place / "progress.jsonl", to_json(each))
-        append_line(self.folder / "progress.jsonl", to_json(row))
+        append_line(self.folder / "progress.jsonl", to_json(whole))
         counters, tensors = self.training.state()
-        state = {**counters, "validation_best": self._validation_best, "expert_return": expert_return}
-        if len(of_tasks) > 1:
-            state["expert_returns"] = self._expert_returns
+        state = {
+            **counters,
+            "validation_best": self._validation_best,
+            "expert_return": whole["return_expert"],
+            **({"expert_returns": self._expert_returns} if several else {}),
+        }
         save_checkpoint(self.folder / "checkpoint", state, tensors)
         if self._on_iteration is not None:
-            self._on_iteration(row)
+            self._on_iteration(whole)
 
     def returns_of(self, drivers: Sequence[Driver]) -> list[float]:
         """Return the mean return on the validation seeds, by road, each driven by its own of `drivers`."""
@@ -242,14 +237,10 @@ class Trainer:
         """Return the mean over the roads by weight."""
         return sum(share * value for share, value in zip(self._shares, by_task, strict=True))
 
-    def _row(
-        self,
-        iteration: Iteration,
-        measured: Sequence[dict[str, Any]],
-        expert_return: float,
-        validation: float | None,
-        virtual: dict[str, Any],
-    ) -> dict[str, Any]:
+    def _row(self, iteration: Iteration, validated: Validated, index: int) -> dict[str, Any]:
+        """Return the row of progress of one road."""
+        measured = [measure(episode) for episode in iteration.episodes[index]]
+        virtual = iteration.virtual[index] if iteration.virtual else {}
         means = {name: float(np.mean([row[name] for row in measured])) for name in ("return", *MEANS)}
         return {
             "iteration": iteration.number,
@@ -258,13 +249,13 @@ class Trainer:
             "k_star": virtual.get("k_star"),
             "eps_m": virtual.get("eps_m"),
             "return_mean": means.pop("return"),
-            "return_expert": expert_return,
-            "return_validation": validation,
+            "return_expert": self._expert_returns[index],
+            "return_validation": validated[index] if validated else None,
             **means,
             "collisions": sum(row["collisions"] for row in measured),
             "learner": iteration.log,
             "virtual": virtual,
-            "seconds": {**iteration.seconds, "validation": self._validation_seconds},
+            "seconds": iteration.seconds,
         }
 
     def _keep_controllers(self, network: Network) -> None:
