@@ -78,7 +78,9 @@ class Imagination:
         self._actual = sum(len(self.data.recordings[place].reward) for place in self._newest)
         settings = self.settings
         if settings.calibrate and first == 0:
-            self._know(calibrated_people(self.data.recordings, self.scenario))
+            self.scenario = replace(
+                self.scenario, humans=calibrated_people(self.data.recordings, self.scenario)
+            )
         found = fit(
             self.model,
             self.data.transitions(settings.holdout),
@@ -157,11 +159,8 @@ class Imagination:
         arrays = {name.removeprefix(DATA): t.numpy() for name, t in tensors.items() if name.startswith(DATA)}
         self.data = unpack_data(facts["data"], arrays)
         self.steps = facts["steps"]
-        self._know(IDMParameters(**facts["people"]))
+        self.scenario = replace(self.scenario, humans=IDMParameters(**facts["people"]))
         self.model.load_state_dict({n: t for n, t in tensors.items() if not n.startswith(DATA)})
-
-    def _know(self, people: IDMParameters) -> None:
-        self.scenario = replace(self.scenario, humans=people)
 
     def _choices(self) -> NDArray[np.int64]:
         choices = self.data.looks()

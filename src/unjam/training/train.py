@@ -145,11 +145,11 @@ class Trainer:
 
     def train(self) -> None:
         """Learn until the configured number of actual steps; a stop loses at most the running iteration."""
-        if self.training.iteration == 0:
+        if self.config.tasks:
             for place, road in zip(self.folders, self.config.roads().values(), strict=True):
-                if place != self.folder:
-                    make_folder(place)
-                    write_whole(place / "config.toml", to_toml(road))
+                make_folder(place)
+                write_whole(place / "config.toml", to_toml(road))
+        if self.training.iteration == 0:
             self._expert_returns = self.returns_of([task.expert for task in self.tasks])
             self._keep_controllers(self.training.learner.network())
             self._validation_best = self._mean(self._expert_returns)
@@ -186,8 +186,8 @@ class Trainer:
     def write(self, iteration: Iteration, validated: Validated) -> None:
         """Write a row of progress, of the whole run and of each road, and a checkpoint."""
         rows = [self._row(iteration, validated, index) for index in range(len(self.tasks))]
-        whole, several = rows[0], len(rows) > 1
-        if several:
+        whole = rows[0]
+        if self.config.tasks:
             for place, row in zip(self.folders, rows, strict=True):
                 append_line(place / "progress.jsonl", to_json(row))
             names = [*RETURNS, *MEANS] if validated else [*RETURNS[:-1], *MEANS]
@@ -207,7 +207,7 @@ class Trainer:
             **counters,
             "validation_best": self._validation_best,
             "expert_return": whole["return_expert"],
-            **({"expert_returns": self._expert_returns} if several else {}),
+            **({"expert_returns": self._expert_returns} if self.config.tasks else {}),
         }
         save_checkpoint(self.folder / "checkpoint", state, tensors)
         if self._on_iteration is not None:
