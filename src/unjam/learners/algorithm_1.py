@@ -140,7 +140,6 @@ def algorithm_1(
         if training.iteration == 1:
             learner.measure_units(actual)
         some = torch.as_tensor(actual.observations[:: -(-len(actual.rewards) // COMPARED_ROWS)])
-
         before = learner.gaussians(some)
 
         # ... and add them to D_a. Line 5: train T on D_a. Line 6: eps_m gives the rollout length k*.

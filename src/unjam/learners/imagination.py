@@ -128,7 +128,7 @@ class Imagination:
         self.steps += rollouts.decisions
         if part == 0:  # the policy that drove the actual episodes: returns can be compared
             self.facts |= self._compared(rollouts, driven)
-        return virtual_experience(rollouts, self._policy.critic_sees_road)
+        return rollout_experience(rollouts, self._policy.critic_sees_road)
 
     def bound(self, eps_pi: float, gamma: float) -> float:
         """Return the bound C for this iteration; `gamma` is that from choice to choice."""
@@ -182,7 +182,7 @@ class Imagination:
         }
 
 
-def virtual_experience(rollouts: Rollouts, critic_sees_road: bool) -> Experience:
+def rollout_experience(rollouts: Rollouts, critic_sees_road: bool) -> Experience:
     """Return virtual rollouts in the form in which learners take them; the cut at k* is no termination."""
     made = rollouts.made.cpu().numpy()
     seen = rollouts.observations.cpu().numpy()
