@@ -153,6 +153,8 @@ def test_each_road_is_judged_in_a_folder_of_its_own(tmp_path: Path) -> None:
         assert road.gain is not None
         assert read_config(road.folder) == mixture().roads()[name]
         assert json.loads((road.folder / "evaluation.json").read_text())["scenario"] == "ring"
+        with pytest.raises(InputError, match="is one road of a run of several"):
+            train(read_config(road.folder), road.folder, resume=True)
     networks = [load_controller(road.controller) for road in result.roads.values()]
     first, second = (driver.network.layers for driver in networks if isinstance(driver, ResidualDriver))
     for one, other in zip(first, second, strict=True):

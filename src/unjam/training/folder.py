@@ -61,8 +61,12 @@ def continue_folder(folder: Path, config: RunConfig) -> None:
     """Check that `config` may go on with the run in `folder`, and write down its new budget.
 
     Raises:
-        InputError: something else than the budget or the number of workers differs.
+        InputError: something else than the budget or the number of workers differs, or the folder is that of
+            one road of a run of several.
     """
+    whole = folder.absolute().parent
+    if (whole / "config.toml").is_file() and folder.name in read_config(whole).roads():
+        raise InputError(f"resume: {str(folder)!r} is one road of a run of several; allowed: {whole}")
     before = read_config(folder)
     if replace(before, steps=config.steps, workers=config.workers) != config:
         raise InputError("resume: only steps and workers may change; all else is the run's")
