@@ -149,7 +149,7 @@ def test_learning_libraries_are_imported_only_where_we_learn() -> None:
         "training",
         "virtual",
     }
-    assert "learners/policy.py" in found
+    assert "learners/trpo_ppo.py" in found
 
 
 def test_only_the_command_line_prints_with_its_libraries() -> None:

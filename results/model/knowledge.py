@@ -18,11 +18,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 
-from unjam.drivers.observation import observation_size
 from unjam.drivers.residual import ResidualDriver
 from unjam.files import to_json, write_whole
-from unjam.learners.algorithms import LEARNERS
-from unjam.learners.episodic import Training
+from unjam.learners.algorithm_1 import begin
+from unjam.learners.imagination import full_policy
 from unjam.manifest import manifest
 from unjam.measures.metrics import measure
 from unjam.reports.figures import INK, LINES, STYLE
@@ -58,13 +57,9 @@ def settings_for(base: BaseName, passes: int = 1) -> VirtualSettings:
 
 def untrained(config: RunConfig) -> ResidualDriver:
     """Return the policy with which a training begins."""
-    scenario, expert, policy = config.make_scenario(), config.make_expert(), config.policy
-    training = Training(
-        observation_size(policy.observe, expert), scenario, policy, config.seed, lambda *_: (), lambda _: None
-    )
-    network = LEARNERS[config.agent](training, config.learner).network()
-    hold = policy.decisions_held(scenario.decision_step)
-    return ResidualDriver(expert, network, scenario.action_limit, policy.observe, hold)
+    tasks = config.make_tasks()
+    training = begin(tasks, config.policy, config.learner, config.virtual, config.seed)
+    return full_policy(tasks[0], config.policy, training.learner.network())
 
 
 def driven(

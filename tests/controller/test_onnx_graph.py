@@ -10,8 +10,8 @@ import torch
 from tests.controller.test_file import residual
 from tests.controller.test_sample import perceived
 from tests.drivers.test_experts import EXPERTS
-from tests.learners.test_policy import make_policy, mean_of, shake
-from tests.learners.test_squashed_policy import make_policy as make_squashed_policy
+from tests.learners.test_sac import make_policy as make_squashed_policy
+from tests.learners.test_trpo_ppo import make_policy, mean_of, shake
 from unjam.controller.onnx_graph import onnx_graph
 from unjam.controller.verify import check_graph, replay, run_graph
 from unjam.drivers import (
@@ -32,9 +32,9 @@ from unjam.drivers.observation import observation_size
 from unjam.drivers.registry import named_driver
 from unjam.drivers.wrappers import Mixed
 from unjam.errors import InputError, MissingPartError
-from unjam.learners.policy import ResidualPolicy
+from unjam.learners.sac import SquashedResidualPolicy
 from unjam.learners.settings import PolicySettings
-from unjam.learners.squashed_policy import SquashedResidualPolicy
+from unjam.learners.trpo_ppo import ResidualPolicy
 from unjam.scenarios import Ring
 from unjam.scenarios.registry import make_scenario
 from unjam.scenarios.scenario import Scenario

@@ -12,7 +12,6 @@ from pathlib import Path
 import torch
 
 from tests.training.test_run import learn_with, small_config
-from unjam.learners.state import learner_state
 from unjam.worlds.workers import Workers
 
 DATA = ("virtual/data/", "replay/")
@@ -35,7 +34,7 @@ def hashes(learners: list[str]) -> dict[str, str]:
             )
             run = learn_with(workers, Path(place) / learner, config)
             total = hashlib.sha256()
-            for name, tensor in sorted(learner_state(run.learner)[1].items()):
+            for name, tensor in sorted(run.training.state()[1].items()):
                 if not name.startswith(DATA):
                     total.update(name.encode() + tensor.numpy().tobytes())
             found[learner] = total.hexdigest()[:16]

@@ -6,14 +6,21 @@ from dataclasses import dataclass, field
 import numpy as np
 import torch
 
-from unjam.drivers import LocalState
+from unjam.drivers import LocalState, PISaturation
 from unjam.drivers.network import Network
-from unjam.learners.algorithms import LEARNERS
-from unjam.learners.episodic import Iteration, Training
-from unjam.learners.settings import LearnerSettings, PolicySettings, PPOSettings, SACSettings, TRPOSettings
-from unjam.learners.state import learner_state
+from unjam.learners.algorithm_1 import Driven, Iteration, Training, Validated, algorithm_1
+from unjam.learners.learner import AgentSpec, make_learner
+from unjam.learners.settings import (
+    LearnerSettings,
+    PolicySettings,
+    PPOSettings,
+    SACSettings,
+    TD3Settings,
+    TRPOSettings,
+)
 from unjam.scenarios import Ring
 from unjam.worlds.record import Episode, Trajectory
+from unjam.worlds.task import Task
 
 INPUTS, DECISIONS = 2, 100
 LENGTHS = (220.0, 270.0)
@@ -21,6 +28,7 @@ QUICK: dict[str, LearnerSettings] = {
     "trpo": TRPOSettings(critic_epochs=3),
     "ppo": PPOSettings(epochs=5),
     "sac": SACSettings(start_steps=0, updates_per_step=0.01, batch=16, buffer_rows=1000),
+    "td3": TD3Settings(start_steps=0, updates_per_step=0.01, batch=16, buffer_rows=1000),
 }
 """settings with which each learner is quick"""
 
@@ -64,7 +72,7 @@ def episode_of(network: Network, seed: tuple[int, ...], hold: int, target: Targe
 
 
 @dataclass
-class Task:
+class Toy:
     """A learner of the task, and what its iterations told."""
 
     policy: PolicySettings = field(default_factory=lambda: PolicySettings(hidden=(16,), exploration_std=0.2))
@@ -78,26 +86,35 @@ class Task:
     networks: list[Network] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        training = Training(INPUTS, Ring(), self.policy, self.seed, self.collect, self.iterations.append)
-        self.learner = LEARNERS[self.agent](training, self.settings or QUICK[self.agent])
+        spec = AgentSpec(INPUTS, int(self.policy.critic_sees_road), 1.0, self.policy, self.seed)
+        self.learner = make_learner(self.settings or QUICK[self.agent], spec)
+        self.training = Training([Task(Ring(), PISaturation())], self.policy, self.seed, self.learner)
 
-    def collect(self, network: Network, iteration: int) -> list[Episode]:
+    def collect(self, network: Network, iteration: int) -> Driven:
         self.networks.append(network)
         return [
-            episode_of(network, (self.seed, iteration, index), self.hold, self.target)
-            for index in range(self.episodes)
+            [
+                episode_of(network, (self.seed, iteration, index), self.hold, self.target)
+                for index in range(self.episodes)
+            ]
         ]
 
-    def learn(self, iterations: int) -> "Task":
-        self.learner.run(iterations * self.episodes * DECISIONS)
+    def run(self, actual_steps: int) -> None:
+        algorithm_1(self.training, actual_steps, self.collect, lambda _: None, self.write)
+
+    def write(self, iteration: Iteration, _: Validated) -> None:
+        self.iterations.append(iteration)
+
+    def learn(self, iterations: int) -> "Toy":
+        self.run(iterations * self.episodes * DECISIONS)
         return self
 
     def parameters(self) -> dict[str, torch.Tensor]:
-        return learner_state(self.learner)[1]
+        return self.training.state()[1]
 
 
 def mean_return(iteration: Iteration) -> float:
-    return float(np.mean([episode.trajectories[0].reward.sum() for episode in iteration.episodes]))
+    return float(np.mean([episode.trajectories[0].reward.sum() for episode in iteration.episodes[0]]))
 
 
 def same(one: dict[str, torch.Tensor], other: dict[str, torch.Tensor]) -> bool:

@@ -13,19 +13,25 @@ from unjam.drivers import PISaturation
 from unjam.drivers.network import Network
 from unjam.drivers.observation import observation_size
 from unjam.drivers.residual import ResidualDriver
-from unjam.learners.algorithms import LEARNERS, OnPolicy
-from unjam.learners.episodic import Episodic, Iteration, Training
-from unjam.learners.imagination import Imagination, virtual_rows
-from unjam.learners.rows import MixedReplayBuffer, Rows
-from unjam.learners.settings import PolicySettings, PPOSettings, SACSettings, TRPOSettings
-from unjam.learners.state import learner_state, restore_learner
+from unjam.learners.algorithm_1 import Driven, Iteration, algorithm_1, begin
+from unjam.learners.experience import Experience, join
+from unjam.learners.imagination import Imagination, rollout_experience
+from unjam.learners.learner import Update
+from unjam.learners.settings import (
+    AGENTS,
+    PolicySettings,
+    PPOSettings,
+    SACSettings,
+    TD3Settings,
+    TRPOSettings,
+)
 from unjam.physics.idm import IDMParameters
 from unjam.scenarios import Ring
 from unjam.virtual.rollout import Rollouts
 from unjam.virtual.settings import VirtualSettings
 from unjam.worlds.episode import run_episode
-from unjam.worlds.record import Episode
 from unjam.worlds.sumo.simulation import Simulation
+from unjam.worlds.task import Task
 
 torch.set_num_threads(1)
 
@@ -36,10 +42,13 @@ SETTINGS = {
     "trpo": TRPOSettings(critic_epochs=2, critic_batch=16),
     "ppo": PPOSettings(epochs=3),
     "sac": SACSettings(start_steps=0, updates_per_step=0.02, batch=16, buffer_rows=500),
+    "td3": TD3Settings(start_steps=0, updates_per_step=0.02, batch=16, buffer_rows=500),
 }
+TASK = Task(RING, PISaturation())
+FREE = VirtualSettings(virtual_ratio=0.0)
 INPUTS = observation_size(POLICY.observe, PISaturation())
 
-every_learner = pytest.mark.parametrize("agent", LEARNERS)
+every_learner = pytest.mark.parametrize("agent", AGENTS)
 
 
 def driver_of(network: Network) -> ResidualDriver:
@@ -56,22 +65,27 @@ class Trained:
         self.told: list[Iteration] = []
         self.episodes_run = 0
 
-        def collect(network: Network, iteration: int) -> list[Episode]:
+        def collect(network: Network, iteration: int) -> Driven:
             driver = ResidualDriver(
                 PISaturation(), network, 1.0, settings.observe, settings.decisions_held(0.1)
             )
             self.episodes_run += 2
             return [
-                run_episode(RING, driver, (0, iteration, index), explore=True, simulation=simulation)
-                for index in range(2)
+                [
+                    run_episode(RING, driver, (0, iteration, index), explore=True, simulation=simulation)
+                    for index in range(2)
+                ]
             ]
 
-        imagination = virtual and Imagination(virtual, RING, "", PISaturation(), POLICY, 0)
-        training = Training(INPUTS, RING, POLICY, 0, collect, self.told.append, imagination)
-        self.learner: Episodic = LEARNERS[agent](training, SETTINGS[agent])
+        self.collect = collect
+        self.training = begin([TASK], POLICY, SETTINGS[agent], virtual or FREE, 0)
+        self.learner: Any = self.training.learner
 
     def learn(self, iterations: int) -> "Trained":
-        self.learner.run(iterations * 2 * RING.horizon)
+        budget = iterations * 2 * RING.horizon
+        algorithm_1(
+            self.training, budget, self.collect, lambda _: None, lambda done, _: self.told.append(done)
+        )
         return self
 
 
@@ -92,7 +106,7 @@ def test_virtual_rows_change_what_is_learned_and_cost_no_actual_step(agent: str,
 
 
 def policy_of(trained: Trained) -> dict[str, torch.Tensor]:
-    return dict(trained.learner.policy.state_dict())
+    return dict(trained.learner.sb3.policy.state_dict())
 
 
 @every_learner
@@ -104,9 +118,9 @@ def test_a_learner_that_was_stopped_goes_on_with_the_same_model_and_data(
     expected = Trained(shared, agent, virtual).learn(3)
     stopped = Trained(shared, agent, virtual).learn(1)
     resumed = Trained(shared, agent, virtual)
-    restore_learner(resumed.learner, *learner_state(stopped.learner))
+    resumed.training.restore(*stopped.training.state())
     resumed.learn(3)
-    assert same(learner_state(resumed.learner)[1], learner_state(expected.learner)[1])
+    assert same(resumed.training.state()[1], expected.training.state()[1])
     assert resumed.told[-1].virtual == expected.told[-1].virtual
     assert resumed.told[-1].virtual_steps == expected.told[-1].virtual_steps
 
@@ -114,20 +128,22 @@ def test_a_learner_that_was_stopped_goes_on_with_the_same_model_and_data(
 @pytest.mark.parametrize("agent", ["trpo", "ppo"])
 def test_the_ratio_is_exactly_one_before_each_update(agent: str, shared: Simulation) -> None:
     trained = Trained(shared, agent, replace(VIRTUAL, update="sequential", updates=2))
-    learner = cast(Any, trained.learner)
-    learner.collect_rollouts()
-    learner._setup_learn(1)
-    seen = 0
-    for update in learner.updates():
-        learner.fill(update.rows)
-        buffer = learner.rollout_buffer
+    learner = trained.learner
+    seen: list[Update] = []
+
+    def learn(update: Update) -> None:
+        learner.fill(join([part for part in (update.actual, update.virtual) if part is not None]))
+        buffer = learner.sb3.rollout_buffer
         observations, actions = (
             torch.as_tensor(part[:, 0]) for part in (buffer.observations, buffer.actions)
         )
-        _, log_prob, _ = learner.policy.evaluate_actions(observations, actions)
+        _, log_prob, _ = learner.sb3.policy.evaluate_actions(observations, actions)
         np.testing.assert_array_equal(log_prob.detach().numpy(), buffer.log_probs[:, 0])
-        seen += 1
-    assert seen == 3
+        seen.append(update)
+
+    learner.learn = learn
+    trained.learn(1)
+    assert len(seen) == 3
 
 
 def rollouts_of(rewards: np.ndarray, made: list[int], terminated: list[bool]) -> Rollouts:
@@ -148,7 +164,7 @@ def rollouts_of(rewards: np.ndarray, made: list[int], terminated: list[bool]) ->
 
 def test_rows_of_a_rollout_end_where_it_crashed() -> None:
     rollouts = rollouts_of(np.arange(6.0).reshape(2, 3), [3, 2], [False, True])
-    rows = virtual_rows(rollouts, critic_sees_road=True)
+    rows = rollout_experience(rollouts, critic_sees_road=True)
     assert rows.rewards.tolist() == [0, 1, 2, 3, 4]
     assert rows.starts.tolist() == [0, 3]
     assert rows.terminated.tolist() == [False, True]
@@ -158,15 +174,15 @@ def test_rows_of_a_rollout_end_where_it_crashed() -> None:
 
 
 def test_the_advantage_at_the_cut_goes_on_with_the_value_of_where_it_ended(shared: Simulation) -> None:
-    learner = cast(OnPolicy, Trained(shared, "trpo", None).learner)
-    rows = virtual_rows(rollouts_of(np.array([[1.0, 2.0], [3.0, 4.0]]), [2, 2], [False, True]), True)
+    learner = Trained(shared, "trpo", None).learner
+    rows = rollout_experience(rollouts_of(np.array([[1.0, 2.0], [3.0, 4.0]]), [2, 2], [False, True]), True)
     learner.fill(rows)
     with torch.no_grad():
         values, ends = (
-            learner.policy.predict_values(torch.as_tensor(part)).numpy().ravel()  # pyright: ignore
+            learner.sb3.policy.predict_values(torch.as_tensor(part)).numpy().ravel()
             for part in (rows.observations, rows.last_observations)
         )
-    found = learner.rollout_buffer.advantages[:, 0]
+    found = learner.sb3.rollout_buffer.advantages[:, 0]
     assert found[1] == pytest.approx(2.0 + learner.gamma * ends[0] - values[1], abs=1e-4)
     assert found[3] == pytest.approx(4.0 - values[3], abs=1e-4)
 
@@ -174,7 +190,7 @@ def test_the_advantage_at_the_cut_goes_on_with_the_value_of_where_it_ended(share
 def test_rollouts_begin_in_the_newest_episodes_and_are_as_many_as_asked(
     shared: Simulation,
 ) -> None:
-    imagination = Imagination(replace(VIRTUAL, virtual_ratio=3.0), RING, "", PISaturation(), POLICY, 0)
+    imagination = Imagination(replace(VIRTUAL, virtual_ratio=3.0), TASK, POLICY, 0)
     network = random_network(INPUTS, scale=0.1)
     driver = ResidualDriver(PISaturation(), network, 1.0, POLICY.observe, 10)
     for iteration in (1, 2):
@@ -182,26 +198,23 @@ def test_rollouts_begin_in_the_newest_episodes_and_are_as_many_as_asked(
             run_episode(RING, driver, (9, iteration, n), explore=True, simulation=shared) for n in (0, 1)
         ]
         imagination.learn(episodes, iteration)
-    rows = cast(Rows, imagination.imagine(network, 2))
+    rows = cast(Experience, imagination.imagine(network, 2))
     assert imagination.k_star == 30
     assert len(rows.rewards) == 3 * 240 / 10
-    assert set(imagination._looks()[:, 0]) == {2, 3}
+    assert set(imagination._choices()[:, 0]) == {2, 3}
 
 
 def test_a_model_that_is_not_trusted_adds_nothing(shared: Simulation) -> None:
     trained = Trained(shared, "trpo", replace(VIRTUAL, kappa=1e-6)).learn(2)
-    assert [(entry.virtual["k_star"], entry.virtual_steps) for entry in trained.told] == [(0, 0), (0, 0)]
+    assert [(entry.virtual[0]["k_star"], entry.virtual_steps) for entry in trained.told] == [(0, 0), (0, 0)]
     assert same(policy_of(trained), policy_of(Trained(shared, "trpo", None).learn(2)))
 
 
 def test_without_the_ratio_actual_rows_alone_fill_a_batch_and_with_it_both_do() -> None:
-    trained = LEARNERS["sac"](
-        Training(INPUTS, RING, POLICY, 0, lambda *_: [], lambda _: None), SETTINGS["sac"]
-    )
-    buffer = cast(MixedReplayBuffer, cast(Any, trained).replay_buffer)
-    actual = virtual_rows(rollouts_of(np.full((4, 3), 1.0), [3] * 4, [False] * 4), True)
-    virtual = virtual_rows(rollouts_of(np.full((4, 3), 2.0), [3] * 4, [False] * 4), True)
-    sac = cast(Any, trained)
+    sac: Any = begin([TASK], POLICY, SETTINGS["sac"], FREE, 0).learner
+    buffer = sac.buffer
+    actual = rollout_experience(rollouts_of(np.full((4, 3), 1.0), [3] * 4, [False] * 4), True)
+    virtual = rollout_experience(rollouts_of(np.full((4, 3), 2.0), [3] * 4, [False] * 4), True)
     sac.fill(buffer, actual)
     assert set(buffer.sample(8).rewards.numpy().ravel()) == {np.float32(0.1)}
     sac.fill(buffer.begin_virtual(12), virtual)
@@ -214,6 +227,7 @@ def test_without_the_ratio_actual_rows_alone_fill_a_batch_and_with_it_both_do() 
 
 def test_what_is_told_of_the_virtual_environment_is_whole(shared: Simulation) -> None:
     told = Trained(shared, "trpo", VIRTUAL).learn(1).told[0]
+    (virtual,) = told.virtual
     assert {
         "k_star",
         "eps_m",
@@ -222,14 +236,14 @@ def test_what_is_told_of_the_virtual_environment_is_whole(shared: Simulation) ->
         "bound",
         "return_virtual",
         "return_actual",
-    } <= set(told.virtual)
+    } <= set(virtual)
     assert set(told.seconds) == {"actual", "fit", "imagine", "update"}
     assert 0 < told.log["eps_pi_mean"] <= told.log["eps_pi_max"] <= 1
-    assert told.virtual["bound"] > abs(told.virtual["return_virtual"] - told.virtual["return_actual"])
+    assert virtual["bound"] > abs(virtual["return_virtual"] - virtual["return_actual"])
 
 
 def test_what_is_known_of_people_survives_a_stop(shared: Simulation) -> None:
-    one, other = (Imagination(VIRTUAL, RING, "", PISaturation(), POLICY, 0) for _ in range(2))
+    one, other = (Imagination(VIRTUAL, TASK, POLICY, 0) for _ in range(2))
     people = IDMParameters(time_headway=1.3, max_acceleration=0.8)
     one.scenario = replace(RING, humans=people)
     one.data.add([run_episode(RING, PISaturation(), (0,), simulation=shared)], RING)

@@ -52,6 +52,17 @@ def document(ran: subprocess.CompletedProcess[str]) -> Any:
     return json.loads(ran.stdout)
 
 
+def test_train_learns_on_several_roads_and_prints_a_table_for_each(unjam: Run, tmp_path: Path) -> None:
+    mixture = tmp_path / "mixture.toml"
+    mixture.write_text('[[tasks]]\nroad = {length = [70, 70]}\n[[tasks]]\nname = "short"\n')
+    command = [*TINY_RUN, "--config", mixture, "--steps", 160, "--out", tmp_path / "run"]
+    ran = unjam(*command, pictures=False)
+    assert ran.returncode == 0, ran.stderr
+    assert [line for line in ran.stdout.splitlines() if line in ("ring:", "short:")] == ["ring:", "short:"]
+    assert ran.stdout.count("return beyond the expert") == 2
+    assert {"ring", "short", "report.html"} <= {path.name for path in (tmp_path / "run").iterdir()}
+
+
 def test_drive_prints_one_json_document(unjam: Run) -> None:
     command = ("drive", "ring", "--driver", "pi", "--episodes", 2, "--seed", 7, *SMALL, "--json")
     found = document(unjam(*command, pictures=False))

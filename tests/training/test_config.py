@@ -8,8 +8,7 @@ from hypothesis import strategies as st
 from unjam.drivers import PISaturation
 from unjam.drivers.constant import Constant
 from unjam.errors import InputError
-from unjam.learners.algorithms import LEARNERS
-from unjam.learners.settings import PolicySettings, TRPOSettings
+from unjam.learners.settings import AGENTS, PolicySettings, TRPOSettings
 from unjam.parameters import merge
 from unjam.training.config import EvaluationSettings, RunConfig, load_config, read_toml, to_toml
 from unjam.training.evaluate import HELD_OUT, VALIDATION
@@ -75,7 +74,7 @@ def test_merging_changes_neither_side() -> None:
         ({"trpo.gamma": float("nan")}, "trpo.gamma: nan is not allowed"),
         ({"trpo": 3}, "trpo: 3 is not allowed"),
         ({"trpo.gamma.x": 3}, "trpo.gamma: {'x': 3} is not allowed"),
-        ({"agent": "magic"}, "agent: 'magic' is not allowed; allowed: 'trpo', 'ppo' or 'sac'"),
+        ({"agent": "magic"}, "agent: 'magic' is not allowed; allowed: 'trpo', 'ppo', 'sac' or 'td3'"),
         ({"ppo.clip": 2.0}, "ppo.clip: 2.0 is not allowed; allowed: less than 1"),
         ({"sac.start": "slowly"}, "sac.start: 'slowly' is not allowed; allowed: 'expert' or 'uniform'"),
         ({"sac.gama": 0.9}, "sac.gama: unknown name"),
@@ -91,6 +90,10 @@ def test_merging_changes_neither_side() -> None:
         ({"policy.observe": ["stars"]}, "policy.observe.0: 'stars' is not allowed"),
         ({"scenario": "rong"}, "scenario: 'rong' is not allowed; allowed: ring, ring-warm, ring-jammed"),
         ({"road": {"lenght": [220, 230]}}, "scenario ring.lenght: unknown name"),
+        ({"tasks": [{"weight": 0}]}, "tasks.0.weight: 0 is not allowed"),
+        ({"tasks": [{"name": "../up"}]}, "tasks.0.name: '../up' is not allowed"),
+        ({"tasks": [{"scenario": "rong"}]}, "scenario: 'rong' is not allowed"),
+        ({"tasks": [{"road": {"lenght": 3}}]}, "scenario ring.lenght: unknown name"),
         ({"road.vehicles": 1}, "scenario ring.vehicles: 1 is not allowed"),
         ({"road.length": [250, 230]}, "scenario ring.length: 230 m is not allowed as the largest"),
     ],
@@ -175,7 +178,7 @@ def test_any_configuration_survives_being_written(made: RunConfig, tmp_path_fact
     assert load_config(path) == made
 
 
-@pytest.mark.parametrize("agent", LEARNERS)
+@pytest.mark.parametrize("agent", AGENTS)
 def test_each_learner_has_its_own_settings(agent: str) -> None:
     made = load_config(changes={"agent": agent, f"{agent}.gamma": 0.7, f"{agent}.batch_steps": 77})
     assert (made.learner.gamma, made.learner.batch_steps) == (0.7, 77)

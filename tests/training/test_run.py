@@ -13,12 +13,15 @@ import torch
 
 from unjam.controller import load_controller
 from unjam.drivers import PISaturation, ResidualDriver
+from unjam.drivers.network import Network
 from unjam.errors import InputError
+from unjam.learners.algorithm_1 import Driven
 from unjam.reports.results import read_progress
 from unjam.training.config import RunConfig, load_config
 from unjam.training.evaluate import HELD_OUT, VALIDATION
 from unjam.training.folder import TENSORS, continue_folder, load_checkpoint, save_checkpoint, start_folder
-from unjam.training.run import Run
+from unjam.training.train import OnIteration, Trainer
+from unjam.worlds.record import Episode
 from unjam.worlds.workers import Workers
 
 torch.set_num_threads(1)  # as a training does
@@ -35,6 +38,7 @@ def small_config(**changes: Any) -> RunConfig:
         "trpo": {"batch_steps": STEPS, "critic_epochs": 2, "critic_batch": 16},
         "ppo": {"batch_steps": STEPS, "epochs": 3},
         "sac": {"batch_steps": STEPS, "start_steps": 400, "updates_per_step": 0.02, "batch": 8},
+        "td3": {"batch_steps": STEPS, "start_steps": 400, "updates_per_step": 0.02, "batch": 8},
         "evaluation": {"every": 1, "validation_episodes": 2, "episodes": 2, "baselines": ["human"]},
         "steps": 2 * STEPS,
         "workers": 1,
@@ -46,32 +50,46 @@ class Stop(Exception):
     """Stands for whatever ends a run in the middle."""
 
 
-def stop_after(iterations: int) -> Callable[[dict[str, Any]], None]:
-    def told(row: dict[str, Any]) -> None:
+def stop_after(iterations: int) -> OnIteration:
+    def stop(row: dict[str, Any]) -> None:
         if row["iteration"] == iterations:
             raise Stop
 
-    return told
+    return stop
 
 
 def learn_with(
     workers: Workers,
     folder: Path,
     config: RunConfig,
-    told: Callable[[dict[str, Any]], None] | None = None,
+    on_iteration: OnIteration | None = None,
     resume: bool = False,
-) -> Run:
+) -> Trainer:
     """Train without the final judgement and the report."""
     if resume:
         continue_folder(folder, config)
     else:
         start_folder(folder, config)
-    run = Run(folder, config, workers, told)
+    run = Trainer(folder, config, workers, on_iteration)
     run.train()
     return run
 
 
-Learn = Callable[..., Run]
+def collected(monkeypatch: pytest.MonkeyPatch) -> list[Episode]:
+    """The episodes that are driven from now on for an iteration, as they come."""
+    episodes: list[Episode] = []
+    collect = Trainer.collect
+
+    def kept(self: Trainer, network: Network, iteration: int) -> Driven:
+        driven = collect(self, network, iteration)
+        episodes.extend(episode for of_task in driven for episode in of_task)
+        return driven
+
+    monkeypatch.setattr(Trainer, "collect", kept)
+    return episodes
+
+
+Learn = Callable[..., Trainer]
 
 
 @pytest.fixture(scope="module")
@@ -133,7 +151,7 @@ def test_a_row_of_progress_is_whole(uninterrupted: Path) -> None:
 def test_steps_are_rounded_up_to_whole_episodes_and_whole_iterations(tmp_path: Path, learn: Learn) -> None:
     run = learn(tmp_path / "run", small_config(trpo__batch_steps=101, steps=201))
     assert [row["actual_steps"] for row in progress(tmp_path / "run")] == [200, 400]
-    assert run.learner.num_timesteps == 400
+    assert run.training.actual_steps == 400
 
 
 def test_the_same_configuration_repeats_to_the_last_bit(
@@ -167,7 +185,7 @@ def test_a_run_that_was_stopped_ends_as_if_it_had_not_been(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("agent", ["ppo", "sac"])
+@pytest.mark.parametrize("agent", ["ppo", "sac", "td3"])
 def test_a_run_of_any_learner_ends_as_if_it_had_not_been_stopped(
     tmp_path: Path, agent: str, learn: Learn
 ) -> None:
@@ -181,7 +199,7 @@ def test_a_run_of_any_learner_ends_as_if_it_had_not_been_stopped(
 
 
 def test_each_learner_learns_its_own_way(uninterrupted: Path, tmp_path: Path, learn: Learn) -> None:
-    for agent, key in {"ppo": "clip_fraction", "sac": "critic_loss"}.items():
+    for agent, key in {"ppo": "clip_fraction", "sac": "critic_loss", "td3": "critic_loss"}.items():
         learn(tmp_path / agent, small_config(agent=agent))
         rows = progress(tmp_path / agent)
         assert rows[0]["return_expert"] == progress(uninterrupted)[0]["return_expert"]
@@ -305,7 +323,7 @@ def test_without_validation_the_last_policy_is_the_controller(tmp_path: Path, le
     assert {row["return_validation"] for row in progress(tmp_path / "run")} == {None}
     loaded = load_controller(tmp_path / "run")
     assert isinstance(loaded, ResidualDriver)
-    for found, expected in zip(loaded.network.layers, run.learner.network().layers, strict=True):
+    for found, expected in zip(loaded.network.layers, run.training.learner.network().layers, strict=True):
         np.testing.assert_array_equal(found[0], expected[0])
         np.testing.assert_array_equal(found[1], expected[1])
     assert controller_manifest(tmp_path / "run")["iteration"] == 2
@@ -319,37 +337,38 @@ def test_validates_now_and_then_and_at_the_end(tmp_path: Path, learn: Learn) -> 
 
 @pytest.mark.parametrize("spread", [True, False])
 def test_episodes_of_an_iteration_are_spread_over_the_lengths_where_asked(
-    tmp_path: Path, spread: bool, learn: Learn
+    tmp_path: Path, spread: bool, learn: Learn, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     config = small_config(
         spread=spread, trpo__batch_steps=11 * 20, steps=20, road__horizon=20, evaluation__every=0
     )
-    run = learn(tmp_path / "run", config)
-    lengths = [episode.drawn["length"] for episode in run.learner._episodes]
+    episodes = collected(monkeypatch)
+    learn(tmp_path / "run", config)
+    lengths = [episode.drawn["length"] for episode in episodes]
     assert (sorted(lengths) == list(range(120, 131))) is spread
     assert set(lengths) <= set(range(120, 131))
 
 
-def test_every_training_episode_has_a_seed_of_its_own_that_never_judges(tmp_path: Path) -> None:
-    seeds: list[tuple[int, ...]] = []
-
-    def told(row: dict[str, Any]) -> None:
-        seeds.extend(episode.seed for episode in run.learner._episodes)
-
-    with Workers(1) as workers:
-        run = Run(tmp_path, small_config(seed=5), workers, told)
-        run.train()
+def test_every_training_episode_has_a_seed_of_its_own_that_never_judges(
+    tmp_path: Path, learn: Learn, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    episodes = collected(monkeypatch)
+    learn(tmp_path, small_config(seed=5))
+    seeds = [episode.seed for episode in episodes]
     assert len(seeds) == len(set(seeds)) == 6
     assert {seed[0] for seed in seeds} == {5}
     assert not {HELD_OUT, VALIDATION} & {number for seed in seeds for number in seed}
 
 
-def test_training_explores_and_validation_does_not(tmp_path: Path, learn: Learn) -> None:
+def test_training_explores_and_validation_does_not(
+    tmp_path: Path, learn: Learn, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    episodes = collected(monkeypatch)
     run = learn(tmp_path / "run", small_config(policy__exploration_std=0.3))
-    (trajectory,) = run.learner._episodes[0].trajectories
+    (trajectory,) = episodes[-1].trajectories
     assert np.std(trajectory.residual) > 0.1
-    again = run.driver(run.learner.network())
-    assert run._validate(again) == progress(tmp_path / "run")[-1]["return_validation"]
+    again = run.drivers(run.training.learner.network())
+    assert run.returns_of(again) == [progress(tmp_path / "run")[-1]["return_validation"]]
 
 
 @pytest.mark.parametrize("name", ["broken", "short", "raises"])

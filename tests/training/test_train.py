@@ -43,7 +43,7 @@ CONTENT = {
 class Trained(NamedTuple):
     config: RunConfig
     result: TrainResult
-    told: list[dict[str, Any]]
+    shown: list[dict[str, Any]]
     judged: list[tuple[tuple[str, int], int]]
 
 
@@ -51,13 +51,16 @@ class Trained(NamedTuple):
 def trained(tmp_path_factory: pytest.TempPathFactory) -> Trained:
     """A finished run of two iterations."""
     folder, config = tmp_path_factory.mktemp("runs") / "finished", small_config()
-    told: list[dict[str, Any]] = []
+    shown: list[dict[str, Any]] = []
     judged: list[tuple[tuple[str, int], int]] = []
     with empty_pictures():
         result = train(
-            config, folder, told=told.append, progress=lambda episode, steps: judged.append((episode, steps))
+            config,
+            folder,
+            on_iteration=shown.append,
+            progress=lambda episode, steps: judged.append((episode, steps)),
         )
-    return Trained(config, result, told, judged)
+    return Trained(config, result, shown, judged)
 
 
 def test_a_run_leaves_all_that_it_made_in_its_folder(trained: Trained) -> None:
@@ -74,9 +77,9 @@ def test_the_folder_says_how_it_was_made(trained: Trained) -> None:
     assert manifest["started"]
 
 
-def test_told_is_what_progress_holds(trained: Trained) -> None:
-    assert trained.told == read_progress(trained.result.folder)
-    assert [row["actual_steps"] for row in trained.told] == [STEPS, 2 * STEPS]
+def test_what_is_shown_is_what_progress_holds(trained: Trained) -> None:
+    assert trained.shown == read_progress(trained.result.folder)
+    assert [row["actual_steps"] for row in trained.shown] == [STEPS, 2 * STEPS]
 
 
 def test_every_driver_is_judged_on_the_held_out_seeds(trained: Trained) -> None:

@@ -10,6 +10,7 @@ from typing import Annotated, Any, NamedTuple
 import typer
 
 from unjam.errors import InputError, wrong_name
+from unjam.learners.settings import AGENTS
 from unjam.parameters import parse_assignments
 from unjam.training.executors import EXECUTORS, Executor
 
@@ -126,7 +127,7 @@ def asked_run(
     ] = None,
     steps: Annotated[int | None, typer.Option(min=1, help="Actual simulator steps to train for.")] = None,
     seed: Annotated[int | None, typer.Option(min=0, help="Seed of the whole run.")] = None,
-    agent: Annotated[str | None, typer.Option(help="Learner: trpo, ppo, sac.")] = None,
+    agent: Annotated[str | None, typer.Option(help=f"Learner: {', '.join(AGENTS)}.")] = None,
     expert: Annotated[
         str | None,
         typer.Option(help="Driver that the residual is added to, as in drive --driver; none: no expert."),

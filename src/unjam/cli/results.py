@@ -47,6 +47,8 @@ def evaluate(
     if humans is not None and out is None:
         raise InputError("humans: it is not allowed without --out: the run keeps its own evaluation")
     config = among(read_config(run), humans)
+    if config.tasks:
+        raise InputError(f"run: {str(run)!r} is of several roads; allowed: the folder of one of them")
     if not (run / "controller.unjam").is_file():
         raise InputError(f"run: {str(run)!r} has no controller yet; go on with: unjam train --resume {run}")
     total = len(comparison(config, run, list(DRIVERS))) * episodes * config.make_scenario().horizon

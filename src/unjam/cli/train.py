@@ -46,6 +46,10 @@ def train(
 
       unjam train ring --agent sac --steps 120000
 
+      unjam train --config mixture.toml              (several roads together: its tables of tasks)
+
+      unjam train --config mixture.toml              (several roads together: its tables of tasks)
+
       unjam train ring-jammed --expert follower-stopper --steps 500000 --seed 3
 
       unjam train ring --expert my_driver.py:gentle --reward my_reward.py:calm
@@ -80,15 +84,24 @@ def train(
 
     with nullcontext() if json else _Progress(config.steps, folder) as shown:
         result = run(config, folder, resume is not None, shown and shown.iteration, shown and shown.judging)
+
+    def facts(of: Any) -> dict[str, Any]:
+        files = {"folder": str(of.folder), "controller": str(of.controller), "report": str(result.report)}
+        gain = asdict(of.gain) if of.gain else None
+        return {**files, "gain": gain, "drivers": Evaluation(of.rows, {}).means()}
+
     if json:
-        files = {name: str(getattr(result, name)) for name in ("folder", "controller", "report")}
-        gain = asdict(result.gain) if result.gain else None
-        print_json({**files, "gain": gain, "drivers": Evaluation(result.rows, {}).means()})
+        roads = {name: facts(road) for name, road in result.roads.items()}
+        print_json({**facts(result), "roads": roads} if roads else facts(result))
         return
-    console.print(metrics_table(result.rows))
-    if result.gain is not None:
-        console.print(f"return beyond the expert, held-out seeds, 95 % interval: {signed(result.gain)}")
-    aside.print(f"controller: {result.controller}\nreport: {result.report}")
+    for name, of in (result.roads or {"": result}).items():
+        if name:
+            console.print(f"{name}:")
+        console.print(metrics_table(of.rows))
+        if of.gain is not None:
+            console.print(f"return beyond the expert, held-out seeds, 95 % interval: {signed(of.gain)}")
+        aside.print(f"controller: {of.controller}")
+    aside.print(f"report: {result.report}")
 
 
 class _Progress(Counted):

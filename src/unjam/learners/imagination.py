@@ -9,15 +9,13 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from unjam.drivers.driver import Driver
 from unjam.drivers.network import Network
 from unjam.drivers.residual import ResidualDriver
 from unjam.errors import MissingPartError
 from unjam.following.calibration import calibrated_people
-from unjam.learners.rows import Rows
+from unjam.learners.experience import Experience
 from unjam.learners.settings import PolicySettings
 from unjam.physics.idm import IDMParameters
-from unjam.scenarios.scenario import Scenario
 from unjam.virtual.data import ActualData, pack_data, unpack_data
 from unjam.virtual.fitting import fit
 from unjam.virtual.model import EnvironmentModel, torch_generator
@@ -25,25 +23,26 @@ from unjam.virtual.rollout import Rollouts, begin, imagine, return_bound, rollou
 from unjam.virtual.settings import VirtualSettings
 from unjam.virtual.world import VirtualDynamics
 from unjam.worlds.record import Episode
+from unjam.worlds.task import Task
 
 FIT, STARTS, NOISE, EXPLORATION = 2, 3, 4, 5
 """what the random numbers of an iteration are for, in their seeds"""
 DATA = "data/"
 
 
+def full_policy(task: Task, policy: PolicySettings, network: Network) -> ResidualDriver:
+    """Return the full policy on a task: its expert plus the residual of `network`."""
+    hold = policy.decisions_held(task.scenario.decision_step)
+    return ResidualDriver(task.expert, network, task.scenario.action_limit, policy.observe, hold)
+
+
 class Imagination:
     """The virtual environment of a run, and the actual data that it learns from."""
 
     def __init__(
-        self,
-        settings: VirtualSettings,
-        scenario: Scenario,
-        reward: str,
-        expert: Driver,
-        policy: PolicySettings,
-        run_seed: int,
+        self, settings: VirtualSettings, task: Task, policy: PolicySettings, run_seed: int, index: int = 0
     ) -> None:
-        """Begin with physics alone, and without data.
+        """Begin with physics alone, and without data; `index` is the task's place in its training.
 
         Raises:
             MissingPartError: the device that the settings name is not there.
@@ -51,18 +50,25 @@ class Imagination:
         if settings.device == "cuda" and not torch.cuda.is_available():
             raise MissingPartError("virtual.device: cuda is not there; use cpu")
         self.settings = settings
+        self.name = f"virtual-{index}" if index else "virtual"
+        """in checkpoints"""
         self.data = ActualData(settings.rows)
-        self.model = EnvironmentModel(settings, len(scenario.drawn_ranges), (run_seed, FIT), settings.device)
+        self.scenario = task.scenario
+        """the road as far as it is known: with calibrated people where the settings ask for them"""
+        self._task = task
+        self._policy = policy
+        self._run_seed = run_seed
+        self._index = (index,) if index else ()
+        drawn = len(task.scenario.drawn_ranges)
+        self.model = EnvironmentModel(settings, drawn, self._seed(FIT), settings.device)
         self.steps = 0
         """virtual decisions of all iterations so far"""
         self.facts: dict[str, Any] = {}
         """what there is to say of the virtual environment in this iteration"""
-        self.scenario = scenario
-        """the road as far as it is known: with calibrated people where the settings ask for them"""
-        self._reward = reward
-        self._expert = expert
-        self._policy = policy
-        self._run_seed = run_seed
+
+    def _seed(self, *of: int) -> tuple[int, ...]:
+        """Return a seed of the run's, the task's own."""
+        return (self._run_seed, *of, *self._index)
 
     def learn(self, episodes: Sequence[Episode], iteration: int) -> None:
         """Add actual episodes to D_a, fit the model to it, and find the rollout length of Eq. 15."""
@@ -72,14 +78,15 @@ class Imagination:
         self._actual = sum(len(self.data.recordings[place].reward) for place in self._newest)
         settings = self.settings
         if settings.calibrate and first == 0:
-            self._know(calibrated_people((kept.states for kept in self.data.recordings), self.scenario))
+            states = (kept.states for kept in self.data.recordings)
+            self.scenario = replace(self.scenario, humans=calibrated_people(states, self.scenario))
         found = fit(
             self.model,
             self.data.transitions(settings.holdout),
             settings,
             self.scenario,
-            self._reward,
-            (self._run_seed, iteration, FIT),
+            self._task.reward,
+            self._seed(iteration, FIT),
         )
         eps_m = found.errors[settings.error]
         self.k_star = rollout_length(eps_m, settings)
@@ -92,38 +99,42 @@ class Imagination:
             "epochs": found.epochs,
         }
 
-    def imagine(self, network: Network, iteration: int, part: int = 0, parts: int = 1) -> Rows | None:
-        """Return the rows of virtual rollouts with the policy `network`; None where there are none.
+    def imagine(self, network: Network, iteration: int, part: int = 0, parts: int = 1) -> Experience | None:
+        """Return the experience of virtual rollouts with the policy `network`; None where there are none.
 
         They begin at random decisions of the newest actual episodes at which a residual was due. In all
         `parts` of an iteration together they make `virtual_ratio` times as many decisions as those have.
         """
-        driver = self._driver(network)
+        driver = full_policy(self._task, self._policy, network)
         driven = self.k_star // driver.hold * driver.hold
-        looks = self._looks()
-        if driven == 0 or len(looks) == 0:
+        choices = self._choices()
+        if driven == 0 or len(choices) == 0:
             return None
         count = ceil(self.settings.virtual_ratio * self._actual / parts / driven)
-        seeds = [(self._run_seed, iteration, purpose, part) for purpose in (STARTS, NOISE, EXPLORATION)]
+        seeds = [self._seed(iteration, purpose, part) for purpose in (STARTS, NOISE, EXPLORATION)]
         generator = np.random.default_rng(np.random.SeedSequence(list(seeds[0])))
-        looks = looks[generator.integers(len(looks), size=count)]
+        choices = choices[generator.integers(len(choices), size=count)]
         device = self.settings.device
         world = VirtualDynamics(
-            self.model, self.scenario, self._reward, torch_generator(seeds[1], device), self.settings.noise
+            self.model,
+            self.scenario,
+            self._task.reward,
+            torch_generator(seeds[1], device),
+            self.settings.noise,
         )
-        starts = begin(self.data, looks, self._expert, device)
+        starts = begin(self.data, choices, self._task.expert, device)
         rollouts = imagine(driver, world, starts, driven, torch_generator(seeds[2], device))
         self.steps += rollouts.decisions
         if part == 0:  # the policy that drove the actual episodes: returns can be compared
             self.facts |= self._compared(rollouts, driven)
-        return virtual_rows(rollouts, self._policy.critic_sees_road)
+        return rollout_experience(rollouts, self._policy.critic_sees_road)
 
     def bound(self, eps_pi: float, gamma: float) -> float:
-        """Return the bound C for this iteration; `gamma` is the discount from look to look."""
+        """Return the bound C for this iteration; `gamma` is that from choice to choice."""
         return self.bound_at(self.k_star, eps_pi, self.facts["eps_m_by_estimator"]["total_variation"], gamma)
 
     def bound_at(self, k: int, eps_pi: float, eps_m: float, gamma: float) -> float:
-        """Return the bound C with rollouts of `k` decisions; `gamma` is the discount from look to look."""
+        """Return the bound C with rollouts of `k` decisions; `gamma` is that from choice to choice."""
         return return_bound(eps_pi, eps_m, k, self.decision_discount(gamma), self.largest_reward)
 
     @property
@@ -132,7 +143,7 @@ class Imagination:
         return max(float(np.abs(kept.reward).max()) for kept in self.data.recordings)
 
     def decision_discount(self, gamma: float) -> float:
-        """Return the discount from decision to decision; `gamma` is that from look to look."""
+        """Return the discount from decision to decision; `gamma` is that from choice to choice."""
         return gamma ** (1 / self._policy.decisions_held(self.scenario.decision_step))
 
     def state(self) -> tuple[dict[str, Any], dict[str, torch.Tensor]]:
@@ -147,20 +158,12 @@ class Imagination:
         arrays = {name.removeprefix(DATA): t.numpy() for name, t in tensors.items() if name.startswith(DATA)}
         self.data = unpack_data(facts["data"], arrays)
         self.steps = facts["steps"]
-        self._know(IDMParameters(**facts["people"]))
+        self.scenario = replace(self.scenario, humans=IDMParameters(**facts["people"]))
         self.model.load_state_dict({n: t for n, t in tensors.items() if not n.startswith(DATA)})
 
-    def _know(self, people: IDMParameters) -> None:
-        self.scenario = replace(self.scenario, humans=people)
-
-    def _driver(self, network: Network) -> ResidualDriver:
-        scenario, policy = self.scenario, self._policy
-        hold = policy.decisions_held(scenario.decision_step)
-        return ResidualDriver(self._expert, network, scenario.action_limit, policy.observe, hold)
-
-    def _looks(self) -> NDArray[np.int64]:
-        looks = self.data.looks()
-        return looks[np.isin(looks[:, 0], self._newest)]
+    def _choices(self) -> NDArray[np.int64]:
+        choices = self.data.looks()
+        return choices[np.isin(choices[:, 0], self._newest)]
 
     def _compared(self, rollouts: Rollouts, driven: int) -> dict[str, Any]:
         """Return how virtual returns compare with what was earned from the same rows, and what went wrong."""
@@ -178,7 +181,7 @@ class Imagination:
         }
 
 
-def virtual_rows(rollouts: Rollouts, critic_sees_road: bool) -> Rows:
+def rollout_experience(rollouts: Rollouts, critic_sees_road: bool) -> Experience:
     """Return virtual rollouts in the form in which learners take them; the cut at k* is no termination."""
     made = rollouts.made.cpu().numpy()
     seen = rollouts.observations.cpu().numpy()
@@ -186,7 +189,7 @@ def virtual_rows(rollouts: Rollouts, critic_sees_road: bool) -> Rows:
         drawn = rollouts.drawn.cpu().numpy()[:, None, :]
         seen = np.concatenate([seen, np.broadcast_to(drawn, (*seen.shape[:2], drawn.shape[2]))], axis=2)
     counted = np.arange(seen.shape[1] - 1) < made[:, None]
-    return Rows(
+    return Experience(
         observations=seen[:, :-1][counted].astype(np.float32),
         actions=rollouts.actions.cpu().numpy()[counted].astype(np.float32),
         rewards=rollouts.rewards.cpu().numpy()[counted].astype(np.float64),

@@ -1,6 +1,10 @@
-"""What decides how an agent learns. Free of torch, so that a wrong value is refused at once."""
+"""What decides how an agent learns. Free of torch, so that a wrong value is refused at once.
 
-from typing import Annotated, Literal
+A learner is a file that makes it, and here its settings, which name it, and their place in `Agents`.
+"""
+
+from dataclasses import field
+from typing import Annotated, ClassVar, Literal, get_args
 
 from pydantic import Field
 from pydantic.dataclasses import dataclass
@@ -49,16 +53,19 @@ class PolicySettings:
 class LearnerSettings:
     """What every learner has."""
 
+    learner: ClassVar[str]
+    """who is made of them: `module:class`"""
     batch_steps: Count = 12_000
     """actual steps in an iteration, rounded up to whole episodes"""
     gamma: Discount = 0.99
-    """discount from one look of the network to the next"""
+    """discount from one choice of the network to the next"""
 
 
 @dataclass(frozen=True, config=STRICT)
 class TRPOSettings(LearnerSettings):
     """Trust region policy optimisation; the preset `paper` has the values of Table B5 where these differ."""
 
+    learner: ClassVar[str] = "unjam.learners.trpo_ppo:TRPO"
     gae_lambda: Share = 0.97
     target_kl: Positive = 0.03
     cg_damping: Positive = 0.1
@@ -73,6 +80,7 @@ class TRPOSettings(LearnerSettings):
 class PPOSettings(LearnerSettings):
     """Proximal policy optimisation; its defaults are the values of Table B3, but for larger iterations."""
 
+    learner: ClassVar[str] = "unjam.learners.trpo_ppo:PPO"
     gae_lambda: Share = 0.97
     clip: Annotated[float, Field(gt=0, lt=1)] = 0.2
     """how far the ratio of new to old probability may move an update"""
@@ -84,22 +92,15 @@ class PPOSettings(LearnerSettings):
 
 
 @dataclass(frozen=True, config=STRICT)
-class SACSettings(LearnerSettings):
-    """Soft actor-critic; the preset `paper` has the values of Table B4 where these differ."""
+class OffPolicySettings(LearnerSettings):
+    """What learners share that learn from earlier iterations too."""
 
     batch_steps: Count = 6_000
     tau: Annotated[float, Field(gt=0, le=1)] = 0.005
-    """share by which the target critics move towards the critics in a gradient step"""
+    """share by which the target networks move towards the learned ones in a gradient step"""
     rate: Positive = 3e-4
-    temperature: Positive = 0.05
-    """weight of the policy's entropy, in units of scaled rewards; with the paper's 0.2 the noise alone costs
-    a quarter of the return on the ring, and what is learned from such driving fails on short rings"""
-    learn_temperature: bool = False
-    """whether the temperature is learned, from its start on, so that the entropy becomes `target_entropy`"""
-    target_entropy: Annotated[float, Field(lt=0.69)] = -1.0
-    """of the residual as a share of its authority: -1 is that of noise with a standard deviation of 0.09"""
     reward_scale: Positive = 0.1
-    """factor of what is earned from one look to the next: the temperature is weighed against it"""
+    """factor of what is earned from one choice to the next: the temperature is weighed against it"""
     batch: Count = 256
     updates_per_step: Positive = 0.25
     """gradient steps per actual step, those of the start included"""
@@ -111,4 +112,53 @@ class SACSettings(LearnerSettings):
     real_ratio: Share = 0.5
     """share of actual rows in a batch, where there are virtual ones"""
     buffer_rows: Count = 200_000
-    """newest rows, one per look, that are learned from"""
+    """newest rows, one per choice, that are learned from"""
+
+
+@dataclass(frozen=True, config=STRICT)
+class SACSettings(OffPolicySettings):
+    """Soft actor-critic; the preset `paper` has the values of Table B4 where these differ."""
+
+    learner: ClassVar[str] = "unjam.learners.sac:SAC"
+    temperature: Positive = 0.05
+    """weight of the policy's entropy, in units of scaled rewards; with the paper's 0.2 the noise alone costs
+    a quarter of the return on the ring, and what is learned from such driving fails on short rings"""
+    learn_temperature: bool = False
+    """whether the temperature is learned, from its start on, so that the entropy becomes `target_entropy`"""
+    target_entropy: Annotated[float, Field(lt=0.69)] = -1.0
+    """of the residual as a share of its authority: -1 is that of noise with a standard deviation of 0.09"""
+
+
+@dataclass(frozen=True, config=STRICT)
+class TD3Settings(OffPolicySettings):
+    """Twin delayed deep deterministic policy gradient; the values of Fujimoto et al. 2018 where they fit."""
+
+    learner: ClassVar[str] = "unjam.learners.td3:TD3"
+    rate: Positive = 1e-3
+    policy_delay: Count = 2
+    """gradient steps of the critics for one of the policy and of the target networks"""
+    target_noise: NotNegative = 0.2
+    """standard deviation of the noise that smooths the target policy, as a share of the authority"""
+    target_noise_clip: NotNegative = 0.5
+    """largest such noise, as a share of the authority"""
+
+
+Agent = Literal["trpo", "ppo", "sac", "td3"]
+AGENTS: tuple[Agent, ...] = get_args(Agent)
+
+
+@dataclass(frozen=True, config=STRICT)
+class Agents:
+    """Who learns, and the settings of every learner in the table of its name."""
+
+    agent: Agent = "trpo"
+    """who learns; its settings are in the table of its name"""
+    trpo: TRPOSettings = field(default_factory=TRPOSettings)
+    ppo: PPOSettings = field(default_factory=PPOSettings)
+    sac: SACSettings = field(default_factory=SACSettings)
+    td3: TD3Settings = field(default_factory=TD3Settings)
+
+    @property
+    def learner(self) -> LearnerSettings:
+        """The settings of the learner that was chosen."""
+        return getattr(self, self.agent)

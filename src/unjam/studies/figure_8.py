@@ -15,7 +15,7 @@ from unjam.reports.figures import LINES, STYLE
 from unjam.reports.results import read_progress
 from unjam.studies.study import VARIANTS, PlannedRun, Study, StudyFolder
 from unjam.training.folder import start_folder
-from unjam.training.run import Run
+from unjam.training.train import Trainer
 from unjam.worlds.workers import Workers
 
 ROAD = "ring"
@@ -46,7 +46,7 @@ def measured_seconds(steps: int = STEPS, rounds: int = ROUNDS) -> dict[str, list
                 config = replace(config, sac=replace(config.sac, start_steps=START_STEPS))
                 folder = Path(place) / f"{variant}-{turn}"
                 start_folder(folder, config)
-                Run(folder, config, workers).train()
+                Trainer(folder, config, workers).train()
                 found[variant].append(_per_thousand(folder))
     return found
 

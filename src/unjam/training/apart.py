@@ -20,16 +20,21 @@ from unjam.training.config import RunConfig
 KINDS = {kind.__name__: kind for kind in (InputError, MissingPartError, DiskError, EpisodeError)}
 
 Rows = dict[str, list[dict[str, Any]]]
+"""of metrics, one per episode, by driver"""
+OnIteration = Callable[[dict[str, Any]], None]
+"""called with each row of progress as it is written"""
+OnProgress = Callable[[tuple[str, int], int], None]
+"""called with how far the judgement is: ((driver, episode), decisions)"""
 
 
 def train_apart(
     config: RunConfig,
     folder: Path,
     resume: bool,
-    told: Callable[[dict[str, Any]], None] | None,
-    progress: Callable[[tuple[str, int], int], None] | None,
-) -> Rows:
-    """Train as `unjam.train` does, and return the rows of the judgement by driver.
+    on_iteration: OnIteration | None,
+    progress: OnProgress | None,
+) -> dict[str, Rows]:
+    """Train as `unjam.train` does, and return the rows of the judgement, by road and driver.
 
     Raises:
         UnjamError: of the same kind as in this process.
@@ -47,8 +52,8 @@ def train_apart(
         child.stdin.close()
         for line in child.stdout:
             word, *content = json.loads(line)
-            if word == "row" and told is not None:
-                told(content[0])
+            if word == "row" and on_iteration is not None:
+                on_iteration(content[0])
             elif word == "judged" and progress is not None:
                 progress((content[0], content[1]), content[2])
             elif word == "error":
@@ -72,16 +77,16 @@ def main() -> None:
         print(json.dumps(words), file=answers, flush=True)
 
     try:
-        from unjam.training.train import train
+        from unjam.training.train import train_here
 
-        result = train(
+        rows = train_here(
             build(RunConfig, values, ""),
-            folder,
+            Path(folder),
             resume,
             lambda row: say("row", row),
             lambda episode, steps: say("judged", *episode, steps),
         )
-        say("done", result.rows)
+        say("done", rows)
     except UnjamError as error:
         say("error", type(error).__name__, str(error))
 

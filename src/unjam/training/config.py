@@ -1,23 +1,32 @@
 """Everything that decides what a training run does: one validated configuration, as TOML and flags."""
 
 import tomllib
-from dataclasses import asdict, field
+from dataclasses import asdict, field, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import tomli_w
-from pydantic import Field, field_validator, model_validator
+from pydantic import AfterValidator, Field, model_validator
 from pydantic.dataclasses import dataclass
 
 from unjam.drivers.constant import Constant
 from unjam.drivers.driver import Driver
+from unjam.drivers.observation import observed
 from unjam.errors import InputError
-from unjam.learners.settings import LearnerSettings, PolicySettings, PPOSettings, SACSettings, TRPOSettings
-from unjam.parameters import STRICT, Count, CountOrNone, build, merge, nested
+from unjam.learners.settings import Agents, PolicySettings
+from unjam.parameters import STRICT, Count, CountOrNone, Positive, build, merge, nested
 from unjam.scenarios.registry import make_scenario
 from unjam.scenarios.scenario import Scenario
 from unjam.training.presets import preset_values
 from unjam.virtual.settings import VirtualSettings
+from unjam.worlds.task import Task
+
+ScenarioChanges = dict[str, Any]
+
+
+def _plain(road: ScenarioChanges) -> ScenarioChanges:
+    """Return changes as a TOML file gives them back, so that a run knows its own road again."""
+    return {key: list(value) if isinstance(value, tuple) else value for key, value in road.items()}
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -35,14 +44,27 @@ class EvaluationSettings:
 
 
 @dataclass(frozen=True, config=STRICT)
-class RunConfig:
+class TaskConfig:
+    """One of several roads of a training; what is left out, or empty, is the run's own."""
+
+    scenario: str = ""
+    road: Annotated[ScenarioChanges, AfterValidator(_plain)] = field(default_factory=dict)
+    """changes to the scenario's parameters, beside the run's"""
+    expert: str = ""
+    reward: str = ""
+    weight: Positive = 1.0
+    """share of the actual steps, beside the weights of the other tasks"""
+    name: Annotated[str, Field(pattern=r"^[\w-]*$")] = ""
+    """of its folder; empty: the scenario's"""
+
+
+@dataclass(frozen=True, config=STRICT)
+class RunConfig(Agents):
     """One training run. Every key can be set in a TOML file, by `--set key=value`, and in Python."""
 
     scenario: str = "ring"
-    road: dict[str, Any] = field(default_factory=dict)
+    road: Annotated[ScenarioChanges, AfterValidator(_plain)] = field(default_factory=dict)
     """changes to the scenario's parameters"""
-    agent: Literal["trpo", "ppo", "sac"] = "trpo"
-    """who learns; its settings are in the table of its name"""
     expert: str = "pi"
     """driver that the residual is added to: a name, `path.py:name`, a run folder, a .unjam file; `none`:
     the network drives alone"""
@@ -57,30 +79,67 @@ class RunConfig:
     """whether the episodes of an iteration, and of a validation, cover the range of what they draw (the
     ring's lengths) evenly"""
     policy: PolicySettings = field(default_factory=PolicySettings)
-    trpo: TRPOSettings = field(default_factory=TRPOSettings)
-    ppo: PPOSettings = field(default_factory=PPOSettings)
-    sac: SACSettings = field(default_factory=SACSettings)
     virtual: VirtualSettings = field(default_factory=VirtualSettings)
     """the virtual environment, in which the agent learns between actual episodes"""
     evaluation: EvaluationSettings = field(default_factory=EvaluationSettings)
+    tasks: tuple[TaskConfig, ...] = ()
+    """roads that are trained on together; empty: the one above"""
     preset: str = ""
     """which preset this started from, for the record"""
-
-    @field_validator("road")
-    @classmethod
-    def _plain(cls, road: dict[str, Any]) -> dict[str, Any]:
-        """Return the changes as a TOML file gives them back, so that a run knows its own road again."""
-        return {key: list(value) if isinstance(value, tuple) else value for key, value in road.items()}
 
     @model_validator(mode="after")
     def _possible(self) -> "RunConfig":
         self.make_scenario()
+        for road in self.roads().values():
+            road.make_scenario()
         return self
 
-    @property
-    def learner(self) -> LearnerSettings:
-        """The settings of the learner that was chosen."""
-        return getattr(self, self.agent)
+    def roads(self) -> dict[str, "RunConfig"]:
+        """Return the configuration of each road alone, by its folder's name; one road has none."""
+        if not self.tasks:
+            return {"": self}
+        found: dict[str, RunConfig] = {}
+        for task in self.tasks:
+            scenario = task.scenario or self.scenario
+            name = base = task.name or Path(scenario).stem
+            number = 1
+            while name in found:
+                number += 1
+                name = f"{base}-{number}"
+            found[name] = replace(
+                self,
+                scenario=scenario,
+                road=merge(self.road, task.road),
+                expert=task.expert or self.expert,
+                reward=task.reward or self.reward,
+                tasks=(),
+            )
+        return found
+
+    def make_tasks(self) -> list[Task]:
+        """Return what is trained on: a task per road.
+
+        Raises:
+            InputError: the network would see something else on one of them, or act within other limits.
+        """
+        weights = [task.weight for task in self.tasks] or [1.0]
+        tasks = [
+            Task(road.make_scenario(), road.make_expert(), road.reward, weight, name)
+            for (name, road), weight in zip(self.roads().items(), weights, strict=True)
+        ]
+        first = tasks[0]
+        for task in tasks[1:]:
+            seen, limit = observed(self.policy.observe, task.expert), task.scenario.action_limit
+            if seen != observed(self.policy.observe, first.expert):
+                raise InputError(
+                    f"tasks: on {task.name} the network would see something else than on {first.name}"
+                )
+            if limit != first.scenario.action_limit:
+                raise InputError(
+                    f"tasks: an action limit of {limit:g} m/s2 on {task.name} is not allowed; "
+                    f"allowed: {first.scenario.action_limit:g}, as on {first.name}"
+                )
+        return tasks
 
     def make_scenario(self) -> Scenario:
         """Return the scenario with its changes."""

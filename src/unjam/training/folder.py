@@ -15,7 +15,7 @@ from safetensors import SafetensorError
 
 from unjam.controller import make_driver
 from unjam.drivers.driver import Driver
-from unjam.drivers.observation import observation_size
+from unjam.drivers.observation import feature, observation_size
 from unjam.errors import InputError
 from unjam.files import make_folder, to_json, write_whole
 from unjam.manifest import manifest, package_versions
@@ -25,22 +25,29 @@ from unjam.training.config import RunConfig, load_config, to_toml
 from unjam.worlds.reward import make_reward
 
 if TYPE_CHECKING:
-    from unjam.learners.state import Tensors
+    from unjam.learners.learner import Tensors
 
-FORMAT = 2
+FORMAT = 3
 """of what a checkpoint holds; one of another unjam is refused"""
 GENERATIONS = 2
 STATE, TENSORS = "state.json", "tensors.safetensors"
 
 
 def check_possible(config: RunConfig) -> None:
-    """Raise `InputError` where the expert, what the network sees, the reward or a baseline is at fault."""
+    """Raise `InputError` where an expert, what the network sees, a reward or a baseline is at fault."""
+    for road in config.roads().values():
+        _check_road(road)
+    config.make_tasks()
+
+
+def _check_road(config: RunConfig) -> None:
     scenario = config.make_scenario()
-    of_a_loop = [part for part in config.policy.observe if part in ("loop_length", "place")]
-    if of_a_loop and not scenario.closed:
-        raise InputError(f"policy.observe: {of_a_loop[0]!r} is not allowed on a road with ends")
-    if "route_position" in config.policy.observe and not scenario.has_coordinate:
-        raise InputError("policy.observe: 'route_position' is not allowed on a network of one's own")
+    for name in config.policy.observe:
+        needs = feature(name).needs
+        if needs == "loop" and not scenario.closed:
+            raise InputError(f"policy.observe: {name!r} is not allowed on a road with ends")
+        if needs == "coordinate" and not scenario.has_coordinate:
+            raise InputError(f"policy.observe: {name!r} is not allowed on a network of one's own")
     observation_size(config.policy.observe, config.make_expert())
     make_reward(config.reward or scenario.reward)
     for name in config.evaluation.baselines:
@@ -76,8 +83,12 @@ def continue_folder(folder: Path, config: RunConfig) -> None:
     """Check that `config` may go on with the run in `folder`, and write down its new budget.
 
     Raises:
-        InputError: something else than the budget or the number of workers differs.
+        InputError: something else than the budget or the number of workers differs, or the folder is that of
+            one road of a run of several.
     """
+    whole = folder.absolute().parent
+    if (whole / "config.toml").is_file() and folder.name in read_config(whole).roads():
+        raise InputError(f"resume: {str(folder)!r} is one road of a run of several; allowed: {whole}")
     before = read_config(folder)
     if replace(before, steps=config.steps, workers=config.workers) != config:
         raise InputError("resume: only steps and workers may change; all else is the run's")

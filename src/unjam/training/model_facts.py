@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from unjam.errors import InputError
 from unjam.files import to_json, write_whole
 from unjam.learners.imagination import Imagination
-from unjam.learners.state import restore_imagination
+from unjam.learners.learner import under
 from unjam.reports.results import MODEL_FILE, read_model, read_progress
 from unjam.scenarios.scenario import Scenario
 from unjam.training.config import RunConfig
@@ -80,10 +80,9 @@ def measure_model(folder: Path, config: RunConfig) -> dict[str, Any]:
     torch.set_num_threads(1)  # for small networks more are slower
     state, tensors = checkpoint
     settings = replace(config.virtual, device="cpu")
-    imagination = Imagination(
-        settings, config.make_scenario(), config.reward, config.make_expert(), config.policy, config.seed
-    )
-    restore_imagination(imagination, state, tensors)
+    (task,) = config.make_tasks()
+    imagination = Imagination(settings, task, config.policy, config.seed)
+    imagination.restore(state[imagination.name], under(f"{imagination.name}/", tensors))
     scenario = imagination.scenario
     generator = np.random.default_rng(config.seed)
     newest = read_progress(folder)[-1]
@@ -107,6 +106,8 @@ def measure_model(folder: Path, config: RunConfig) -> dict[str, Any]:
 
 
 def _check_virtual(folder: Path, config: RunConfig) -> None:
+    if config.tasks:
+        raise InputError(f"run: {str(folder)!r} is of several roads; allowed: a run of one")
     if config.virtual.virtual_ratio == 0:
         raise InputError(
             f"run: {str(folder)!r} has no virtual environment: its virtual.virtual_ratio is 0; allowed: > 0"

@@ -1,33 +1,59 @@
 """Train: from a configuration to a folder with everything about the run. `unjam train`, `unjam.train`."""
 
-from collections.abc import Callable
-from dataclasses import dataclass
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from math import ceil
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
+from unjam.controller import controller_bytes
+from unjam.drivers.driver import Driver
+from unjam.drivers.network import Network
+from unjam.files import append_line, make_folder, to_json, write_whole
 from unjam.kernels import child_would_be_pinned
+from unjam.learners.algorithm_1 import Driven, Iteration, Validated, algorithm_1, begin
+from unjam.learners.imagination import full_policy
+from unjam.measures.metrics import measure
 from unjam.measures.statistics import Estimate, paired_difference
 from unjam.reports.html import write_report
-from unjam.training.apart import train_apart
-from unjam.training.config import RunConfig
-from unjam.training.evaluate import TRAINED, judge
-from unjam.training.folder import check_possible, continue_folder, start_folder
+from unjam.reports.results import read_progress
+from unjam.training.apart import OnIteration, OnProgress, Rows, train_apart
+from unjam.training.config import RunConfig, to_toml
+from unjam.training.evaluate import TRAINED, VALIDATION, judge, raise_failure
+from unjam.training.folder import (
+    check_possible,
+    continue_folder,
+    load_checkpoint,
+    origin,
+    save_checkpoint,
+    start_folder,
+)
 from unjam.training.model_facts import write_model_facts
-from unjam.training.run import Run, Told
-from unjam.worlds.workers import Workers
+from unjam.worlds.workers import EpisodeTask, Workers
+
+MEANS = (
+    *("mean_speed", "speed_std_fleet", "cav_mean_speed", "speed_std_cav", "mean_abs_accel"),
+    "shield_override_share",
+)
+"""metrics whose means over an iteration's episodes are in progress"""
+RETURNS = ("return_mean", "return_expert", "return_validation")
 
 
 @dataclass(frozen=True)
 class TrainResult:
-    """A finished training run."""
+    """A finished training run; of several roads, each has its own result in `roads`, and no other."""
 
     folder: Path
-    rows: dict[str, list[dict[str, Any]]]
+    rows: Rows
     """by driver: a row of metrics per held-out episode"""
     gain: Estimate | None
     """return of the trained controller beyond its expert's, same seeds paired; None without an expert"""
+    roads: dict[str, "TrainResult"] = field(default_factory=dict)
+    """by task, each in a folder of its own; empty where there is one road alone"""
 
     @property
     def controller(self) -> Path:
@@ -44,13 +70,14 @@ def train(
     config: RunConfig,
     folder: Path | str,
     resume: bool = False,
-    told: Told | None = None,
-    progress: Callable[[tuple[str, int], int], None] | None = None,
+    on_iteration: OnIteration | None = None,
+    progress: OnProgress | None = None,
 ) -> TrainResult:
     """Train as `config` says into `folder`, judge the controller on held-out seeds, and write the report.
 
     A run that was stopped goes on where it was with `resume`; one that ended goes on if `config.steps` is
-    larger than before. It then ends with the same parameters as if it had never stopped.
+    larger than before. It then ends with the same parameters as if it had never stopped. A run of several
+    roads (`config.tasks`) is judged on each of them, in a folder with the road's name.
 
     Where NumPy was imported before unjam, it trains in a process of its own, so that the result is the same:
     see `unjam.kernels`.
@@ -59,34 +86,210 @@ def train(
         config: what to do; see `unjam.load_config`.
         folder: new, or the run's.
         resume: whether to go on with the run in `folder`.
-        told: told a row of progress after each iteration.
-        progress: told how far the final evaluation is: ((driver, episode), decisions).
+        on_iteration: called with a row of progress after each iteration.
+        progress: called with how far the final evaluation is: ((driver, episode), decisions).
 
     Raises:
         InputError: the folder holds something else, or the driver or reward are at fault.
         DiskError: the disk is full; the last checkpoint is whole.
     """
     folder = Path(folder)
-    if child_would_be_pinned():
-        rows = train_apart(config, folder, resume, told, progress)
-        return TrainResult(folder, rows, gain_of(config, rows))
-    check_possible(config)  # what is wrong is told before anything is written
+    train_it = train_apart if child_would_be_pinned() else train_here
+    rows = train_it(config, folder, resume, on_iteration, progress)
+    results = {
+        name: TrainResult(folder / name, rows[name], gain_of(road, rows[name]))
+        for name, road in config.roads().items()
+    }
+    return TrainResult(folder, {}, None, results) if config.tasks else results[""]
+
+
+def train_here(
+    config: RunConfig,
+    folder: Path,
+    resume: bool = False,
+    on_iteration: OnIteration | None = None,
+    progress: OnProgress | None = None,
+) -> dict[str, Rows]:
+    """Train in this process, as `train` does; return the rows of the judgement, by road and driver."""
+    check_possible(config)  # what is wrong is said before anything is written
     if resume:
         continue_folder(folder, config)
     else:
         start_folder(folder, config)
     torch.set_num_threads(1)  # more threads would fight with the workers for the cores
     with Workers(config.workers) as workers:
-        Run(folder, config, workers, told).train()
-        found = judge(folder, config, workers, progress=progress)
-    if config.virtual.virtual_ratio > 0:
+        Trainer(folder, config, workers, on_iteration).train()
+        rows = {
+            name: judge(folder / name, road, workers, progress=progress).rows
+            for name, road in config.roads().items()
+        }
+    if config.virtual.virtual_ratio > 0 and not config.tasks:
         write_model_facts(folder, config)
-    write_report([folder], folder / "report.html")
-    return TrainResult(folder, found.rows, gain_of(config, found.rows))
+    write_report([folder / name for name in rows], folder / "report.html")
+    return rows
 
 
-def gain_of(config: RunConfig, rows: dict[str, list[dict[str, Any]]]) -> Estimate | None:
+def gain_of(config: RunConfig, rows: Rows) -> Estimate | None:
     """Return what the trained controller earns beyond its expert, same seeds paired."""
     if config.expert == "none":
         return None
     return paired_difference(rows[TRAINED], rows[config.make_expert().describe()], "return")
+
+
+class Trainer:
+    """What Algorithm 1 needs around it: episodes from the workers, validation, and the run's folder.
+
+    Of several roads each has a folder of its own in the run's, with controller and progress. Returns of
+    the whole run are then means over the roads by weight, and so is what chooses the controllers.
+    """
+
+    def __init__(
+        self, folder: Path, config: RunConfig, workers: Workers, on_iteration: OnIteration | None = None
+    ) -> None:
+        """Prepare a run, from its newest checkpoint if it has one."""
+        self.folder = folder
+        self.config = config
+        self.workers = workers
+        self.tasks = config.make_tasks()
+        self.folders = [folder / task.name for task in self.tasks]
+        self.training = begin(self.tasks, config.policy, config.learner, config.virtual, config.seed)
+        self._on_iteration = on_iteration
+        total = sum(task.weight for task in self.tasks)
+        self._shares = [task.weight / total for task in self.tasks]
+        self._validation_best = -np.inf
+        self._expert_returns = [float("nan")] * len(self.tasks)
+        checkpoint = load_checkpoint(folder / "checkpoint")
+        if checkpoint is not None:
+            state, tensors = checkpoint
+            self.training.restore(state, tensors)
+            self._validation_best = state["validation_best"]
+            self._expert_returns = state.get("expert_returns", [state["expert_return"]])
+            for place in {folder, *self.folders}:
+                _forget_progress_after(state["iteration"], place)
+
+    def train(self) -> None:
+        """Learn until the configured number of actual steps; a stop loses at most the running iteration."""
+        if self.config.tasks:
+            for place, road in zip(self.folders, self.config.roads().values(), strict=True):
+                make_folder(place)
+                write_whole(place / "config.toml", to_toml(road))
+        if self.training.iteration == 0:
+            self._expert_returns = self.returns_of([task.expert for task in self.tasks])
+            self._keep_controllers(self.training.learner.network())
+            self._validation_best = self._mean(self._expert_returns)
+        algorithm_1(self.training, self.config.steps, self.collect, self.validate, self.write)
+
+    def drivers(self, network: Network) -> list[Driver]:
+        """Return the full policy on each road: its expert plus this residual."""
+        return [full_policy(task, self.config.policy, network) for task in self.tasks]
+
+    def collect(self, network: Network, iteration: int) -> Driven:
+        """Return the episodes of an iteration, at least one of each road, as many as its weight asks for."""
+        steps = self.config.learner.batch_steps
+        counts = [
+            max(1, ceil(round(share * steps / task.scenario.horizon, 9)))
+            for task, share in zip(self.tasks, self._shares, strict=True)
+        ]
+        return self._drive(self.drivers(network), counts, (self.config.seed, iteration), explore=True)
+
+    def validate(self, iteration: Iteration) -> Validated:
+        """Now and then, and at the end, drive the validation seeds, and keep the best controller."""
+        started, found = time.perf_counter(), None
+        network, every = self.training.learner.network(), self.config.evaluation.every
+        last = iteration.actual_steps >= self.config.steps
+        if every and (iteration.number % every == 0 or last):
+            found = self.returns_of(self.drivers(network))
+            if self._mean(found) > self._validation_best:
+                self._validation_best = self._mean(found)
+                self._keep_controllers(network)
+        elif not every and last:
+            self._keep_controllers(network)
+        iteration.seconds["validation"] = time.perf_counter() - started
+        return found
+
+    def write(self, iteration: Iteration, validated: Validated) -> None:
+        """Write a row of progress, of the whole run and of each road, and a checkpoint."""
+        rows = [self._row(iteration, validated, index) for index in range(len(self.tasks))]
+        whole = rows[0]
+        if self.config.tasks:
+            for place, row in zip(self.folders, rows, strict=True):
+                append_line(place / "progress.jsonl", to_json(row))
+            names = [*RETURNS, *MEANS] if validated else [*RETURNS[:-1], *MEANS]
+            whole = {
+                **rows[0],
+                **{name: self._mean([row[name] for row in rows]) for name in names},
+                **{"k_star": None, "eps_m": None, "virtual": {}},
+                "collisions": sum(row["collisions"] for row in rows),
+                "tasks": {
+                    task.name: {name: row[name] for name in (*RETURNS, "k_star", "eps_m")}
+                    for task, row in zip(self.tasks, rows, strict=True)
+                },
+            }
+        append_line(self.folder / "progress.jsonl", to_json(whole))
+        counters, tensors = self.training.state()
+        state = {
+            **counters,
+            "validation_best": self._validation_best,
+            "expert_return": whole["return_expert"],
+            **({"expert_returns": self._expert_returns} if self.config.tasks else {}),
+        }
+        save_checkpoint(self.folder / "checkpoint", state, tensors)
+        if self._on_iteration is not None:
+            self._on_iteration(whole)
+
+    def returns_of(self, drivers: Sequence[Driver]) -> list[float]:
+        """Return the mean return on the validation seeds, by road, each driven by its own of `drivers`."""
+        counts = [self.config.evaluation.validation_episodes] * len(self.tasks)
+        episodes = self._drive(drivers, counts, (VALIDATION,))
+        return [float(np.mean([measure(episode)["return"] for episode in driven])) for driven in episodes]
+
+    def _drive(
+        self, drivers: Sequence[Driver], counts: Sequence[int], seed: tuple[int, ...], explore: bool = False
+    ) -> Driven:
+        """Run `counts` episodes that cover the range of what each scenario draws; raise where one failed."""
+        wanted = []
+        for task, driver, count in zip(self.tasks, drivers, counts, strict=True):
+            for part in range(count):
+                scenario = task.scenario.part(part, count) if self.config.spread else task.scenario
+                wanted.append(EpisodeTask(scenario, driver, (*seed, len(wanted)), task.reward, explore))
+        episodes = self.workers.run(wanted)
+        raise_failure([measure(episode) for episode in episodes if not episode.ok])
+        ends = np.cumsum(counts)
+        return [episodes[end - count : end] for end, count in zip(ends, counts, strict=True)]
+
+    def _mean(self, by_task: Sequence[float]) -> float:
+        """Return the mean over the roads by weight."""
+        return sum(share * value for share, value in zip(self._shares, by_task, strict=True))
+
+    def _row(self, iteration: Iteration, validated: Validated, index: int) -> dict[str, Any]:
+        """Return the row of progress of one road."""
+        measured = [measure(episode) for episode in iteration.episodes[index]]
+        virtual = iteration.virtual[index] if iteration.virtual else {}
+        means = {name: float(np.mean([row[name] for row in measured])) for name in ("return", *MEANS)}
+        return {
+            "iteration": iteration.number,
+            "actual_steps": iteration.actual_steps,
+            "virtual_steps": iteration.virtual_steps,
+            "k_star": virtual.get("k_star"),
+            "eps_m": virtual.get("eps_m"),
+            "return_mean": means.pop("return"),
+            "return_expert": self._expert_returns[index],
+            "return_validation": validated[index] if validated else None,
+            **means,
+            "collisions": sum(row["collisions"] for row in measured),
+            "learner": iteration.log,
+            "virtual": virtual,
+            "seconds": iteration.seconds,
+        }
+
+    def _keep_controllers(self, network: Network) -> None:
+        done = {"iteration": self.training.iteration, "actual_steps": self.training.actual_steps}
+        for place, task, driver in zip(self.folders, self.tasks, self.drivers(network), strict=True):
+            about = {**origin(task.scenario, task.expert), **done}
+            write_whole(place / "controller.unjam", controller_bytes(driver, about))
+
+
+def _forget_progress_after(iteration: int, folder: Path) -> None:
+    """Remove rows of iterations that the checkpoint does not know: they will be made again."""
+    kept = [to_json(row) + "\n" for row in read_progress(folder) if row["iteration"] <= iteration]
+    write_whole(folder / "progress.jsonl", "".join(kept))

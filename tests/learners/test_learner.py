@@ -1,18 +1,23 @@
 import json
+from itertools import pairwise
 
 import numpy as np
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 from safetensors.torch import load, save
+from scipy.integrate import quad
+from scipy.stats import norm
+from torch.distributions import Normal
 
-from tests.learners.task import QUICK, Task, same
-from unjam.learners.algorithms import LEARNERS
-from unjam.learners.settings import LearnerSettings, PolicySettings, SACSettings
-from unjam.learners.state import learner_state, restore_learner
+from tests.learners.task import QUICK, Toy, same
+from unjam.learners.learner import policy_distance
+from unjam.learners.settings import AGENTS, LearnerSettings, PolicySettings, SACSettings
 
 torch.set_num_threads(1)  # more would fight for the cores over matrices of this size
 
-every_learner = pytest.mark.parametrize("agent", LEARNERS)
+every_learner = pytest.mark.parametrize("agent", AGENTS)
 WRAPPED = SACSettings(start_steps=0, updates_per_step=0.01, batch=16, buffer_rows=900, learn_temperature=True)
 """with a replay buffer that is full, and begins anew, in the third iteration of 400 rows"""
 
@@ -32,20 +37,20 @@ def test_a_restored_learner_goes_on_to_the_last_bit(
 ) -> None:
     policy = PolicySettings(hidden=(8, 8), learn_exploration=learned)
 
-    def new() -> Task:
-        return Task(policy, settings, agent, hold=2)
+    def new() -> Toy:
+        return Toy(policy, settings, agent, hold=2)
 
     through = new().learn(4)
-    counters, tensors = learner_state(new().learn(before).learner)
+    counters, tensors = new().learn(before).training.state()
     # As a checkpoint does it, and in a process that has drawn other numbers since.
     counters, tensors = json.loads(json.dumps(counters)), load(save(tensors))
     torch.manual_seed(99)
     np.random.seed(99)
     resumed = new()
-    restore_learner(resumed.learner, counters, tensors)
+    resumed.training.restore(counters, tensors)
     resumed.learn(4)
     assert same(resumed.parameters(), through.parameters())
-    assert learner_state(resumed.learner)[0] == learner_state(through.learner)[0]
+    assert resumed.training.state()[0] == through.training.state()[0]
     assert [entry.log for entry in resumed.iterations] == [entry.log for entry in through.iterations[before:]]
     assert [entry.number for entry in resumed.iterations] == [1, 2, 3, 4][before:]
     assert resumed.iterations[-1].actual_steps == 3200
@@ -53,18 +58,18 @@ def test_a_restored_learner_goes_on_to_the_last_bit(
 
 @every_learner
 def test_a_restored_learner_has_the_state_that_was_kept(agent: str) -> None:
-    kept = learner_state(Task(agent=agent).learn(2).learner)
-    other = Task(agent=agent, seed=5)
+    kept = Toy(agent=agent).learn(2).training.state()
+    other = Toy(agent=agent, seed=5)
     assert not same(other.parameters(), kept[1])
-    restore_learner(other.learner, *kept)
-    counters, tensors = learner_state(other.learner)
+    other.training.restore(*kept)
+    counters, tensors = other.training.state()
     assert counters == kept[0]
     assert {"iteration": 2, "actual_steps": 1600}.items() <= counters.items()
     assert same(tensors, kept[1])
 
 
 def test_the_state_holds_the_momenta_of_the_critic() -> None:
-    _, tensors = learner_state(Task().learn(1).learner)
+    _, tensors = Toy().learn(1).training.state()
     momenta = [tensor for name, tensor in tensors.items() if name.endswith("/exp_avg")]
     assert len(momenta) == 4  # weight and bias of one hidden layer and of the head
     assert all(tensor.abs().max() > 0 for tensor in momenta)
@@ -73,7 +78,7 @@ def test_the_state_holds_the_momenta_of_the_critic() -> None:
 @pytest.mark.parametrize("learned", [True, False])
 def test_the_state_of_sac_holds_all_that_it_learns_from(learned: bool) -> None:
     settings = SACSettings(start_steps=0, updates_per_step=0.01, batch=16, learn_temperature=learned)
-    _, tensors = learner_state(Task(settings=settings, agent="sac").learn(1).learner)
+    _, tensors = Toy(settings=settings, agent="sac").learn(1).training.state()
     parts = {name.partition("/")[0] for name in tensors}
     expected = {"policy", "actor.optimizer", "critic.optimizer", "replay"}
     assert parts == expected | ({"log_ent_coef", "ent_coef_optimizer"} if learned else set())
@@ -82,14 +87,14 @@ def test_the_state_of_sac_holds_all_that_it_learns_from(learned: bool) -> None:
 
 
 def test_a_full_replay_buffer_is_kept_whole() -> None:
-    _, tensors = learner_state(Task(settings=WRAPPED, agent="sac").learn(2).learner)
+    _, tensors = Toy(settings=WRAPPED, agent="sac").learn(2).training.state()
     assert len(tensors["replay/rewards"]) == 900
 
 
 @every_learner
 def test_a_kept_state_does_not_change_when_the_learner_goes_on(agent: str) -> None:
-    task = Task(agent=agent).learn(1)
-    _, tensors = learner_state(task.learner)
+    task = Toy(agent=agent).learn(1)
+    _, tensors = task.training.state()
     before = {name: tensor.clone() for name, tensor in tensors.items()}
     task.learn(2)
     assert same(tensors, before)
@@ -98,17 +103,50 @@ def test_a_kept_state_does_not_change_when_the_learner_goes_on(agent: str) -> No
 
 @every_learner
 def test_a_learner_that_goes_on_does_not_change_the_state_it_came_from(agent: str) -> None:
-    counters, tensors = learner_state(Task(agent=agent).learn(1).learner)
+    counters, tensors = Toy(agent=agent).learn(1).training.state()
     before = {name: tensor.clone() for name, tensor in tensors.items()}
-    task = Task(agent=agent)
-    restore_learner(task.learner, counters, tensors)
+    task = Toy(agent=agent)
+    task.training.restore(counters, tensors)
     task.learn(3)
     assert same(tensors, before)
 
 
 @every_learner
 def test_weights_of_another_network_are_refused(agent: str) -> None:
-    counters, tensors = learner_state(Task(agent=agent).learn(1).learner)
-    other = Task(PolicySettings(hidden=(4,)), agent=agent)
+    counters, tensors = Toy(agent=agent).learn(1).training.state()
+    other = Toy(PolicySettings(hidden=(4,)), agent=agent)
     with pytest.raises(RuntimeError, match="size mismatch"):
-        restore_learner(other.learner, counters, tensors)
+        other.training.restore(counters, tensors)
+
+
+means = st.floats(-3, 3)
+stds = st.floats(0.05, 3)
+
+
+def of(mean: float, std: float) -> Normal:
+    return Normal(torch.tensor([mean]), torch.tensor([std]))
+
+
+@given(means, stds, means, stds)
+def test_is_half_the_integral_of_the_difference_of_the_densities(
+    m: float, s: float, n: float, t: float
+) -> None:
+    def difference(x: float) -> float:
+        return float(abs(norm.pdf(x, m, s) - norm.pdf(x, n, t)))
+
+    low, high = min(m - 9 * s, n - 9 * t), max(m + 9 * s, n + 9 * t)
+    points = np.unique(np.concatenate([[low, high], m + s * np.arange(-3, 4), n + t * np.arange(-3, 4)]))
+    expected = 0.5 * sum(quad(difference, a, b)[0] for a, b in pairwise(points))
+    assert abs(float(policy_distance(of(m, s), of(n, t))) - expected) < 1e-5
+
+
+@given(means, stds)
+def test_is_zero_for_the_same_policy_and_one_for_policies_far_apart(mean: float, std: float) -> None:
+    assert float(policy_distance(of(mean, std), of(mean, std))) == 0.0
+    assert float(policy_distance(of(mean, std), of(mean + 100 * std, std))) > 0.999
+
+
+@given(means, stds, means, stds)
+def test_is_the_same_both_ways(m: float, s: float, n: float, t: float) -> None:
+    there, back = policy_distance(of(m, s), of(n, t)), policy_distance(of(n, t), of(m, s))
+    torch.testing.assert_close(there, back, atol=1e-6, rtol=0)

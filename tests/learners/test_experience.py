@@ -7,18 +7,19 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from stable_baselines3.common.buffers import ReplayBuffer, RolloutBuffer
 
-from tests.learners.test_policy import make_policy, shake
+from tests.learners.test_trpo_ppo import make_policy, shake
 from unjam.drivers import LocalState
-from unjam.learners.policy import ResidualPolicy, policy_spaces
-from unjam.learners.rows import (
-    Rows,
+from unjam.learners.experience import (
+    Experience,
     add_to_replay_buffer,
     discounted_returns,
+    experience_of,
     fill_rollout_buffer,
-    join_rows,
-    rows_of,
+    join,
     shifted_rewards,
 )
+from unjam.learners.learner import policy_spaces
+from unjam.learners.trpo_ppo import ResidualPolicy
 from unjam.worlds.record import Trajectory
 
 INPUTS = 3
@@ -61,7 +62,7 @@ def fill(
 ) -> RolloutBuffer:
     spaces = policy.observation_space, policy.action_space
     buffer = RolloutBuffer(1, *spaces, device="cpu", gamma=gamma, gae_lambda=gae_lambda)
-    fill_rollout_buffer(buffer, policy, rows_of(trajectories, extra or [()] * len(trajectories)))
+    fill_rollout_buffer(buffer, policy, experience_of(trajectories, extra or [()] * len(trajectories)))
     return buffer
 
 
@@ -180,16 +181,16 @@ def test_the_value_after_the_end_is_that_of_the_trajectorys_own_road() -> None:
 def test_parts_that_are_joined_are_the_rows_of_all_their_trajectories() -> None:
     trajectories = [make_trajectory(seed, 3 + seed, hold=2, terminated=seed == 1) for seed in range(4)]
     extra = [(float(seed),) for seed in range(4)]
-    parts = [rows_of(trajectories[:1], extra[:1]), rows_of(trajectories[1:], extra[1:])]
-    joined, expected = join_rows(parts), rows_of(trajectories, extra)
-    for field in fields(Rows):
+    parts = [experience_of(trajectories[:1], extra[:1]), experience_of(trajectories[1:], extra[1:])]
+    joined, expected = join(parts), experience_of(trajectories, extra)
+    for field in fields(Experience):
         np.testing.assert_array_equal(getattr(joined, field.name), getattr(expected, field.name))
         assert getattr(joined, field.name).dtype == getattr(expected, field.name).dtype
 
 
 def test_after_each_row_comes_the_next_of_its_trajectory_or_where_that_ended() -> None:
     trajectories = [make_trajectory(0, 5, hold=2), make_trajectory(1, 1), make_trajectory(2, 3)]
-    rows = rows_of(trajectories, [()] * 3)
+    rows = experience_of(trajectories, [()] * 3)
     expected = np.concatenate([trajectory.observations[1:] for trajectory in trajectories])
     np.testing.assert_array_equal(rows.next_observations, expected.astype(np.float32))
     assert rows.lasts.tolist() == [2, 3, 6]
@@ -226,7 +227,7 @@ def test_the_ratio_is_one_in_the_shuffled_order_of_the_update_too() -> None:
 def test_a_buffer_takes_the_size_of_each_iteration() -> None:
     policy = random_policy()
     buffer = fill(policy, [make_trajectory(0, 50)])
-    fill_rollout_buffer(buffer, policy, rows_of([make_trajectory(1, 20)], [()]))
+    fill_rollout_buffer(buffer, policy, experience_of([make_trajectory(1, 20)], [()]))
     assert len(buffer.rewards) == 20
     assert sum(len(rows.returns) for rows in buffer.get(7)) == 20
     np.testing.assert_array_equal(
@@ -254,7 +255,7 @@ def test_discounted_returns_are_the_sums_written_out(
             within = sum(gamma ** (later - t) * earned[later] for later in range(t, len(earned)))
             expected.append(within + gamma ** (len(earned) - t) * after)
     np.testing.assert_allclose(
-        discounted_returns(rows_of(trajectories, [()] * len(trajectories)), gamma),
+        discounted_returns(experience_of(trajectories, [()] * len(trajectories)), gamma),
         expected,
         rtol=1e-9,
         atol=1e-9,
@@ -264,7 +265,7 @@ def test_discounted_returns_are_the_sums_written_out(
 def test_a_cut_trajectory_that_always_earns_the_same_is_worth_the_same_everywhere() -> None:
     trajectory = make_trajectory(0, 30)
     trajectory.terms["one"][:], trajectory.terms["other"][:] = 1.5, 0.5
-    np.testing.assert_allclose(discounted_returns(rows_of([trajectory], [()]), 0.95), 2.0 / 0.05)
+    np.testing.assert_allclose(discounted_returns(experience_of([trajectory], [()]), 0.95), 2.0 / 0.05)
 
 
 def replay_buffer(size: int) -> ReplayBuffer:
@@ -280,7 +281,7 @@ def test_the_replay_buffer_holds_what_sb3_would_have_put_there_row_by_row() -> N
             for seed in range(2)
         ]
         extra = [(0.5,), (-0.5,)]
-        rows = rows_of(trajectories, extra)
+        rows = experience_of(trajectories, extra)
         add_to_replay_buffer(ours, rows, 2.0, rows.rewards)
         for trajectory, more in zip(trajectories, extra, strict=True):
             seen = [np.append(row, more).astype(np.float32) for row in trajectory.observations]
@@ -297,7 +298,7 @@ def test_the_replay_buffer_holds_what_sb3_would_have_put_there_row_by_row() -> N
 
 def test_more_rows_than_a_replay_buffer_takes_leave_the_newest() -> None:
     buffer = replay_buffer(5)
-    rows = rows_of([make_trajectory(0, 13)], [(0.0,)])
+    rows = experience_of([make_trajectory(0, 13)], [(0.0,)])
     add_to_replay_buffer(buffer, rows, 2.0, rows.rewards)
     assert sorted(buffer.rewards[:, 0]) == sorted(rows.rewards[-5:].astype(np.float32))
 
@@ -311,7 +312,7 @@ def test_more_rows_than_a_replay_buffer_takes_leave_the_newest() -> None:
 def test_shifted_rewards_shift_all_that_follows_by_the_same(
     shapes: list[tuple[int, bool]], gamma: float, offset: float, after: float
 ) -> None:
-    rows = rows_of(
+    rows = experience_of(
         [make_trajectory(seed, size, 1, terminated) for seed, (size, terminated) in enumerate(shapes)],
         [()] * len(shapes),
     )

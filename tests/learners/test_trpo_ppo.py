@@ -1,4 +1,6 @@
 import math
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -6,10 +8,14 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.learners.task import INPUTS, Toy, same
 from unjam.drivers import PISaturation, ResidualDriver
+from unjam.drivers.network import Network
 from unjam.drivers.observation import observation_size
-from unjam.learners.policy import ResidualPolicy, policy_spaces
-from unjam.learners.settings import PolicySettings
+from unjam.learners.experience import discounted_returns, experience_of
+from unjam.learners.learner import policy_spaces
+from unjam.learners.settings import PolicySettings, PPOSettings, TRPOSettings
+from unjam.learners.trpo_ppo import ResidualPolicy
 from unjam.scenarios import Ring
 from unjam.worlds.episode import run_episode
 from unjam.worlds.sumo.simulation import Simulation
@@ -199,3 +205,110 @@ def test_spaces_hold_both_networks_inputs_and_the_bounds_of_the_mean() -> None:
     assert actions.shape == (1,)
     assert float(actions.high[0]) == pytest.approx(0.7)
     assert float(actions.low[0]) == pytest.approx(-0.7)
+
+
+def test_each_update_stays_within_the_trust_region() -> None:
+    task = Toy(settings=TRPOSettings(critic_epochs=1, target_kl=0.02)).learn(5)
+    networks = [*task.networks, task.learner.network()]
+    for iteration, before, after in zip(task.iterations, networks[:-1], networks[1:], strict=True):
+        observations = np.concatenate([e.trajectories[0].observations[:-1] for e in iteration.episodes[0]])
+        old, new = before.exploration_std, after.exploration_std
+        moved = (after(observations) - before(observations)) ** 2
+        divergence = float(np.mean(np.log(old / new) + (new**2 + moved) / (2 * old**2) - 0.5))
+        assert 0.2 * 0.02 < divergence <= 0.02 * 1.001
+        assert divergence == pytest.approx(iteration.log["kl_divergence_loss"], rel=0.01)
+
+
+@pytest.mark.parametrize("learned", [True, False])
+def test_exploration_changes_only_where_it_is_learned(learned: bool) -> None:
+    policy = PolicySettings(hidden=(8,), exploration_std=0.2, learn_exploration=learned)
+    task = Toy(policy).learn(3)
+    found = task.learner.network().exploration_std
+    assert (found == task.networks[0].exploration_std) is not learned
+    assert same_mean(task.networks[0], task.learner.network()) is False
+
+
+def same_mean(one: Network, other: Network) -> bool:
+    rows = np.random.default_rng(0).uniform(size=(5, INPUTS))
+    return bool(np.array_equal(one(rows), other(rows)))
+
+
+@pytest.mark.parametrize("normalise", [True, False])
+def test_units_of_the_value_come_from_the_first_iteration(normalise: bool) -> None:
+    policy = PolicySettings(hidden=(8,), normalise_value=normalise)
+    task = Toy(policy).learn(3)
+    trajectories = [episode.trajectories[0] for episode in task.iterations[0].episodes[0]]
+    returns = discounted_returns(experience_of(trajectories, [()] * len(trajectories)), 0.99)
+    expected = [returns.mean(), returns.std()] if normalise else [0.0, 1.0]
+    assert task.parameters()["policy/value_net.scale"].tolist() == pytest.approx(expected, rel=1e-5)
+
+
+def test_the_units_of_a_value_that_never_changes_stay_usable() -> None:
+    policy = PolicySettings(hidden=(8,), exploration_std=1e-9)
+    task = Toy(policy, target=lambda rows: np.zeros(len(rows))).learn(2)
+    assert task.parameters()["policy/value_net.scale"][1] > 0.0
+    assert all(torch.isfinite(tensor).all() for tensor in task.parameters().values())
+
+
+def test_settings_reach_the_learner() -> None:
+    settings = TRPOSettings(
+        gamma=0.9,
+        gae_lambda=0.5,
+        target_kl=0.07,
+        cg_damping=0.2,
+        cg_steps=7,
+        critic_epochs=4,
+        critic_batch=33,
+    )
+    learner: Any = Toy(settings=replace(settings, critic_rate=0.02, value_l2=0.3)).learner.sb3
+    (group,) = learner.policy.optimizer.param_groups
+    assert (learner.rollout_buffer.gamma, learner.rollout_buffer.gae_lambda) == (0.9, 0.5)
+    assert (learner.target_kl, learner.cg_damping, learner.cg_max_steps) == (0.07, 0.2, 7)
+    assert (learner.n_critic_updates, learner.batch_size) == (4, 33)
+    assert (group["lr"], group["weight_decay"], group["eps"]) == (0.02, 0.3, 1e-5)
+
+
+def test_the_decay_of_the_value_network_leaves_the_actor_alone() -> None:
+    def actor(value_l2: float) -> dict[str, Any]:
+        found = Toy(settings=TRPOSettings(value_l2=value_l2, critic_rate=0.01)).learn(1).parameters()
+        return {name: tensor for name, tensor in found.items() if "value" not in name and "policy/" in name}
+
+    def critic(value_l2: float) -> torch.Tensor:
+        found = Toy(settings=TRPOSettings(value_l2=value_l2, critic_rate=0.01)).learn(1).parameters()
+        return found["policy/value_net.linear.weight"]
+
+    assert same(actor(0.0), actor(5.0))
+    assert not torch.equal(critic(0.0), critic(5.0))
+
+
+def test_settings_reach_ppo() -> None:
+    settings = PPOSettings(gamma=0.9, gae_lambda=0.5, clip=0.3, epochs=4, actor_rate=0.01, critic_rate=0.02)
+    learner: Any = Toy(settings=settings, agent="ppo").learn(1).learner.sb3
+    assert (learner.rollout_buffer.gamma, learner.rollout_buffer.gae_lambda) == (0.9, 0.5)
+    assert learner.clip_range(1.0) == 0.3
+    assert [group["lr"] for group in learner.policy.optimizer.param_groups] == [0.01, 0.02]
+
+
+@pytest.mark.parametrize(("minibatches", "steps_per_epoch"), [(1, 1), (3, 3)])
+def test_each_epoch_of_ppo_takes_all_rows_in_so_many_parts(minibatches: int, steps_per_epoch: int) -> None:
+    settings = PPOSettings(epochs=5, minibatches=minibatches)
+    parameters = Toy(settings=settings, agent="ppo", episodes=3).learn(2).parameters()
+    steps = {int(tensor) for name, tensor in parameters.items() if name.endswith("/step")}
+    assert steps == {2 * 5 * steps_per_epoch}
+
+
+def test_actor_and_critic_of_ppo_learn_at_their_own_rates() -> None:
+    def moved(actor_rate: float, critic_rate: float) -> dict[bool, float]:
+        settings = PPOSettings(epochs=5, actor_rate=actor_rate, critic_rate=critic_rate)
+        task = Toy(settings=settings, agent="ppo")
+        before = task.parameters()
+        after = task.learn(2).parameters()
+        found = {True: 0.0, False: 0.0}
+        for name, tensor in before.items():
+            if name.startswith("policy/") and "scale" not in name:
+                critic = "value" in name
+                found[critic] = max(found[critic], float((after[name] - tensor).abs().max()))
+        return found
+
+    assert moved(1e-12, 1e-2)[False] < 1e-8 < 1e-3 < moved(1e-12, 1e-2)[True]
+    assert moved(1e-2, 1e-12)[True] < 1e-8 < 1e-3 < moved(1e-2, 1e-12)[False]

@@ -1,4 +1,4 @@
-"""From trajectories to rows, the form in which learners take them, and into Stable-Baselines3's buffers."""
+"""From trajectories to experience, the form in which learners take it, and into SB3's buffers."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,8 +18,8 @@ Float64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Rows:
-    """What a learner learns from: one row per look of the network, trajectories one behind the other."""
+class Experience:
+    """What a learner learns from: one row per choice of the network, trajectories one behind the other."""
 
     observations: Float32
     """what the actor sees, then what the critic alone sees, shape (rows, inputs + critic inputs)"""
@@ -48,28 +48,30 @@ class Rows:
         return after
 
 
-def rows_of(trajectories: Sequence[Trajectory], critic_inputs: Sequence[tuple[float, ...]]) -> Rows:
-    """Return the rows of trajectories; `critic_inputs` has, for each, what the critic alone sees."""
-    looks = [trajectory.choices for trajectory in trajectories]
+def experience_of(
+    trajectories: Sequence[Trajectory], critic_inputs: Sequence[tuple[float, ...]]
+) -> Experience:
+    """Return the experience of trajectories; `critic_inputs` has, for each, what the critic alone sees."""
+    choices = [trajectory.choices for trajectory in trajectories]
     seen = [
         np.column_stack([trajectory.observations, np.tile(extra, (len(trajectory.observations), 1))])
         for trajectory, extra in zip(trajectories, critic_inputs, strict=True)
     ]
-    counts = [len(earned) for _, earned in looks]
-    return Rows(
+    counts = [len(earned) for _, earned in choices]
+    return Experience(
         observations=np.concatenate([rows[:-1] for rows in seen]).astype(np.float32),
-        actions=np.concatenate([residual for residual, _ in looks]).astype(np.float32),
-        rewards=np.concatenate([earned for _, earned in looks]),
+        actions=np.concatenate([residual for residual, _ in choices]).astype(np.float32),
+        rewards=np.concatenate([earned for _, earned in choices]),
         starts=np.concatenate([[0], np.cumsum(counts)[:-1]]).astype(np.intp),
         last_observations=np.concatenate([rows[-1:] for rows in seen]).astype(np.float32),
         terminated=np.array([trajectory.terminated for trajectory in trajectories]),
     )
 
 
-def join_rows(parts: Sequence[Rows]) -> Rows:
-    """Return the rows of all parts, one behind the other: actual and virtual ones, say."""
+def join(parts: Sequence[Experience]) -> Experience:
+    """Return the experience of all parts, one behind the other: actual and virtual ones, say."""
     before = np.cumsum([0, *(len(part.rewards) for part in parts[:-1])])
-    return Rows(
+    return Experience(
         observations=np.concatenate([part.observations for part in parts]),
         actions=np.concatenate([part.actions for part in parts]),
         rewards=np.concatenate([part.rewards for part in parts]),
@@ -79,7 +81,7 @@ def join_rows(parts: Sequence[Rows]) -> Rows:
     )
 
 
-def fill_rollout_buffer(buffer: RolloutBuffer, policy: ActorCriticPolicy, rows: Rows) -> None:
+def fill_rollout_buffer(buffer: RolloutBuffer, policy: ActorCriticPolicy, rows: Experience) -> None:
     """Fill `buffer` with rows and compute their advantages.
 
     Values and log-probabilities are computed here, in one batch, so that the ratio before the first update
@@ -108,7 +110,7 @@ def fill_rollout_buffer(buffer: RolloutBuffer, policy: ActorCriticPolicy, rows: 
     buffer.compute_returns_and_advantage(torch.zeros(1), np.ones(1, bool))
 
 
-def add_to_replay_buffer(buffer: ReplayBuffer, rows: Rows, authority: float, rewards: Float64) -> None:
+def add_to_replay_buffer(buffer: ReplayBuffer, rows: Experience, authority: float, rewards: Float64) -> None:
     """Add rows to those of earlier iterations, in place of the oldest where the buffer is full.
 
     Only a collision ends what is to be earned: a trajectory that was cut goes on with the value of where it
@@ -163,7 +165,7 @@ class MixedReplayBuffer(ReplayBuffer):
         return ReplayBufferSamples(*joined)
 
 
-def shifted_rewards(rows: Rows, offset: float, gamma: float) -> Float64:
+def shifted_rewards(rows: Experience, offset: float, gamma: float) -> Float64:
     """Return the rewards less `offset`, shape (rows,), so that the same policies are the best ones.
 
     What follows a row is then worth less by offset / (1 - gamma), wherever it is; after a collision, where
@@ -174,7 +176,7 @@ def shifted_rewards(rows: Rows, offset: float, gamma: float) -> Float64:
     return rewards
 
 
-def discounted_returns(rows: Rows, gamma: float) -> Float64:
+def discounted_returns(rows: Experience, gamma: float) -> Float64:
     """Return the discounted sum of the rewards that follow each row, shape (rows,).
 
     The end of a cut trajectory counts as if it went on at its mean reward.

@@ -2,28 +2,44 @@ import numpy as np
 import pytest
 import torch
 
-from tests.learners.task import DECISIONS, INPUTS, Task, same
+from tests.learners.task import (
+    DECISIONS,
+    INPUTS,
+    Target,
+    Toy,
+    constant_target,
+    mean_return,
+    same,
+    sloped_target,
+)
 from unjam.errors import UnjamError
-from unjam.learners.algorithms import LEARNERS
-from unjam.learners.episodic import seed_iteration
-from unjam.learners.settings import PolicySettings
+from unjam.learners.algorithm_1 import actual_experience, seed_iteration
+from unjam.learners.settings import (
+    AGENTS,
+    LearnerSettings,
+    PolicySettings,
+    PPOSettings,
+    SACSettings,
+    TD3Settings,
+    TRPOSettings,
+)
 
 torch.set_num_threads(1)  # more would fight for the cores over matrices of this size
 
-every_learner = pytest.mark.parametrize("agent", LEARNERS)
+every_learner = pytest.mark.parametrize("agent", AGENTS)
 
 
 @every_learner
 def test_the_same_seed_gives_the_same_parameters_to_the_last_bit(agent: str) -> None:
-    one, other = (Task(agent=agent).learn(3) for _ in range(2))
+    one, other = (Toy(agent=agent).learn(3) for _ in range(2))
     assert same(one.parameters(), other.parameters())
     assert [entry.log for entry in one.iterations] == [entry.log for entry in other.iterations]
-    assert not same(one.parameters(), Task(agent=agent, seed=1).learn(3).parameters())
+    assert not same(one.parameters(), Toy(agent=agent, seed=1).learn(3).parameters())
 
 
 @every_learner
 def test_what_others_draw_in_between_changes_nothing(agent: str) -> None:
-    task, disturbed = Task(agent=agent), Task(agent=agent)
+    task, disturbed = Toy(agent=agent), Toy(agent=agent)
     for iterations in (1, 2, 3):
         task.learn(iterations)
         torch.rand(7)
@@ -35,26 +51,26 @@ def test_what_others_draw_in_between_changes_nothing(agent: str) -> None:
 @every_learner
 @pytest.mark.parametrize("hold", [1, 5])
 def test_counts_decisions_and_not_looks(agent: str, hold: int) -> None:
-    task = Task(agent=agent, hold=hold, episodes=3)
-    task.learner.run(2 * 3 * DECISIONS)
+    task = Toy(agent=agent, hold=hold, episodes=3)
+    task.run(2 * 3 * DECISIONS)
     assert [entry.actual_steps for entry in task.iterations] == [300, 600]
     assert [entry.number for entry in task.iterations] == [1, 2]
 
 
 @every_learner
 def test_ends_with_the_first_iteration_that_reaches_the_budget(agent: str) -> None:
-    task = Task(agent=agent, episodes=3)
-    task.learner.run(301)
-    assert task.learner.num_timesteps == 600
-    task.learner.run(600)
+    task = Toy(agent=agent, episodes=3)
+    task.run(301)
+    assert task.training.actual_steps == 600
+    task.run(600)
     assert len(task.iterations) == 2
-    task.learner.run(601)
-    assert task.learner.num_timesteps == 900
+    task.run(601)
+    assert task.training.actual_steps == 900
 
 
 @every_learner
 def test_each_iteration_is_driven_by_what_the_one_before_learned(agent: str) -> None:
-    task = Task(agent=agent).learn(2)
+    task = Toy(agent=agent).learn(2)
     rows = np.random.default_rng(0).uniform(size=(5, INPUTS))
     found = [network(rows) for network in (*task.networks, task.learner.network())]
     assert (found[0] == 0.0).all()
@@ -64,27 +80,25 @@ def test_each_iteration_is_driven_by_what_the_one_before_learned(agent: str) -> 
 
 @every_learner
 def test_an_iteration_tells_what_progress_needs(agent: str) -> None:
-    (iteration,) = Task(agent=agent).learn(1).iterations
+    (iteration,) = Toy(agent=agent).learn(1).iterations
     assert iteration.log
     assert all(type(value) is float and np.isfinite(value) for value in iteration.log.values())
     assert set(iteration.seconds) == {"actual", "update"}
     assert min(iteration.seconds.values()) > 0.0
     assert iteration.virtual_steps == 0
-    assert len(iteration.episodes) == 8
+    assert len(iteration.episodes[0]) == 8
 
 
 @every_learner
 @pytest.mark.parametrize("sees_road", [True, False])
 def test_only_the_critic_sees_the_road_that_was_drawn(agent: str, sees_road: bool) -> None:
     policy = PolicySettings(hidden=(8,), critic_sees_road=sees_road)
-    task = Task(policy, agent=agent, episodes=2)
-    learner = task.learner
-    learner.collect_rollouts()
-    rows = next(learner.updates()).rows
+    task = Toy(policy, agent=agent, episodes=2)
+    rows = actual_experience(task.training, task.collect(task.learner.network(), 1))
     assert rows.observations.shape == (2 * DECISIONS, INPUTS + sees_road)
     if sees_road:
         assert set(rows.observations[:, INPUTS]) == {-1.0, 1.0}
-    assert task.learner.observation_space.shape == (INPUTS + sees_road,)
+    assert task.learner.sb3.observation_space.shape == (INPUTS + sees_road,)
     assert task.learner.network().inputs == INPUTS
 
 
@@ -101,7 +115,7 @@ def test_each_iteration_of_each_run_draws_its_own_numbers() -> None:
 @every_learner
 @pytest.mark.filterwarnings("ignore:overflow", "ignore:invalid value")
 def test_a_reward_that_is_not_finite_is_named_before_anything_is_learned(agent: str) -> None:
-    task = Task(agent=agent, target=lambda observations: np.full(len(observations), 1e200))
+    task = Toy(agent=agent, target=lambda observations: np.full(len(observations), 1e200))
     before = task.parameters()
     with pytest.raises(UnjamError, match="learner: rewards of iteration 1 are not finite"):
         task.learn(1)
@@ -111,11 +125,51 @@ def test_a_reward_that_is_not_finite_is_named_before_anything_is_learned(agent: 
 
 @every_learner
 def test_a_parameter_that_is_not_finite_is_named_in_the_same_iteration(agent: str) -> None:
-    task = Task(agent=agent)
-    critic = (p for name, p in task.learner.policy.named_parameters() if "value" in name or "critic" in name)
+    task = Toy(agent=agent)
+    critic = (
+        p for name, p in task.learner.sb3.policy.named_parameters() if "value" in name or "critic" in name
+    )
     with torch.no_grad():
         next(critic)[0] = torch.nan
     with pytest.raises(UnjamError, match=r"learner: \S+ is not finite in iteration 1") as caught:
         task.learn(1)
     assert "\n" not in str(caught.value)
     assert task.iterations == []
+
+
+# Nothing in the task has late consequences, so a small discount is enough.
+TO_LEARN: dict[str, LearnerSettings] = {
+    "trpo": TRPOSettings(critic_epochs=3, gamma=0.8, gae_lambda=0.9),
+    "ppo": PPOSettings(epochs=20, gamma=0.8, gae_lambda=0.9),
+    "sac": SACSettings(
+        gamma=0.5,
+        start_steps=1600,
+        rate=5e-3,
+        tau=0.02,
+        reward_scale=10.0,
+        temperature=0.02,
+        batch=64,
+        updates_per_step=0.04,
+    ),
+    "td3": TD3Settings(
+        gamma=0.5, start_steps=1600, rate=5e-3, tau=0.02, reward_scale=10.0, batch=64, updates_per_step=0.04
+    ),
+}
+
+
+@pytest.mark.parametrize(
+    ("target", "hold"), [(constant_target, 1), pytest.param(sloped_target, 5, marks=pytest.mark.slow)]
+)
+@pytest.mark.parametrize(
+    "agent", [pytest.param(name, marks=pytest.mark.slow) if name == "ppo" else name for name in AGENTS]
+)
+def test_learns_to_be_at_the_target(agent: str, target: Target, hold: int) -> None:
+    policy = PolicySettings(hidden=(16,), exploration_std=0.2)
+    episodes = 8 if hold == 1 else 20
+    task = Toy(policy, TO_LEARN[agent], agent, target=target, hold=hold, episodes=episodes)
+    task.learn(12 if agent in ("sac", "td3") else 30)
+    observations = np.random.default_rng(9).uniform(-1.0, 1.0, size=(500, INPUTS))
+    at_start = np.abs(task.networks[0](observations) - target(observations)).mean()
+    at_end = np.abs(task.learner.network()(observations) - target(observations)).mean()
+    assert at_end < 0.1 < at_start / 2
+    assert mean_return(task.iterations[-1]) > mean_return(task.iterations[0]) / 2  # both are negative

@@ -1,4 +1,5 @@
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -6,10 +7,11 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.learners.test_policy import random_rows, shake
-from unjam.learners.policy import policy_spaces
-from unjam.learners.settings import PolicySettings
-from unjam.learners.squashed_policy import SquashedResidualPolicy, uniform_network
+from tests.learners.task import INPUTS, Toy
+from tests.learners.test_trpo_ppo import random_rows, shake
+from unjam.learners.learner import policy_spaces
+from unjam.learners.sac import SquashedResidualPolicy, uniform_network
+from unjam.learners.settings import PolicySettings, SACSettings
 
 torch.set_num_threads(1)  # more would fight for the cores over matrices of this size
 
@@ -128,3 +130,60 @@ def test_uniform_residuals_cover_their_authority_evenly() -> None:
     share = np.arange(len(found)) / len(found)
     assert np.abs(share - (found + 2.0) / 4.0).max() < 0.015
     assert (network(np.ones((4, 3))) == 0.0).all()
+
+
+@pytest.mark.parametrize("start", ["expert", "uniform"])
+def test_sac_learns_nothing_before_its_start_is_driven(start: Any) -> None:
+    settings = SACSettings(start=start, start_steps=1700, updates_per_step=0.02, batch=8)
+    task = Toy(PolicySettings(hidden=(16,), exploration_std=0.1), settings, "sac").learn(4)
+    updates = [entry.log.get("n_updates", 0.0) for entry in task.iterations]
+    assert updates == [0.0, 0.0, 48.0, 64.0]  # 800 actual steps in each iteration
+    rows = np.zeros((2000, INPUTS))
+    noise = np.random.default_rng(0).normal(size=len(rows))
+    stds = [network.explore(rows, noise).std() for network in task.networks]
+    expected = 0.1 if start == "expert" else 3**-0.5
+    assert stds[:3] == pytest.approx([expected] * 3, rel=0.05)
+    assert stds[3] == pytest.approx(0.1, rel=0.2)  # the policy's own, after its first few updates
+    assert (task.networks[2](rows) == 0.0).all()
+
+
+def test_an_iteration_of_sac_makes_at_least_one_update() -> None:
+    settings = SACSettings(start_steps=0, updates_per_step=1e-9, batch=8)
+    task = Toy(settings=settings, agent="sac").learn(2)
+    assert [entry.log["n_updates"] for entry in task.iterations] == [1.0, 2.0]
+
+
+@pytest.mark.parametrize("normalise", [True, False])
+def test_rewards_of_sac_are_shifted_by_the_mean_of_the_first_iteration_and_scaled(normalise: bool) -> None:
+    policy = PolicySettings(hidden=(8,), normalise_value=normalise)
+    settings = SACSettings(start_steps=0, updates_per_step=0.01, batch=8, reward_scale=3.0)
+    task = Toy(policy, settings, "sac").learn(2)
+    earned = [
+        np.concatenate([episode.trajectories[0].reward for episode in entry.episodes[0]])
+        for entry in task.iterations
+    ]
+    offset = earned[0].mean() if normalise else 0.0
+    expected = 3.0 * (np.concatenate(earned) - offset)
+    np.testing.assert_allclose(task.parameters()["replay/rewards"][:, 0], expected, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("learned", [True, False])
+def test_the_temperature_of_sac_changes_only_where_it_is_learned(learned: bool) -> None:
+    settings = SACSettings(
+        start_steps=0, updates_per_step=0.02, batch=8, temperature=0.3, learn_temperature=learned
+    )
+    logs = [entry.log["ent_coef"] for entry in Toy(settings=settings, agent="sac").learn(3).iterations]
+    assert logs[0] == pytest.approx(0.3, rel=0.01)
+    assert (logs[-1] == logs[0]) is not learned
+
+
+def test_settings_reach_sac() -> None:
+    settings = SACSettings(
+        gamma=0.9, tau=0.1, rate=0.02, batch=33, buffer_rows=77, learn_temperature=True, target_entropy=-3.0
+    )
+    learner: Any = Toy(settings=settings, agent="sac").learner.sb3
+    assert (learner.gamma, learner.tau, learner.batch_size) == (0.9, 0.1, 33)
+    assert learner.replay_buffer.buffer_size == 77
+    assert learner.target_entropy == -3.0
+    optimisers = (learner.actor.optimizer, learner.critic.optimizer, learner.ent_coef_optimizer)
+    assert {optimiser.param_groups[0]["lr"] for optimiser in optimisers} == {0.02}

@@ -1,0 +1,261 @@
+"""Algorithm 1 of the paper: knowledge-informed model-based residual reinforcement learning.
+
+The names are the paper's: pi_theta is the network of residuals, pi_H the expert, T the virtual environment,
+D_a actual experience and D_v virtual experience, k* the rollout length of Eq. 15.
+"""
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+
+from unjam.drivers.network import Network
+from unjam.drivers.observation import observation_size
+from unjam.errors import UnjamError
+from unjam.learners.experience import Experience, Float32, experience_of, join
+from unjam.learners.imagination import Imagination
+from unjam.learners.learner import AgentSpec, Learner, Tensors, Update, make_learner, policy_distance, under
+from unjam.learners.settings import LearnerSettings, PolicySettings
+from unjam.virtual.settings import VirtualSettings
+from unjam.worlds.record import Episode
+from unjam.worlds.task import Task
+
+COMPARED_ROWS = 2000
+"""at most so many of the visited states tell how far an update has moved the policy"""
+
+Driven = Sequence[Sequence[Episode]]
+"""the episodes of each task"""
+Validated = Sequence[float] | None
+"""return on the validation seeds of each task; None where it was not the time to validate"""
+
+
+@dataclass
+class Training:
+    """What Algorithm 1 goes on from: networks, virtual environments with D_a, and how far it is."""
+
+    tasks: Sequence[Task]
+    policy: PolicySettings
+    seed: int
+    """of the whole run"""
+    learner: Learner
+    """pi_theta and its value network"""
+    imaginations: Sequence[Imagination] = ()
+    """the virtual environment of each task, with its D_a; empty: model-free"""
+    iteration: int = 0
+    """iterations done"""
+    actual_steps: int = 0
+
+    def state(self) -> tuple[dict[str, Any], Tensors]:
+        """Return counters and tensors at the end of an iteration: all that is needed to go on."""
+        counters, tensors = self.learner.state()
+        counters |= {"iteration": self.iteration, "actual_steps": self.actual_steps}
+        for imagination in self.imaginations:
+            counters[imagination.name], kept = imagination.state()
+            tensors |= {f"{imagination.name}/{name}": tensor for name, tensor in kept.items()}
+        return counters, {name: tensor.detach().clone() for name, tensor in tensors.items()}
+
+    def restore(self, counters: dict[str, Any], tensors: Tensors) -> None:
+        """Go on, with the same configuration, from what `state` returned."""
+        self.learner.restore(counters, tensors)
+        self.iteration, self.actual_steps = counters["iteration"], counters["actual_steps"]
+        for imagination in self.imaginations:
+            imagination.restore(counters[imagination.name], under(f"{imagination.name}/", tensors))
+
+
+@dataclass(frozen=True)
+class Iteration:
+    """What one iteration did: Algorithm 1, once around."""
+
+    number: int
+    """from 1"""
+    episodes: Driven
+    actual_steps: int
+    """of all iterations so far"""
+    virtual_steps: int
+    """of all iterations so far"""
+    virtual: Sequence[dict[str, Any]]
+    """what there is to say of the virtual environment of each task; empty without one"""
+    log: dict[str, float]
+    """what the learner says about its update"""
+    seconds: dict[str, float]
+    """wall time of each part"""
+
+
+def begin(
+    tasks: Sequence[Task],
+    policy: PolicySettings,
+    learner: LearnerSettings,
+    virtual: VirtualSettings,
+    seed: int,
+) -> Training:
+    """Initialise pi_theta, the value network, T and an empty D_a (lines 1 and 2); pi_H is the tasks'."""
+    imaginations = []
+    if virtual.virtual_ratio > 0:
+        imaginations = [Imagination(virtual, task, policy, seed, index) for index, task in enumerate(tasks)]
+    inputs = observation_size(policy.observe, tasks[0].expert)
+    critic_inputs = 0
+    if policy.critic_sees_road:  # and, of several, which it is: see for_critic
+        critic_inputs = sum(len(task.scenario.drawn_ranges) for task in tasks)
+        critic_inputs += len(tasks) if len(tasks) > 1 else 0
+    spec = AgentSpec(inputs, critic_inputs, tasks[0].scenario.action_limit, policy, seed)
+    return Training(tasks, policy, seed, make_learner(learner, spec), imaginations)
+
+
+def algorithm_1(
+    training: Training,
+    budget: int,
+    collect: Callable[[Network, int], Driven],
+    validate: Callable[[Iteration], Validated],
+    write: Callable[[Iteration, Validated], None],
+) -> None:
+    """Learn until `budget` actual steps were made in all; a stop loses at most the running iteration.
+
+    Args:
+        training: where to begin; it goes on in place.
+        budget: actual steps, those of the iterations before included.
+        collect: (pi_theta, iteration) -> the episodes of an iteration, driven with exploration.
+        validate: judges the policy as it is now, where it is time to, and keeps it if it is the best.
+        write: writes progress and a checkpoint: what an iteration did, what `validate` says, and the state
+            of `training`.
+
+    Raises:
+        UnjamError: an observation, a reward or a parameter is not finite; it names the first.
+    """
+    learner, imaginations = training.learner, training.imaginations
+    while training.actual_steps < budget:
+        timed_parts = ("actual", "fit", "imagine", "update") if imaginations else ("actual", "update")
+        seconds: dict[str, float] = dict.fromkeys(timed_parts, 0.0)
+
+        # Line 4: collect transitions from the actual environment using pi_theta and pi_H, ...
+        with _timed(seconds, "actual"):
+            network = learner.exploring_network(training.actual_steps)
+            episodes = collect(network, training.iteration + 1)
+        training.iteration += 1
+        training.actual_steps += sum(episode.steps for driven in episodes for episode in driven)
+        actual = actual_experience(training, episodes)
+        if training.iteration == 1:
+            learner.measure_units(actual)
+        some = torch.as_tensor(actual.observations[:: -(-len(actual.rewards) // COMPARED_ROWS)])
+        before = learner.gaussians(some)
+
+        # ... and add them to D_a. Line 5: train T on D_a. Line 6: eps_m gives the rollout length k*.
+        for imagination, driven in zip(imaginations, episodes, strict=False):  # none: model-free
+            with _timed(seconds, "fit"):
+                imagination.learn(driven, training.iteration)
+
+        plan = plan_updates(training)
+        for with_actual, part, parts in plan:
+            # Line 7: collect virtual transitions using T, pi_theta as it is now, and pi_H: D_v.
+            virtual = None
+            if parts:
+                with _timed(seconds, "imagine"):
+                    virtual = virtual_experience(training, part, parts)
+                if virtual is None and not with_actual:
+                    continue
+            # Line 8: update pi_theta and its value network with D_a and D_v.
+            seed_iteration(training.seed, training.iteration)
+            given = actual if with_actual else None
+            with _timed(seconds, "update"):
+                try:
+                    learner.learn(Update(given, virtual, 1.0 / len(plan), training.actual_steps))
+                finally:  # torch, too, complains of a distribution with such a parameter
+                    learner.check_parameters(training.iteration)
+
+        log = learner.log()
+        eps_pi = policy_distance(before, learner.gaussians(some))
+        log |= {"eps_pi_mean": float(eps_pi.mean()), "eps_pi_max": float(eps_pi.max())}
+        for imagination in imaginations:
+            imagination.facts["bound"] = imagination.bound(log["eps_pi_max"], learner.gamma)
+
+        # Line 9: until the policy performs well in the actual environment; the best one is kept.
+        facts = [imagination.facts for imagination in imaginations]
+        virtual_steps = sum(imagination.steps for imagination in imaginations)
+        done = Iteration(
+            training.iteration, episodes, training.actual_steps, virtual_steps, facts, log, seconds
+        )
+        write(done, validate(done))
+
+
+def plan_updates(training: Training) -> list[tuple[bool, int, int]]:
+    """Return the updates of this iteration: (with actual rows, which part of the virtual rows, of how many).
+
+    All rows at once; or first the actual ones, then parts of virtual ones alone, each of the policy that the
+    part before has made. Of no parts are those that learn from actual rows alone.
+    """
+    only_actual = (True, 0, 0)
+    if not training.imaginations or not training.learner.learns(training.actual_steps):
+        return [only_actual]
+    settings = training.imaginations[0].settings
+    if settings.update == "union":
+        return [(True, 0, 1)]
+    return [only_actual, *((False, part, settings.updates) for part in range(settings.updates))]
+
+
+def actual_experience(training: Training, episodes: Driven) -> Experience:
+    """Return what was driven as experience; raise `UnjamError` where some of it is not finite."""
+    found = []
+    for index, (task, driven) in enumerate(zip(training.tasks, episodes, strict=True)):
+        sees_road = training.policy.critic_sees_road
+        pairs = [
+            (trajectory, task.scenario.drawn_scaled(episode.drawn) if sees_road else ())
+            for episode in driven
+            for trajectory in episode.trajectories
+        ]
+        of_task = experience_of([trajectory for trajectory, _ in pairs], [extra for _, extra in pairs])
+        found.append(for_critic(training, of_task, index))
+    joined = join(found)
+    for name in ("observations", "rewards"):
+        if not np.isfinite(getattr(joined, name)).all():
+            raise UnjamError(f"learner: {name} of iteration {training.iteration} are not finite")
+    return joined
+
+
+def virtual_experience(training: Training, part: int, parts: int) -> Experience | None:
+    """Return one of `parts` of what the policy as it is now does in the virtual environments, if anything."""
+    network, found = training.learner.network(), []
+    for index, imagination in enumerate(training.imaginations):
+        of_task = imagination.imagine(network, training.iteration, part, parts)
+        if of_task is not None:
+            found.append(for_critic(training, of_task, index))
+    return join(found) if found else None
+
+
+def for_critic(training: Training, found: Experience, index: int) -> Experience:
+    """Return experience of task `index` with all that the critic sees where there are several tasks.
+
+    That is: what each task draws, zeros for the other tasks', and a number per task that says which it is.
+    """
+    if len(training.tasks) == 1 or not training.policy.critic_sees_road:
+        return found
+    drawn = [len(task.scenario.drawn_ranges) for task in training.tasks]
+    inputs, which = training.learner.spec.inputs, np.eye(len(drawn))[index]
+
+    def wide(seen: Float32) -> Float32:
+        before, after = (np.zeros((len(seen), sum(part))) for part in (drawn[:index], drawn[index + 1 :]))
+        parts = [seen[:, :inputs], before, seen[:, inputs:], after, np.tile(which, (len(seen), 1))]
+        return np.hstack(parts).astype(np.float32)
+
+    return replace(
+        found, observations=wide(found.observations), last_observations=wide(found.last_observations)
+    )
+
+
+def seed_iteration(run_seed: int, iteration: int) -> None:
+    """Seed every generator that an update uses, from the run's seed and the iteration alone.
+
+    So a run that goes on from a checkpoint draws what the uninterrupted one would have drawn.
+    """
+    torch_seed, numpy_seed = np.random.SeedSequence([run_seed, iteration, 1]).generate_state(2)
+    torch.manual_seed(int(torch_seed))
+    np.random.seed(int(numpy_seed))
+
+
+@contextmanager
+def _timed(seconds: dict[str, float], part: str) -> Iterator[None]:
+    started = time.perf_counter()
+    yield
+    seconds[part] += time.perf_counter() - started

@@ -1,0 +1,61 @@
+"""TD3: a deterministic policy that explores with noise of a fixed size, and a pair of critics.
+
+Source: Fujimoto, van Hoof and Meger 2018, Addressing function approximation error in actor-critic methods.
+"""
+
+from typing import cast
+
+import stable_baselines3
+import torch
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.td3.policies import Actor, TD3Policy
+from torch import Tensor, nn
+from torch.distributions import Normal
+
+from unjam.drivers.network import Network
+from unjam.learners.learner import AgentSpec, network_layers
+from unjam.learners.sac import ActorView, OffPolicy, OffPolicyResidual
+from unjam.learners.settings import TD3Settings
+
+
+class DeterministicResidualPolicy(OffPolicyResidual, TD3Policy):
+    """SB3's policy of TD3 with a residual that is zero at the start: the actor's last layer is."""
+
+    def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> Actor:
+        """Return the actor, which sees the first `inputs` numbers."""
+        actor = super().make_actor(ActorView(self.observation_space, self.inputs))
+        last = cast(nn.Linear, actor.mu[-2])  # before the tanh
+        nn.init.zeros_(last.weight)
+        nn.init.zeros_(last.bias)
+        return actor
+
+    @property
+    def exploration_std(self) -> float:
+        """Standard deviation of the exploration noise [m/s2]."""
+        return self.settings.exploration_std * self.authority / self.settings.authority
+
+    def network(self) -> Network:
+        """Return the NumPy twin: the same residual to 1e-6, with the exploration noise beside it."""
+        return Network(network_layers(self.actor.mu), self.authority, self.exploration_std)
+
+
+class TD3(OffPolicy):
+    """Twin delayed deep deterministic policy gradient from whole episodes."""
+
+    def __init__(self, spec: AgentSpec, settings: TD3Settings) -> None:
+        super().__init__(
+            spec,
+            settings,
+            stable_baselines3.TD3,
+            DeterministicResidualPolicy,
+            policy_delay=settings.policy_delay,
+            target_policy_noise=settings.target_noise,
+            target_noise_clip=settings.target_noise_clip,
+        )
+
+    def gaussians(self, observations: Tensor) -> Normal:
+        """Return the residual and the standard deviation of its exploration noise [m/s2]."""
+        policy = self.sb3.policy
+        with torch.no_grad():
+            mean = policy.authority * policy.actor(observations).squeeze(1)
+        return Normal(mean, torch.full_like(mean, policy.exploration_std))

@@ -1,0 +1,208 @@
+"""TRPO and PPO: learners from the rows of the newest policy alone, and the policy that they share."""
+
+import math
+from typing import Any, cast
+
+import sb3_contrib
+import stable_baselines3
+import torch
+from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.torch_layers import create_mlp
+from torch import Tensor, nn
+from torch.distributions import Normal
+
+from unjam.drivers.network import Network
+from unjam.learners.experience import Experience, discounted_returns, fill_rollout_buffer, join
+from unjam.learners.learner import AgentSpec, Learner, Update, network_layers
+from unjam.learners.settings import PolicySettings, PPOSettings, TRPOSettings
+
+SIZED_LATER = 2
+"""stands for the size of rollout buffer and batch until an iteration says how many rows it has"""
+
+
+class BoundedTanh(nn.Module):
+    """`authority * tanh(x)`: keeps the mean of the residual within its bounds (paper, section 3.3.2)."""
+
+    def __init__(self, authority: float) -> None:
+        super().__init__()
+        self.authority = authority
+
+    def forward(self, features: Tensor) -> Tensor:
+        """Return the bounded mean, of the shape of `features`."""
+        return self.authority * torch.tanh(features)
+
+
+class ScaledValue(nn.Module):
+    """A value head in the units of the returns: `mean + std * linear(x)`, with fixed mean and std."""
+
+    def __init__(self, inputs: int) -> None:
+        super().__init__()
+        self.linear = nn.Linear(inputs, 1)
+        self.scale: Tensor
+        self.register_buffer("scale", torch.tensor([0.0, 1.0]))
+
+    def forward(self, features: Tensor) -> Tensor:
+        """Return the value, shape (n, 1)."""
+        return self.scale[0] + self.scale[1] * self.linear(features)
+
+
+class ActorAndCritic(nn.Module):
+    """Hidden layers of both networks; the critic may see more than the actor.
+
+    SB3 hands both the same vector: what the actor sees, then what the critic alone sees.
+    """
+
+    def __init__(self, inputs: int, critic_inputs: int, hidden: tuple[int, ...]) -> None:
+        super().__init__()
+        self.inputs = inputs
+        self.policy_net = nn.Sequential(*create_mlp(inputs, -1, list(hidden)))  # -1: no output layer
+        # TRPO tells the critic by `value` in its name.
+        self.value_net = nn.Sequential(*create_mlp(inputs + critic_inputs, -1, list(hidden)))
+        self.latent_dim_pi = self.latent_dim_vf = hidden[-1]
+
+    def forward(self, features: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the last hidden layers of actor and critic."""
+        return self.forward_actor(features), self.forward_critic(features)
+
+    def forward_actor(self, features: Tensor) -> Tensor:
+        """Return the actor's last hidden layer."""
+        return self.policy_net(features[:, : self.inputs])
+
+    def forward_critic(self, features: Tensor) -> Tensor:
+        """Return the critic's last hidden layer."""
+        return self.value_net(features)
+
+
+class ResidualPolicy(ActorCriticPolicy):
+    """SB3's actor-critic policy with a bounded mean that is zero at the start.
+
+    The last layer of the actor starts at zero, so that the full policy starts as exactly the expert.
+    """
+
+    def __init__(
+        self, *arguments: Any, settings: PolicySettings, inputs: int, action_limit: float, **named: Any
+    ) -> None:
+        self.settings = settings
+        self.inputs = inputs
+        self.authority = settings.authority * action_limit
+        super().__init__(*arguments, log_std_init=math.log(settings.exploration_std * action_limit), **named)
+
+    def _build_mlp_extractor(self) -> None:
+        critic_inputs = self.features_dim - self.inputs
+        self.mlp_extractor = ActorAndCritic(self.inputs, critic_inputs, self.settings.hidden)  # pyright: ignore[reportAttributeAccessIssue]
+
+    def _build(self, lr_schedule: Any) -> None:
+        super()._build(lr_schedule)
+        last = nn.Linear(self.mlp_extractor.latent_dim_pi, 1)
+        nn.init.zeros_(last.weight)
+        nn.init.zeros_(last.bias)
+        self.action_net = nn.Sequential(last, BoundedTanh(self.authority))
+        self.value_net = ScaledValue(self.mlp_extractor.latent_dim_vf)  # pyright: ignore[reportAttributeAccessIssue]
+        nn.init.orthogonal_(self.value_net.linear.weight)
+        nn.init.zeros_(self.value_net.linear.bias)
+        if not self.settings.learn_exploration:
+            log_std = self.log_std.detach()
+            del self.log_std
+            self.register_buffer("log_std", log_std)
+        self.optimizer = self.optimizer_class(self.parameters(), lr=lr_schedule(1), **self.optimizer_kwargs)  # pyright: ignore[reportCallIssue]
+
+    def set_rates(self, actor: float, critic: float) -> None:
+        """Give actor and critic learning rates of their own, in a new optimiser."""
+        groups: dict[bool, list[nn.Parameter]] = {False: [], True: []}
+        for name, parameter in self.named_parameters():
+            groups["value" in name].append(parameter)
+        self.optimizer = torch.optim.Adam(
+            [{"params": groups[False], "lr": actor}, {"params": groups[True], "lr": critic}],
+            eps=1e-5,
+            fused=True,  # see `unjam.kernels`
+        )
+
+    def scale_value(self, mean: float, std: float) -> None:
+        """Fix the units of the value head."""
+        self.value_net.scale.copy_(torch.tensor([mean, std]))  # pyright: ignore[reportCallIssue]
+
+    def network(self) -> Network:
+        """Return the NumPy twin: the same residual to 1e-6, and the same exploration noise."""
+        layers = network_layers(nn.Sequential(self.mlp_extractor.policy_net, self.action_net))  # pyright: ignore[reportArgumentType]
+        return Network(layers, self.authority, float(torch.exp(self.log_std.detach()).item()))
+
+
+class OnPolicy(Learner):
+    """What learners share that learn from the rows of the current policy alone."""
+
+    def measure_units(self, actual: Experience) -> None:
+        """Scale the value head by the returns of actual rows."""
+        if self.spec.policy.normalise_value:
+            returns = discounted_returns(actual, self.gamma)
+            self.sb3.policy.scale_value(float(returns.mean()), float(max(returns.std(), 1e-3)))
+
+    def gaussians(self, observations: Tensor) -> Normal:
+        """Return mean and standard deviation of the residual."""
+        with torch.no_grad():
+            normal = cast(Normal, self.sb3.policy.get_distribution(observations).distribution)
+        return Normal(normal.mean.squeeze(1), normal.stddev.squeeze(1))
+
+    def learn(self, update: Update) -> None:
+        """Update policy and value network with actual and virtual rows together."""
+        self.fill(join([part for part in (update.actual, update.virtual) if part is not None]))
+        self.sb3.train()
+
+    def fill(self, rows: Experience) -> None:
+        """Put rows into the rollout buffer, in place of those before."""
+        fill_rollout_buffer(self.sb3.rollout_buffer, self.sb3.policy, rows)
+
+
+class TRPO(OnPolicy):
+    """Trust region policy optimisation from whole episodes."""
+
+    def __init__(self, spec: AgentSpec, settings: TRPOSettings) -> None:
+        super().__init__(
+            spec,
+            sb3_contrib.TRPO,
+            ResidualPolicy,
+            # SB3 drops its own eps when given arguments for the optimiser. Fused: see `unjam.kernels`.
+            {"optimizer_kwargs": {"eps": 1e-5, "weight_decay": settings.value_l2, "fused": True}},
+            learning_rate=settings.critic_rate,
+            n_steps=settings.critic_batch,  # the buffer takes the size of the episodes
+            batch_size=settings.critic_batch,
+            gamma=settings.gamma,
+            gae_lambda=settings.gae_lambda,
+            target_kl=settings.target_kl,
+            cg_damping=settings.cg_damping,
+            cg_max_steps=settings.cg_steps,
+            n_critic_updates=settings.critic_epochs,
+        )
+
+
+class PPO(OnPolicy):
+    """Proximal policy optimisation from whole episodes."""
+
+    def __init__(self, spec: AgentSpec, settings: PPOSettings) -> None:
+        super().__init__(
+            spec,
+            TwoRatesPPO,
+            ResidualPolicy,
+            n_steps=SIZED_LATER,
+            batch_size=SIZED_LATER,
+            n_epochs=settings.epochs,
+            gamma=settings.gamma,
+            gae_lambda=settings.gae_lambda,
+            clip_range=settings.clip,
+            # SB3 clips the gradients of actor and critic together; they share no weight, and the critic's
+            # gradient, in the units of returns, would leave nothing of the actor's.
+            max_grad_norm=math.inf,
+        )
+        self._minibatches = settings.minibatches
+        self.sb3.policy.set_rates(settings.actor_rate, settings.critic_rate)
+
+    def fill(self, rows: Experience) -> None:
+        """Put rows into the rollout buffer, and say how many of them make a minibatch."""
+        super().fill(rows)
+        self.sb3.batch_size = math.ceil(len(rows.rewards) / self._minibatches)
+
+
+class TwoRatesPPO(stable_baselines3.PPO):
+    """SB3's PPO, with the rates of the policy's optimiser left as they are."""
+
+    def _update_learning_rate(self, optimizers: Any) -> None:
+        """Do nothing: SB3 would set one rate for actor and critic."""

@@ -1,0 +1,108 @@
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tests.learners.task import INPUTS, Toy
+from tests.learners.test_trpo_ppo import random_rows, shake
+from unjam.learners.learner import policy_spaces
+from unjam.learners.settings import PolicySettings, TD3Settings
+from unjam.learners.td3 import DeterministicResidualPolicy
+
+torch.set_num_threads(1)  # more would fight for the cores over matrices of this size
+
+
+def make_policy(
+    settings: PolicySettings | None = None,
+    inputs: int = 5,
+    critic_inputs: int = 0,
+    action_limit: float = 1.0,
+) -> DeterministicResidualPolicy:
+    settings = settings or PolicySettings()
+    return DeterministicResidualPolicy(
+        *policy_spaces(inputs, critic_inputs, settings.authority * action_limit),
+        lambda _: 1e-3,
+        settings=settings,
+        inputs=inputs,
+        action_limit=action_limit,
+    )
+
+
+def residual_of(policy: DeterministicResidualPolicy, rows: np.ndarray) -> np.ndarray:
+    """The deterministic residual [m/s2], as SB3 unscales it from [-1, 1]."""
+    with torch.no_grad():
+        return policy.unscale_action(policy._predict(torch.as_tensor(rows)).numpy())[:, 0]
+
+
+@pytest.mark.parametrize(("std", "authority"), [(0.1, 1.0), (0.3, 0.5)])
+def test_a_fresh_policy_adds_nothing_but_noise_of_the_asked_size(std: float, authority: float) -> None:
+    policy = make_policy(PolicySettings(exploration_std=std, authority=authority), action_limit=2.0)
+    network, rows = policy.network(), random_rows(200, 5)
+    assert (residual_of(policy, rows) == 0.0).all()
+    assert (network(rows.astype(float)) == 0.0).all()
+    noise = np.random.default_rng(0).normal(size=len(rows))
+    np.testing.assert_allclose(network.explore(rows.astype(float), noise), 2.0 * std * noise, atol=1e-12)
+
+
+@given(
+    seed=st.integers(0, 2**31),
+    inputs=st.integers(1, 9),
+    hidden=st.lists(st.integers(1, 64), min_size=1, max_size=3),
+    authority=st.floats(0.1, 2.0),
+    rows=st.integers(1, 40),
+)
+def test_the_numpy_twin_gives_the_residual_of_the_torch_policy(
+    seed: int, inputs: int, hidden: list[int], authority: float, rows: int
+) -> None:
+    policy = make_policy(PolicySettings(hidden=tuple(hidden), authority=authority), inputs, critic_inputs=2)
+    shake(policy.actor, seed)
+    seen = random_rows(rows, inputs + 2, seed)
+    found = policy.network()(seen[:, :inputs].astype(float))
+    np.testing.assert_allclose(found, residual_of(policy, seen), rtol=0, atol=1e-6)
+
+
+def test_targets_start_as_what_they_follow() -> None:
+    policy, rows = make_policy(critic_inputs=1), torch.as_tensor(random_rows(5, 6))
+    action = torch.ones(5, 1)
+    assert torch.equal(policy.actor(rows), policy.actor_target(rows))
+    for found, target in zip(policy.critic(rows, action), policy.critic_target(rows, action), strict=True):
+        assert torch.equal(found, target)
+
+
+def test_td3_learns_nothing_before_its_start_is_driven_and_keeps_its_noise() -> None:
+    settings = TD3Settings(start_steps=1700, updates_per_step=0.02, batch=8)
+    toy = Toy(PolicySettings(hidden=(16,), exploration_std=0.1), settings, "td3").learn(4)
+    updates = [entry.log.get("n_updates", 0.0) for entry in toy.iterations]
+    assert updates == [0.0, 0.0, 48.0, 64.0]  # 800 actual steps in each iteration
+    assert [network.exploration_std for network in toy.networks] == pytest.approx([0.1] * 4)
+    assert (toy.networks[2](np.ones((3, INPUTS))) == 0.0).all()
+
+
+def test_the_policy_is_updated_once_for_so_many_updates_of_its_critics() -> None:
+    settings = TD3Settings(start_steps=0, updates_per_step=0.01, batch=8, policy_delay=4)
+    tensors = Toy(settings=settings, agent="td3").learn(1).parameters()
+    steps = {part: int(tensors[f"{part}.optimizer/0/step"]) for part in ("actor", "critic")}
+    assert steps == {"actor": 2, "critic": 8}
+
+
+def test_eps_pi_is_that_of_the_exploration_noise_about_the_residual() -> None:
+    toy = Toy(agent="td3").learn(2)
+    seen = torch.as_tensor(random_rows(20, INPUTS + 1))
+    noise = toy.learner.gaussians(seen)
+    mean, std = noise.mean, noise.stddev
+    network = toy.learner.network()
+    np.testing.assert_allclose(mean.numpy(), network(seen[:, :INPUTS].numpy().astype(float)), atol=1e-6)
+    assert set(std.tolist()) == {np.float32(network.exploration_std)}
+
+
+def test_settings_reach_td3() -> None:
+    settings = TD3Settings(gamma=0.9, tau=0.1, rate=0.02, batch=33, buffer_rows=77, policy_delay=3)
+    learner: Any = Toy(settings=settings, agent="td3").learner.sb3
+    assert (learner.gamma, learner.tau, learner.batch_size, learner.policy_delay) == (0.9, 0.1, 33, 3)
+    assert (learner.target_policy_noise, learner.target_noise_clip) == (0.2, 0.5)
+    assert learner.replay_buffer.buffer_size == 77
+    optimisers = (learner.actor.optimizer, learner.critic.optimizer)
+    assert {optimiser.param_groups[0]["lr"] for optimiser in optimisers} == {0.02}

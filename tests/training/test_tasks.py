@@ -1,0 +1,164 @@
+"""Training on several roads at once."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from tests.training.test_run import Stop, collected, learn_with, outcome, progress, small_config, stop_after
+from unjam.controller import load_controller
+from unjam.drivers import PISaturation, ResidualDriver
+from unjam.errors import InputError
+from unjam.learners.algorithm_1 import actual_experience
+from unjam.learners.settings import AGENTS
+from unjam.training.config import RunConfig, load_config, to_toml
+from unjam.training.folder import check_possible, read_config
+from unjam.training.train import Trainer, train
+from unjam.worlds.workers import Workers
+
+torch.set_num_threads(1)  # as a training does
+
+SHORT = {"road": {"length": [90, 100], "vehicles": 6}, "name": "short"}
+MIXTURE: list[dict[str, Any]] = [{"weight": 2.0}, SHORT]
+VIRTUAL = {"virtual__members": 2, "virtual__epochs": 2, "virtual__hidden": [8]}
+
+
+def mixture(**changes: Any) -> RunConfig:
+    return small_config(**{"tasks": MIXTURE, **VIRTUAL, **changes})
+
+
+def test_what_a_task_leaves_out_is_the_runs_own() -> None:
+    config = mixture(expert="pi:window=30", reward="eq16", tasks=[*MIXTURE, {"scenario": "ring-warm"}, {}])
+    roads = config.roads()
+    assert list(roads) == ["ring", "short", "ring-warm", "ring-2"]
+    assert {road.expert for road in roads.values()} == {"pi:window=30"}
+    assert roads["short"].road == {"length": [90, 100], "vehicles": 6, "horizon": 100}
+    tasks = config.make_tasks()
+    assert [task.weight for task in tasks] == [2.0, 1.0, 1.0, 1.0]
+    assert [task.reward for task in tasks] == ["eq16"] * 4
+    assert [task.scenario.warmup for task in tasks] == [0, 0, 750, 0]
+
+
+def test_one_road_is_a_list_of_one() -> None:
+    config = small_config()
+    assert config.roads() == {"": config}
+    (task,) = config.make_tasks()
+    assert (task.scenario, task.expert, task.name) == (config.make_scenario(), PISaturation(), "")
+
+
+def test_a_mixture_survives_being_written(tmp_path: Path) -> None:
+    (tmp_path / "config.toml").write_text(to_toml(mixture()))
+    assert load_config(tmp_path / "config.toml") == mixture()
+
+
+@pytest.mark.parametrize(
+    ("task", "words"),
+    [
+        (
+            {"expert": "follower-stopper"},
+            "tasks: on ring-2 the network would see something else than on ring",
+        ),
+        (
+            {"road": {"action_limit": 2.0}},
+            "tasks: an action limit of 2 m/s2 on ring-2 is not allowed; allowed: 1",
+        ),
+        ({"expert": "magic"}, "driver: 'magic'"),
+        ({"reward": "magic"}, "reward: 'magic'"),
+    ],
+)
+def test_roads_that_do_not_go_together_are_refused_in_one_line(task: dict[str, Any], words: str) -> None:
+    with pytest.raises(InputError) as caught:
+        check_possible(mixture(tasks=[{}, task]))
+    assert str(caught.value).startswith(words)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "agent", [pytest.param(name, marks=pytest.mark.slow) if name != "td3" else name for name in AGENTS]
+)
+def test_a_mixture_that_was_stopped_ends_as_if_it_had_not_been(
+    agent: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config, places = mixture(agent=agent), [tmp_path / "one go", tmp_path / "run"]
+    episodes = collected(monkeypatch)
+    with Workers(1) as workers:
+        learn_with(workers, places[0], config)
+        # 300 steps by weight: two episodes of the first road and one of the other, each with its own seed.
+        drawn = [(episode.seed, episode.drawn["length"]) for episode in episodes]
+        assert [seed for seed, _ in drawn] == [(0, i, n) for i in (1, 2) for n in range(3)]
+        assert [length > 110 for _, length in drawn] == [True, True, False] * 2
+        with pytest.raises(Stop):
+            learn_with(workers, places[1], config, stop_after(1))
+        learn_with(workers, places[1], config, resume=True)
+    for road in ("ring", "short"):
+        found = [
+            (progress(place / road), (place / road / "controller.unjam").read_bytes()) for place in places
+        ]
+        assert found[0] == found[1]
+    found = [outcome_of(place) for place in places]
+    assert found[0] == found[1]
+    assert {"virtual", "virtual-1"} <= found[0][0].keys()
+
+
+def outcome_of(folder: Path) -> tuple[Any, ...]:
+    (folder / "controller.unjam").touch()  # each road has its own
+    return outcome(folder)
+
+
+def test_progress_is_of_all_roads_and_of_each(tmp_path: Path) -> None:
+    with Workers(1) as workers:
+        learn_with(workers, tmp_path / "run", mixture())
+    for number, row in enumerate(progress(tmp_path / "run")):
+        assert list(row["tasks"]) == ["ring", "short"]
+        for name in ("return_mean", "return_expert", "return_validation"):
+            each = [row["tasks"][road][name] for road in ("ring", "short")]
+            assert row[name] == pytest.approx((2 * each[0] + each[1]) / 3)
+            assert each == [progress(tmp_path / "run" / road)[number][name] for road in ("ring", "short")]
+        assert all(found["k_star"] > 0 for found in row["tasks"].values())
+
+
+@pytest.mark.parametrize("sees_road", [True, False])
+def test_the_critic_sees_which_road_it_is_and_what_that_has_drawn(tmp_path: Path, sees_road: bool) -> None:
+    with Workers(1) as workers:
+        trainer = Trainer(tmp_path, mixture(policy__critic_sees_road=sees_road), workers)
+        training = trainer.training
+        episodes = trainer.collect(training.learner.network(), 1)
+        rows = actual_experience(training, episodes)
+    beside = rows.observations[:, training.learner.spec.inputs :]
+    assert training.learner.sb3.observation_space.shape == rows.observations.shape[1:]
+    if not sees_road:
+        assert beside.shape[1] == 0
+        return
+    scaled = [
+        task.scenario.drawn_scaled(driven[-1].drawn)[0]
+        for task, driven in zip(training.tasks, episodes, strict=True)
+    ]
+    np.testing.assert_allclose(beside[0, 1:], [0.0, 1.0, 0.0])
+    np.testing.assert_allclose(beside[-1], [0.0, scaled[1], 0.0, 1.0], rtol=1e-6)
+    np.testing.assert_allclose(beside[19, :2], [scaled[0], 0.0], rtol=1e-6)
+    assert (rows.last_observations[:2, -2:] == [1.0, 0.0]).all()
+
+
+@pytest.mark.usefixtures("without_pictures")
+def test_each_road_is_judged_in_a_folder_of_its_own(tmp_path: Path) -> None:
+    result = train(mixture(), tmp_path / "run")
+    assert (result.rows, result.gain) == ({}, None)
+    assert list(result.roads) == ["ring", "short"]
+    for name, road in result.roads.items():
+        assert road.folder == tmp_path / "run" / name
+        assert list(road.rows) == ["human", "pi", "trained"]
+        assert road.gain is not None
+        assert read_config(road.folder) == mixture().roads()[name]
+        assert json.loads((road.folder / "evaluation.json").read_text())["scenario"] == "ring"
+        with pytest.raises(InputError, match="is one road of a run of several"):
+            train(read_config(road.folder), road.folder, resume=True)
+    networks = [load_controller(road.controller) for road in result.roads.values()]
+    first, second = (driver.network.layers for driver in networks if isinstance(driver, ResidualDriver))
+    for one, other in zip(first, second, strict=True):
+        np.testing.assert_array_equal(one[0], other[0])
+    page = (tmp_path / "run" / "report.html").read_text()
+    assert "short: trained" in page
+    assert "2 results compared" in page
