@@ -1,0 +1,37 @@
+"""The worked examples of docs/architecture.md do what the page says."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+from unjam.drivers.registry import RECIPES
+
+PAGE = (Path(__file__).parents[1] / "docs" / "architecture.md").read_text()
+EXAMPLES = dict(re.findall(r"^### ([^\n]+)\n.*?^```python\n(.*?)^```$", PAGE, flags=re.S | re.M))
+
+
+def test_the_page_works_six_of_the_ten_changes() -> None:
+    assert len(EXAMPLES) == 6
+    table = PAGE.partition("## Ten changes")[2].partition("\nSix of them")[0]
+    assert len(re.findall(r"^\| [^|]+ \| \d \|", table, flags=re.M)) == 10
+
+
+@pytest.mark.parametrize("title", EXAMPLES)
+def test_an_example_of_the_architecture_runs(
+    title: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    before = dict(RECIPES)  # what an example adds is taken away again
+    try:
+        exec(compile(EXAMPLES[title], title, "exec"), {"__name__": "example"})
+    finally:
+        RECIPES.clear()
+        RECIPES.update(before)
+
+
+def test_the_house_has_the_rooms_that_the_page_names() -> None:
+    house = PAGE.partition("## The house")[2].partition("\n## ")[0]
+    named = set(re.findall(r"^\| `(\w+)/`", house, flags=re.M))
+    rooms = {place.parent.name for place in Path(__file__).parents[1].glob("src/unjam/*/__init__.py")}
+    assert named == rooms
