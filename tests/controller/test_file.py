@@ -303,7 +303,7 @@ def test_a_manifest_that_is_none_is_refused(tmp_path: Path, manifest: str) -> No
     refused(written(tmp_path, content))
 
 
-@pytest.mark.parametrize("number", [0, 3, "1", None, [1]])
+@pytest.mark.parametrize("number", [0, 4, "1", None, [1]])
 def test_another_format_is_refused(tmp_path: Path, number: object) -> None:
     content = with_manifest(lambda manifest: manifest.update(format=number))
     assert f"format {number!r} is unknown" in refused(written(tmp_path, content))

@@ -11,6 +11,7 @@ from unjam.drivers.check import random_state
 from unjam.drivers.from_file import FileDriver
 from unjam.drivers.observation import observed
 from unjam.drivers.wrappers import Mixed
+from unjam.tree import leaves
 
 DRIVERS: dict[str, Driver] = {
     "expert": PISaturation(window=20),
@@ -25,7 +26,7 @@ DRIVERS: dict[str, Driver] = {
 @pytest.mark.parametrize("name", DRIVERS)
 def test_memory_is_what_the_driver_starts_with(name: str) -> None:
     driver, said = DRIVERS[name], description(DRIVERS[name])["memory"]
-    memory = driver.initial_memory(1)
+    memory = dict(leaves(driver.initial_memory(1)))
     assert [entry["name"] for entry in said] == list(memory)
     for entry in said:
         first = np.nan if entry["first"] is None else entry["first"]
