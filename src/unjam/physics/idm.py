@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import fields
+from functools import cached_property
 from math import sqrt
 from typing import NamedTuple
 
@@ -29,6 +30,16 @@ class IDMParameters:
     minimum_gap: Positive = 2.0
     """s0 [m], bumper to bumper at standstill"""
 
+    @cached_property
+    def braking(self) -> float:
+        """2 sqrt(a b) of Eq. 6 [m/s2]; kept, for a simulator asks for it in every step."""
+        return twice_root(self.max_acceleration, self.comfortable_deceleration)
+
+
+def twice_root(one: Array, other: Array) -> Array:
+    """Return twice the geometric mean of both."""
+    return 2.0 * square_root(one * other)
+
 
 class IDMRows(NamedTuple):
     """The parameters of many drivers at once: as `IDMParameters`, arrays that broadcast with the states."""
@@ -39,6 +50,11 @@ class IDMRows(NamedTuple):
     comfortable_deceleration: Array
     exponent: Array
     minimum_gap: Array
+
+    @property
+    def braking(self) -> Array:
+        """2 sqrt(a b) of Eq. 6 [m/s2]."""
+        return twice_root(self.max_acceleration, self.comfortable_deceleration)
 
 
 PAPER_IDM = IDMParameters()
@@ -66,8 +82,7 @@ def desired_gap(speed: Array, approach_rate: Array, parameters: IDMParameters | 
         Desired bumper-to-bumper gap [m], same shape.
     """
     p = parameters
-    braking = 2.0 * square_root(p.max_acceleration * p.comfortable_deceleration)
-    return p.minimum_gap + at_least(speed * p.time_headway + speed * approach_rate / braking, 0.0)
+    return p.minimum_gap + at_least(speed * p.time_headway + speed * approach_rate / p.braking, 0.0)
 
 
 def idm_acceleration(

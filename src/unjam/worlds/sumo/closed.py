@@ -74,6 +74,7 @@ class ClosedTraffic(Traffic[ClosedRoad]):
         """Let `ids` be those whose driving has noise, from the next step on."""
         self._human_ids = ids
         self._human_mask = [name in ids for name in self.road.vehicle_ids]
+        self._human_places = [place for place, human in enumerate(self._human_mask) if human]
         self._noise_rows: list[list[float]] = []
 
     def _forget(self) -> None:
@@ -174,12 +175,15 @@ class ClosedTraffic(Traffic[ClosedRoad]):
 
     def _command_people(self) -> None:
         """Ask for the speeds that people want."""
-        people = list(compress(range(len(self._speeds)), self._human_mask))
-        noise = [0.0] * len(self._speeds)
-        if self.scenario.noise > 0:
-            noise = self._next_noise()
+        noise = self._next_noise() if self.scenario.noise > 0 else [0.0] * len(self._speeds)
         wanted = wanted_speeds(
-            self.scenario, self.road, self._drivers, people, self._speeds, self._near_positions, noise
+            self.scenario,
+            self.road,
+            self._drivers,
+            self._human_places,
+            self._speeds,
+            self._near_positions,
+            noise,
         )
         self._simulation.command_speeds(self._human_ids, wanted)
 

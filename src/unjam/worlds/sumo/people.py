@@ -43,23 +43,28 @@ def wanted_speeds(
         noise: by how much noise changes each speed [m/s], by place.
     """
     step, loop, count = scenario.simulation_step, road.loop_length, len(speeds)
-    population = scenario.calibrated
+    population, crossings = scenario.calibrated, road.crossings
     wanted: list[float] = [LEAVE_TO_SUMO] * len(people)
-    seen: list[tuple[int, float, float, float]] = []
-    accelerations: list[float] = []
+    seen: list[tuple[int, float, float, float, float]] = []
     for index, place in enumerate(people):
         position = positions[place]
         on_road = position % loop
-        if any(start <= on_road < end for start, end in road.crossings):
-            continue
-        ahead = place + 1 if place + 1 < count else 0
-        gap = at_least(gap_on_loop(position, positions[ahead], loop, VEHICLE_LENGTH), SMALLEST_GAP)
-        speed = speeds[place]
-        accelerations.append(idm_acceleration(speed, speeds[ahead], gap, drivers[place]))
-        seen.append((index, speed, speeds[ahead], gap))
-    if population is not None and seen:
+        for start, end in crossings:  # any() would cost as much as the rest
+            if start <= on_road < end:
+                break
+        else:
+            ahead = place + 1 if place + 1 < count else 0
+            gap = at_least(gap_on_loop(position, positions[ahead], loop, VEHICLE_LENGTH), SMALLEST_GAP)
+            speed = speeds[place]
+            acceleration = idm_acceleration(speed, speeds[ahead], gap, drivers[place])
+            if population is None:
+                wanted[index] = at_least(speed + acceleration * step + noise[place], 0.0)
+            else:
+                seen.append((index, acceleration, speed, speeds[ahead], gap))
+    if seen:  # a population's network is asked once for all
         _, *columns = (np.array(column, np.float64) for column in zip(*seen, strict=True))
-        accelerations = as_calibrated(population, np.array(accelerations), *columns).tolist()
-    for (index, speed, *_), acceleration in zip(seen, accelerations, strict=True):
-        wanted[index] = at_least(speed + acceleration * step + noise[people[index]], 0.0)
+        for (index, _, speed, *_), acceleration in zip(
+            seen, as_calibrated(population, *columns).tolist(), strict=True
+        ):
+            wanted[index] = at_least(speed + acceleration * step + noise[people[index]], 0.0)
     return wanted

@@ -7,7 +7,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import redirect_stdout, suppress
 from functools import partial
-from itertools import count, dropwhile
+from itertools import count, dropwhile, starmap
 from pathlib import Path
 from types import ModuleType, TracebackType
 from typing import Any, Literal, Self
@@ -209,8 +209,7 @@ class Simulation:
 
     def command_speeds(self, ids: Iterable[str], speeds: Iterable[float]) -> None:
         """Ask for the speeds that `ids` shall have after the next step [m/s]: plain floats."""
-        for name, speed in zip(ids, speeds, strict=True):
-            self._set_speed(name, speed)
+        _exhaust(starmap(self._set_speed, zip(ids, speeds, strict=True)))
 
     def replace_speeds(self, ids: Iterable[str], speeds: Iterable[float]) -> None:
         """Give `ids` other current speeds [m/s], plain floats: how noise enters."""
