@@ -214,7 +214,7 @@ def _networks(driver: Driver, prefix: str = "") -> dict[str, list[dict[str, Any]
     return own | {
         name: seen
         for below, held in driver.inner.items()
-        for name, seen in _networks(held, prefix + below).items()
+        for name, seen in _networks(held, f"{prefix}{below}.").items()
     }
 
 

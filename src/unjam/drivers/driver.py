@@ -78,14 +78,14 @@ class Driver:
 
     def initial_memory(self, n: int) -> Memory:
         """Return the memory of `n` CAVs before their first step: NumPy arrays of shape (n, ...)."""
-        return {}
+        return {name: held.initial_memory(n) for name, held in self.inner.items()}
 
     def recall(self, memory: Memory, history: LocalState) -> Memory:
         """Return `memory` as if the driver had watched `history` before it took over.
 
         Called once, where a warm-up came before. `history` holds arrays of shape (n, steps), oldest first.
         """
-        return memory
+        return memory | {name: held.recall(memory[name], history) for name, held in self.inner.items()}
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
         """Return the wanted acceleration [m/s2], shape (n,), and the memory after this step.
@@ -111,7 +111,7 @@ class Driver:
 
     @property
     def inner(self) -> dict[str, "Driver"]:
-        """The drivers that it holds, by what the weights of their networks are prefixed with."""
+        """The drivers that it holds, by the names of their memories, which prefix their networks' weights."""
         return {}
 
     @property
@@ -139,10 +139,31 @@ class Driver:
     def arrays(self) -> Arrays:
         """Return the weights of its networks, those of the drivers that it holds with their prefix."""
         return {
-            f"{prefix}{key}": array
-            for prefix, held in self.inner.items()
+            f"{name}.{key}": array
+            for name, held in self.inner.items()
             for key, array in held.arrays().items()
         }
+
+
+class Formula(Driver):
+    """A driver that is written once for arrays, tensors and plain numbers (see `unjam.physics.arrays`)."""
+
+    plain_numbers: ClassVar[bool] = True
+    tensors: ClassVar[bool] = True
+
+
+class Wrapper(Driver):
+    """A driver that drives by those which it holds."""
+
+    @property
+    def tensors(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Whether all that it holds take tensors."""
+        return all(held.tensors for held in self.inner.values())
+
+    @property
+    def needs_loop(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Whether one that it holds must know its place on a closed road."""
+        return any(held.needs_loop for held in self.inner.values())
 
 
 def listed(parameters: dict[str, Any]) -> list[str]:

@@ -1,6 +1,6 @@
 """All drivers by name, and every driver from how it is written down, so that another process can make it."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import fields
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -9,38 +9,22 @@ import numpy as np
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
-from unjam.drivers.acc import ACC, LACC
-from unjam.drivers.bilateral import BCM
-from unjam.drivers.constant import Constant
+from unjam.drivers.car_following import ACC, BCM, IDM, LACC, OVM, Constant, Human
 from unjam.drivers.driver import Driver, Recipe
 from unjam.drivers.follower_stopper import FollowerStopper
 from unjam.drivers.from_file import FileDriver, FileReference, is_file_reference
-from unjam.drivers.idm import IDM, Human
-from unjam.drivers.jam_absorber import JamAbsorber
 from unjam.drivers.network import network_from_arrays
 from unjam.drivers.observation import FeatureName, observation_size
-from unjam.drivers.ovm import OVM
-from unjam.drivers.pacer import Pacer
 from unjam.drivers.pi_saturation import PISaturation
-from unjam.drivers.residual import ResidualDriver
-from unjam.drivers.wrappers import Impaired, Mixed
+from unjam.drivers.residual import EXPERT, ResidualDriver
+from unjam.drivers.road_experts import JamAbsorber, Pacer
+from unjam.drivers.wrappers import INNER, Impaired, Mixed
 from unjam.errors import InputError, wrong
 from unjam.parameters import STRICT, Count, NotNegative, Positive, build, split_parameters
 from unjam.tree import Arrays
 
-DRIVERS: dict[str, type[Driver]] = {
-    "human": Human,
-    "idm": IDM,
-    "pi": PISaturation,
-    "follower-stopper": FollowerStopper,
-    "acc": ACC,
-    "lacc": LACC,
-    "bcm": BCM,
-    "ovm": OVM,
-    "pacer": Pacer,
-    "jam-absorber": JamAbsorber,
-    "constant": Constant,
-}
+_KINDS = (Human, IDM, PISaturation, FollowerStopper, ACC, LACC, BCM, OVM, Pacer, JamAbsorber, Constant)
+DRIVERS: dict[str, type[Driver]] = {kind.name: kind for kind in _KINDS}
 
 
 def driver_names() -> str:
@@ -64,10 +48,6 @@ def named_driver(text: str, time_step: float) -> Driver:
         return FileDriver(reference.path, reference.name, parameters, time_step)
     if name not in DRIVERS:
         raise wrong("driver", name, driver_names())
-    return _make(name, parameters, time_step)
-
-
-def _make(name: str, parameters: dict[str, Any], time_step: float) -> Driver:
     kind = DRIVERS[name]
     if any(field.name == "time_step" for field in fields(kind)):  # pyright: ignore[reportArgumentType]
         parameters = {"time_step": time_step, **parameters}
@@ -88,51 +68,6 @@ class _ResidualRecipe:
     files: list[dict[str, Any]] = Field(default_factory=list)
 
 
-def _named(recipe: Recipe, arrays: Arrays, prefix: str) -> Driver:
-    if recipe["name"] not in DRIVERS:
-        raise wrong("driver recipe", recipe["name"], ", ".join(DRIVERS))
-    return build(DRIVERS[recipe["name"]], recipe["parameters"], f"driver {recipe['name']}")
-
-
-def _from_file(recipe: Recipe, arrays: Arrays, prefix: str) -> Driver:
-    return FileDriver(Path(recipe["path"]), recipe["name"], recipe["parameters"], recipe["time_step"])
-
-
-def _mixed(recipe: Recipe, arrays: Arrays, prefix: str) -> Driver:
-    parts = enumerate(recipe["drivers"])
-    return Mixed(tuple(driver_from_recipe(part, arrays, f"{prefix}{number}.") for number, part in parts))
-
-
-def _impaired(recipe: Recipe, arrays: Arrays, prefix: str) -> Driver:
-    worse = {key: float(recipe[key]) for key in ("delay", "gap_noise", "time_step")}
-    return Impaired(driver_from_recipe(recipe["driver"], arrays, f"{prefix}inner."), **worse)
-
-
-def _residual(recipe: Recipe, arrays: Arrays, prefix: str) -> Driver:
-    found, expert = build(_ResidualRecipe, recipe, "driver recipe"), f"{prefix}expert."
-    own = {
-        name.removeprefix(prefix): array
-        for name, array in arrays.items()
-        if name.startswith(prefix) and not name.startswith(expert)
-    }
-    base = driver_from_recipe(found.expert, arrays, expert)
-    network = network_from_arrays(own, found.authority, found.exploration_std)
-    shown = observation_size(found.parts, base)
-    if network.inputs != shown:
-        raise InputError(f"network: {network.inputs} inputs are not allowed; allowed: {shown}")
-    return ResidualDriver(base, network, found.action_limit, found.parts, found.hold)
-
-
-RECIPES: dict[str, Callable[[Recipe, Arrays, str], Driver]] = {
-    "named": _named,
-    "file": _from_file,
-    "residual": _residual,
-    "mixed": _mixed,
-    "impaired": _impaired,
-}
-"""how each kind of recipe becomes a driver again, the prefix being that of its networks' weights"""
-
-
 def recipe_of(driver: Driver) -> tuple[Recipe, Arrays]:
     """Return the recipe of a driver and the arrays of its networks; `driver_from_recipe` undoes it.
 
@@ -148,11 +83,45 @@ def recipe_of(driver: Driver) -> tuple[Recipe, Arrays]:
 
 
 def driver_from_recipe(recipe: Recipe, arrays: Arrays, prefix: str = "") -> Driver:
-    """Return the driver that `recipe_of` wrote down; raise `InputError` where the recipe is not valid."""
-    kind = recipe.get("kind") if isinstance(recipe, dict) else recipe
-    if kind not in RECIPES:
-        raise wrong("driver recipe", kind, ", ".join(RECIPES))
-    return RECIPES[kind](recipe, arrays, prefix)
+    """Return the driver that `recipe_of` wrote down; raise `InputError` where the recipe is not valid.
+
+    The arrays of its networks begin with `prefix`.
+    """
+
+    def held(recipe: Recipe, name: str) -> Driver:
+        return driver_from_recipe(recipe, arrays, f"{prefix}{name}.")
+
+    match recipe.get("kind") if isinstance(recipe, dict) else recipe:
+        case "named":
+            name = recipe["name"]
+            if name not in DRIVERS:
+                raise wrong("driver recipe", name, ", ".join(DRIVERS))
+            return build(DRIVERS[name], recipe["parameters"], f"driver {name}")
+        case "file":
+            return FileDriver(Path(recipe["path"]), recipe["name"], recipe["parameters"], recipe["time_step"])
+        case "residual":
+            found = build(_ResidualRecipe, recipe, "driver recipe")
+            return _residual(found, held(found.expert, EXPERT), arrays, prefix)
+        case "mixed":
+            return Mixed(tuple(held(part, str(number)) for number, part in enumerate(recipe["drivers"])))
+        case "impaired":
+            worse = {key: float(recipe[key]) for key in ("delay", "gap_noise", "time_step")}
+            return Impaired(held(recipe["driver"], INNER), **worse)
+        case kind:
+            raise wrong("driver recipe", kind, "named, file, residual, mixed, impaired")
+
+
+def _residual(recipe: _ResidualRecipe, expert: Driver, arrays: Arrays, prefix: str) -> Driver:
+    own = {
+        name.removeprefix(prefix): array
+        for name, array in arrays.items()
+        if name.startswith(prefix) and not name.startswith(f"{prefix}{EXPERT}.")
+    }
+    network = network_from_arrays(own, recipe.authority, recipe.exploration_std)
+    shown = observation_size(recipe.parts, expert)
+    if network.inputs != shown:
+        raise InputError(f"network: {network.inputs} inputs are not allowed; allowed: {shown}")
+    return ResidualDriver(expert, network, recipe.action_limit, recipe.parts, recipe.hold)
 
 
 def files_of(recipe: Any) -> list[Recipe]:
