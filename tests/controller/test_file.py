@@ -25,7 +25,7 @@ from unjam.drivers.from_file import FileDriver
 from unjam.drivers.network import network_arrays
 from unjam.drivers.observation import FeatureName, observation_size
 from unjam.drivers.registry import recipe_of
-from unjam.drivers.wrappers import Mixed
+from unjam.drivers.residual import Mixed
 from unjam.errors import InputError
 
 ALL_PARTS: tuple[FeatureName, ...] = (

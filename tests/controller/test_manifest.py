@@ -10,7 +10,7 @@ from unjam.drivers import IDM, Driver, FollowerStopper, LocalState, Pacer, PISat
 from unjam.drivers.check import random_state
 from unjam.drivers.from_file import FileDriver
 from unjam.drivers.observation import observed
-from unjam.drivers.wrappers import Mixed
+from unjam.drivers.residual import Mixed
 
 DRIVERS: dict[str, Driver] = {
     "expert": PISaturation(window=20),

@@ -7,7 +7,7 @@ from tests.controller.test_file import ABOUT, actions, residual, written
 from unjam.controller import controller_bytes, make_driver
 from unjam.drivers import IDM, PISaturation
 from unjam.drivers.from_file import FileDriver
-from unjam.drivers.wrappers import Mixed
+from unjam.drivers.residual import Mixed
 from unjam.errors import InputError
 
 

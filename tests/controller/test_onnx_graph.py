@@ -30,7 +30,7 @@ from unjam.drivers.from_file import FileDriver
 from unjam.drivers.network import Network
 from unjam.drivers.observation import observation_size
 from unjam.drivers.registry import named_driver
-from unjam.drivers.wrappers import Mixed
+from unjam.drivers.residual import Mixed
 from unjam.errors import InputError, MissingPartError
 from unjam.learners.sac import SquashedResidualPolicy
 from unjam.learners.settings import PolicySettings

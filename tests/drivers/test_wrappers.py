@@ -8,7 +8,7 @@ from unjam.controller import make_driver
 from unjam.drivers import IDM, Driver, FollowerStopper, PISaturation, check_driver
 from unjam.drivers.check import random_state
 from unjam.drivers.registry import driver_from_recipe, recipe_of
-from unjam.drivers.wrappers import Impaired, Mixed
+from unjam.drivers.residual import Impaired, Mixed
 from unjam.errors import InputError
 from unjam.scenarios import Merge, Ring
 from unjam.tree import mapped

@@ -7,7 +7,7 @@ from tests.conftest import random_network
 from tests.mock_world import MockWorld
 from unjam.drivers import IDM, Human, LocalState, PISaturation, ResidualDriver
 from unjam.drivers.command import Limits
-from unjam.drivers.wrappers import Impaired, Mixed
+from unjam.drivers.residual import Impaired, Mixed
 from unjam.worlds.drive import Drive, drive
 from unjam.worlds.world import RecordedWorld
 

@@ -128,7 +128,7 @@ class Driver:
         changed = {
             key: value for key, value in parameters.items() if value != default[key] and key != "time_step"
         }
-        return ":".join([self.name, *listed(changed)])
+        return labelled(self.name, changed)
 
     def recipe(self) -> Recipe:
         """Return what it is made from; its networks' weights are `arrays`."""
@@ -152,23 +152,10 @@ class Formula(Driver):
     tensors: ClassVar[bool] = True
 
 
-class Wrapper(Driver):
-    """A driver that drives by those which it holds."""
-
-    @property
-    def tensors(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Whether all that it holds take tensors."""
-        return all(held.tensors for held in self.inner.values())
-
-    @property
-    def needs_loop(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Whether one that it holds must know its place on a closed road."""
-        return any(held.needs_loop for held in self.inner.values())
-
-
-def listed(parameters: dict[str, Any]) -> list[str]:
-    """Return parameters as `key=value,key=value` in a list of one; empty where there are none."""
-    return [",".join(f"{key}={value}" for key, value in parameters.items())] if parameters else []
+def labelled(name: str, parameters: dict[str, Any]) -> str:
+    """Return `name:key=value,key=value`; the name alone where there are no parameters."""
+    values = ",".join(f"{key}={value}" for key, value in parameters.items())
+    return f"{name}:{values}" if values else name
 
 
 def single_row(memory: Memory) -> Memory:

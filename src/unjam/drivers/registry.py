@@ -16,9 +16,8 @@ from unjam.drivers.from_file import FileDriver, FileReference, is_file_reference
 from unjam.drivers.network import network_from_arrays
 from unjam.drivers.observation import FeatureName, observation_size
 from unjam.drivers.pi_saturation import PISaturation
-from unjam.drivers.residual import EXPERT, ResidualDriver
+from unjam.drivers.residual import EXPERT, INNER, Impaired, Mixed, ResidualDriver
 from unjam.drivers.road_experts import JamAbsorber, Pacer
-from unjam.drivers.wrappers import INNER, Impaired, Mixed
 from unjam.errors import InputError, wrong
 from unjam.parameters import STRICT, Count, NotNegative, Positive, build, split_parameters
 from unjam.tree import Arrays

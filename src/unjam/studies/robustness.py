@@ -10,7 +10,7 @@ import pandas as pd
 
 from unjam.controller import make_driver
 from unjam.drivers.driver import Driver
-from unjam.drivers.wrappers import Impaired
+from unjam.drivers.residual import Impaired
 from unjam.files import to_json, write_whole
 from unjam.measures.statistics import paired_difference
 from unjam.studies.study import REFERENCES, ROADS, PlannedRun, Study, StudyFolder, Table
