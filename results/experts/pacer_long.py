@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from unjam.drivers.pacer import Pacer
+from unjam.drivers.road_experts import Pacer
 from unjam.files import to_json, write_whole
 from unjam.manifest import manifest
 from unjam.scenarios.figure_eight import FigureEight

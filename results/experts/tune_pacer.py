@@ -1,4 +1,4 @@
-"""Finds paces for the figure eight; prints the lap times and the paces that `drivers/pacer.py` holds.
+"""Finds paces for the figure eight; prints the lap times and the paces that `drivers/road_experts.py` holds.
 
 Lap times by grid, paces over the lap by the cross-entropy method: candidates are drawn from a normal
 distribution, which then moves to the best of them. Each candidate drives 5,000 steps with seeds that are new
@@ -13,7 +13,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from unjam.drivers.pacer import TUNED, Pacer
+from unjam.drivers.road_experts import TUNED, Pacer
 from unjam.scenarios.figure_eight import FigureEight, loop_length
 from unjam.worlds.record import Episode
 from unjam.worlds.workers import EpisodeTask, Workers

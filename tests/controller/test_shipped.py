@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 import unjam
-from unjam.controller import make_driver
-from unjam.controller.naming import SHIPPED, shipped_file, shipped_names
+from unjam.controller import SHIPPED, make_driver, shipped_file, shipped_names
 from unjam.controller.verify import verify_controller
 from unjam.drivers import ResidualDriver
 from unjam.errors import InputError

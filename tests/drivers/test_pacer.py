@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from unjam.drivers import LocalState, Pacer
-from unjam.drivers.pacer import TUNED
+from unjam.drivers.road_experts import TUNED
 
 
 def state(gap: float, place: float = 0.0, loop: float = 450.0, speed: float = 0.0) -> LocalState:

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from unjam.drivers import PISaturation
-from unjam.drivers.constant import Constant
+from unjam.drivers.car_following import Constant
 from unjam.errors import InputError
 from unjam.learners.settings import AGENTS, PolicySettings, TRPOSettings
 from unjam.parameters import merge

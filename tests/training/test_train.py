@@ -13,7 +13,7 @@ from tests.pictures import empty_pictures
 from tests.training.test_run import STEPS, learn_with, outcome, small_config
 from unjam.controller import load_controller
 from unjam.drivers import ResidualDriver
-from unjam.drivers.constant import Constant
+from unjam.drivers.car_following import Constant
 from unjam.errors import InputError, UnjamError
 from unjam.measures.metrics import METRICS
 from unjam.reports.results import read_progress, read_results

@@ -118,7 +118,7 @@ def drivers(json: JsonOption = False) -> None:
 
       unjam drivers
     """
-    from unjam.controller.naming import SHIPPED, shipped_names
+    from unjam.controller import SHIPPED, shipped_names
     from unjam.drivers.registry import DRIVERS
 
     listed: dict[str, dict[str, Any]] = {}
@@ -144,8 +144,8 @@ def drivers(json: JsonOption = False) -> None:
 
 def _about_shipped(name: str) -> str:
     """Return what a shipped controller is, and what it was measured to do, from its manifest."""
+    from unjam.controller import shipped_file
     from unjam.controller.file import read_controller
-    from unjam.controller.naming import shipped_file
 
     manifest = read_controller(shipped_file(name)).manifest
     expert, metrics, road = manifest["expert"], manifest["metrics"], manifest["run"]["scenario"]

@@ -5,7 +5,66 @@ remembers, how its driver is made), weights in safetensors and, where it was exp
 and an ONNX graph. Nothing in it is ever executed.
 """
 
-from unjam.controller.file import SUFFIX, controller_bytes, load_controller
-from unjam.controller.naming import make_driver
+import re
+from importlib.resources import files
+from pathlib import Path
 
-__all__ = ["SUFFIX", "controller_bytes", "load_controller", "make_driver"]
+from unjam.controller.file import SUFFIX, controller_bytes, load_controller
+from unjam.drivers.driver import Driver
+from unjam.drivers.from_file import is_file_reference
+from unjam.drivers.registry import DRIVERS, named_driver
+from unjam.drivers.wrappers import Mixed
+from unjam.errors import wrong_name
+
+__all__ = [
+    "SHIPPED",
+    "SUFFIX",
+    "controller_bytes",
+    "load_controller",
+    "make_driver",
+    "shipped_file",
+    "shipped_names",
+]
+
+SHIPPED = "unjam:"
+"""what the name of a controller begins with that is part of the package"""
+SHIPPED_FOLDER = Path(str(files("unjam") / "controllers"))
+
+_SEVERAL = re.compile(r"\+(?=[^\W\d]|[./~])")
+"""between two drivers of a mixture; not the + of 1e+5"""
+
+
+def make_driver(text: str, time_step: float) -> Driver:
+    """Return the driver that `text` names.
+
+    Args:
+        text: a name (`pi`), with parameters (`pi:time_constant=1,window=30`), your own (`path.py:name`), a
+            run folder, a `.unjam` file, or a shipped controller (`unjam:ring-best`); or several of them
+            joined by `+`, for CAVs side by side.
+        time_step: time between two decisions of the road [s].
+
+    Raises:
+        InputError: there is no such driver, or a parameter is wrong.
+    """
+    path = Path(text)
+    parts = [] if path.exists() else _SEVERAL.split(text)
+    if len(parts) > 1:
+        return Mixed(tuple(make_driver(part, time_step) for part in parts))
+    if text.startswith(SHIPPED):
+        return load_controller(shipped_file(text.removeprefix(SHIPPED)))
+    named = text.partition(":")[0] in DRIVERS or is_file_reference(text)
+    if not named and (text.endswith(SUFFIX) or path.is_dir()):
+        return load_controller(path)
+    return named_driver(text, time_step)
+
+
+def shipped_names() -> list[str]:
+    """Return the names of the controllers that are part of the package: `ring-best`."""
+    return sorted(path.stem for path in SHIPPED_FOLDER.glob(f"*{SUFFIX}"))
+
+
+def shipped_file(name: str) -> Path:
+    """Return the file of a shipped controller; raise `InputError` where there is none of that name."""
+    if name not in shipped_names():
+        raise wrong_name("driver", f"{SHIPPED}{name}", [f"{SHIPPED}{known}" for known in shipped_names()])
+    return SHIPPED_FOLDER / f"{name}{SUFFIX}"

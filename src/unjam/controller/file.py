@@ -214,17 +214,13 @@ def _networks(driver: Driver, prefix: str = "") -> dict[str, list[dict[str, Any]
     return own | {
         name: seen
         for below, held in driver.inner.items()
-        for name, seen in _networks(held, prefix + below).items()
+        for name, seen in _networks(held, f"{prefix}{below}.").items()
     }
 
 
 def _remembered(name: str, value: Any) -> dict[str, Any]:
     """Return the name, shape and first value of what is remembered of one CAV."""
     values = np.asarray(value, np.float64)
-    same = bool(values.size) and np.array_equal(values, np.full_like(values, values.flat[0]), equal_nan=True)
-    first = values.flat[0].item() if same else values.tolist()
-    return {
-        "name": name,
-        "shape": list(values.shape),
-        "first": None if same and np.isnan(values.flat[0]) else first,
-    }
+    different = np.unique(values)  # NaN is one value
+    first = different[0].item() if len(different) == 1 else values.tolist()
+    return {"name": name, "shape": list(values.shape), "first": None if first != first else first}

@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 
+from unjam.drivers.command import as_rows
 from unjam.drivers.driver import Memory
 from unjam.drivers.local_state import LocalState
 from unjam.errors import InputError
@@ -36,7 +37,7 @@ def check_driver(driver: Any, rows: int = 8, steps: int = 50, seed: int = 0) -> 
     single = [driver.initial_memory(1) for _ in range(rows)]
     for step in range(steps):
         state = random_state(generator, rows)
-        before = _copy(memory)
+        before = mapped(np.array, memory)  # a copy
         acceleration, after = driver.act(state, memory)
         acceleration = check_acceleration(acceleration, rows, f"step {step}")
         if not _equal(memory, before):
@@ -46,23 +47,17 @@ def check_driver(driver: Any, rows: int = 8, steps: int = 50, seed: int = 0) -> 
             raise InputError(f"driver: step {step}: the same state and memory gave another acceleration")
         for row in range(rows):
             one = state.each(lambda values: values[row : row + 1])  # noqa: B023
-            alone, single[row] = driver.act(one, single[row])
-            if not abs(float(np.asarray(alone)[0]) - float(acceleration[row])) <= TOLERANCE:
-                raise InputError(
-                    f"driver: step {step}: row {row} gave {float(np.asarray(alone)[0])!r} alone "
-                    f"and {float(acceleration[row])!r} among {rows} rows"
-                )
+            answer, single[row] = driver.act(one, single[row])
+            alone, among = float(np.asarray(answer)[0]), float(acceleration[row])
+            if not abs(alone - among) <= TOLERANCE:
+                words = f"row {row} gave {alone!r} alone and {among!r} among {rows} rows"
+                raise InputError(f"driver: step {step}: {words}")
         memory = after
 
 
 def check_acceleration(acceleration: Any, rows: int, where: str) -> np.ndarray:
     """Return a driver's answer as an array; raise `InputError` unless it is finite and has `rows` rows."""
-    try:
-        array = np.asarray(acceleration, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise InputError(f"driver: {where}: acceleration is not numbers: {acceleration!r}") from None
-    if array.shape != (rows,):
-        raise InputError(f"driver: {where}: acceleration has shape {array.shape}; allowed: ({rows},)")
+    array = as_rows(acceleration, rows, f"driver: {where}")
     if not np.isfinite(array).all():
         raise InputError(f"driver: {where}: acceleration is {array[~np.isfinite(array)][0]}; allowed: finite")
     return array
@@ -74,10 +69,6 @@ def random_state(generator: np.random.Generator, rows: int) -> LocalState:
     gaps = generator.uniform(0.5, 60.0, (2, rows))
     position = generator.uniform(0.0, 230.0, rows)
     return LocalState(speeds[0], speeds[1], gaps[0], speeds[2], gaps[1], position, np.full(rows, 230.0))
-
-
-def _copy(memory: Memory) -> Memory:
-    return mapped(np.array, memory)
 
 
 def _equal(memory: Memory, other: Memory) -> bool:

@@ -9,6 +9,7 @@ from math import isfinite
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from unjam.errors import InputError
 from unjam.physics.arrays import Array, clip
@@ -43,6 +44,18 @@ class Limits(NamedTuple):
         return cls(-limit, limit)
 
 
+def as_rows(acceleration: Any, rows: int, where: str) -> NDArray[np.float64]:
+    """Return what a driver answered as an array; raise `InputError` unless it is `rows` numbers."""
+    try:
+        array = np.asarray(acceleration, np.float64)
+    except (TypeError, ValueError):
+        raise InputError(f"{where}: acceleration is not numbers: {acceleration!r}") from None
+    if array.shape != (rows,):
+        allowed = f"({rows},), one for each CAV"
+        raise InputError(f"{where}: acceleration has shape {array.shape}; allowed: {allowed}")
+    return array
+
+
 def accelerations(command: Command, limits: Limits, names: Sequence[str], where: str) -> list[float]:
     """Return what vehicles are told, within the limits, as plain floats [m/s2].
 
@@ -55,20 +68,13 @@ def accelerations(command: Command, limits: Limits, names: Sequence[str], where:
     Raises:
         InputError: an acceleration is not finite, or there are not as many as vehicles.
     """
-    found: Any = command.acceleration
-    if type(found) is float and len(names) == 1:
+    found, rows = command.acceleration, len(names)
+    if type(found) is float and rows == 1:
         if isfinite(found):  # the common case, in every step of a simulator
             return [limits.keep(found)]
         values = [found]
     else:
-        try:
-            array = np.asarray(found, np.float64)
-        except (TypeError, ValueError):
-            raise InputError(f"{where}: acceleration is not numbers: {found!r}") from None
-        if array.shape != (len(names),):
-            allowed = f"({len(names)},), one for each CAV"
-            raise InputError(f"{where}: acceleration has shape {array.shape}; allowed: {allowed}")
-        values = array.tolist()
+        values = as_rows(found, rows, where).tolist()
     for name, value in zip(names, values, strict=True):
         if not isfinite(value):
             raise InputError(f"{where}: acceleration of {name} is {value}; allowed: finite")

@@ -78,14 +78,14 @@ class Driver:
 
     def initial_memory(self, n: int) -> Memory:
         """Return the memory of `n` CAVs before their first step: NumPy arrays of shape (n, ...)."""
-        return {}
+        return {name: held.initial_memory(n) for name, held in self.inner.items()}
 
     def recall(self, memory: Memory, history: LocalState) -> Memory:
         """Return `memory` as if the driver had watched `history` before it took over.
 
         Called once, where a warm-up came before. `history` holds arrays of shape (n, steps), oldest first.
         """
-        return memory
+        return memory | {name: held.recall(memory[name], history) for name, held in self.inner.items()}
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
         """Return the wanted acceleration [m/s2], shape (n,), and the memory after this step.
@@ -111,7 +111,7 @@ class Driver:
 
     @property
     def inner(self) -> dict[str, "Driver"]:
-        """The drivers that it holds, by what the weights of their networks are prefixed with."""
+        """The drivers that it holds, by the names of their memories, which prefix their networks' weights."""
         return {}
 
     @property
@@ -128,7 +128,7 @@ class Driver:
         changed = {
             key: value for key, value in parameters.items() if value != default[key] and key != "time_step"
         }
-        return ":".join([self.name, *listed(changed)])
+        return labelled(self.name, changed)
 
     def recipe(self) -> Recipe:
         """Return what it is made from; its networks' weights are `arrays`."""
@@ -139,15 +139,23 @@ class Driver:
     def arrays(self) -> Arrays:
         """Return the weights of its networks, those of the drivers that it holds with their prefix."""
         return {
-            f"{prefix}{key}": array
-            for prefix, held in self.inner.items()
+            f"{name}.{key}": array
+            for name, held in self.inner.items()
             for key, array in held.arrays().items()
         }
 
 
-def listed(parameters: dict[str, Any]) -> list[str]:
-    """Return parameters as `key=value,key=value` in a list of one; empty where there are none."""
-    return [",".join(f"{key}={value}" for key, value in parameters.items())] if parameters else []
+class Formula(Driver):
+    """A driver that is written once for arrays, tensors and plain numbers (see `unjam.physics.arrays`)."""
+
+    plain_numbers: ClassVar[bool] = True
+    tensors: ClassVar[bool] = True
+
+
+def labelled(name: str, parameters: dict[str, Any]) -> str:
+    """Return `name:key=value,key=value`; the name alone where there are no parameters."""
+    values = ",".join(f"{key}={value}" for key, value in parameters.items())
+    return f"{name}:{values}" if values else name
 
 
 def single_row(memory: Memory) -> Memory:

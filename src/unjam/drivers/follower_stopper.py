@@ -1,19 +1,18 @@
 """FollowerStopper (Stern et al. 2018): drives at a desired speed and yields smoothly when close."""
 
-from typing import Annotated, ClassVar
+from typing import ClassVar
 
-from pydantic import Field
 from pydantic.dataclasses import dataclass
 
-from unjam.drivers.driver import Driver, Memory
+from unjam.drivers.driver import Formula, Memory
 from unjam.drivers.local_state import LocalState
 from unjam.drivers.speed_history import empty_window, fill, mean_speed, slide
-from unjam.parameters import STRICT, Positive
+from unjam.parameters import STRICT, NotNegative, Positive
 from unjam.physics.arrays import Array, clip, namespace
 
 
 @dataclass(frozen=True, config=STRICT)
-class FollowerStopper(Driver):
+class FollowerStopper(Formula):
     """Drives at the desired speed while the gap allows it, and below it in three regions of the gap.
 
     In the field the desired speed was set from outside, as an estimate of the speed of traffic. By default
@@ -23,10 +22,8 @@ class FollowerStopper(Driver):
     """
 
     name: ClassVar[str] = "follower-stopper"
-    plain_numbers: ClassVar[bool] = True
-    tensors: ClassVar[bool] = True
 
-    desired_speed: Annotated[float, Field(ge=0)] | None = None
+    desired_speed: NotNegative | None = None
     """U [m/s]; None: mean speed of the leader over the window"""
     window: Positive = 38.0
     """time over which the leader's speed is averaged [s]"""
@@ -34,7 +31,7 @@ class FollowerStopper(Driver):
     """borders of the three regions at equal speeds [m]"""
     decelerations: tuple[Positive, Positive, Positive] = (1.5, 1.0, 0.5)
     """how fast the borders grow when closing in [m/s2]"""
-    time_constant: Annotated[float, Field(ge=0)] = 0.0
+    time_constant: NotNegative = 0.0
     """time over which the wanted speed is reached [s]; 0: one time step"""
     time_step: Positive = 0.1
     """time between two decisions [s]; set by the road"""

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from unjam.drivers.driver import Driver, Memory, Recipe, listed
+from unjam.drivers.driver import Driver, Memory, Recipe, labelled
 from unjam.drivers.local_state import LocalState
 from unjam.errors import InputError
 from unjam.physics.arrays import Array
@@ -98,11 +98,9 @@ class FileReference:
 
 
 @dataclass(frozen=True)
-class FileDriver(Driver):
+class FileDriver(FileReference, Driver):
     """The driver `name` of the user's file: a function of the state, a class, or an instance of one."""
 
-    path: Path
-    name: str  # pyright: ignore[reportIncompatibleVariableOverride]
     parameters: dict[str, Any] = field(default_factory=dict)
     time_step: float = 0.1
     held: Any = field(init=False, repr=False, compare=False)
@@ -112,12 +110,8 @@ class FileDriver(Driver):
         object.__setattr__(self, "path", self.path.resolve())
         object.__setattr__(self, "held", self._build())
 
-    @property
-    def _reference(self) -> FileReference:
-        return FileReference(self.path, self.name)
-
     def _build(self) -> Any:
-        found, where = self._reference.load(), self._reference
+        found = self.load()
         if inspect.isclass(found):
             arguments = dict(self.parameters)
             if "time_step" in inspect.signature(found).parameters:
@@ -125,16 +119,16 @@ class FileDriver(Driver):
             try:
                 found = found(**arguments)
             except Exception as error:
-                raise InputError(f"{where}: {type(error).__name__} when made: {error}") from error
+                raise InputError(f"{self}: {type(error).__name__} when made: {error}") from error
         elif self.parameters:
-            raise InputError(f"{where}: takes no parameters; only a class does")
+            raise InputError(f"{self}: takes no parameters; only a class does")
         if callable(getattr(found, "act", None)):
             if not callable(getattr(found, "initial_memory", None)):
-                raise InputError(f"{where}: has act() but no initial_memory(n)")
+                raise InputError(f"{self}: has act() but no initial_memory(n)")
             return found
         if callable(found):
             return FunctionDriver(found)
-        raise InputError(f"{where}: is neither a function nor a class with act(state, memory)")
+        raise InputError(f"{self}: is neither a function nor a class with act(state, memory)")
 
     def initial_memory(self, n: int) -> Memory:
         """Return what the user's driver remembers before its first step."""
@@ -152,7 +146,7 @@ class FileDriver(Driver):
         """
         if np.size(state.speed) == 0:
             return np.zeros(0), memory
-        return self._reference.ask(self.held.act, state, memory)
+        return self.ask(self.held.act, state, memory)
 
     def memory_features(self, memory: Memory) -> Array | None:
         """Return the user's features of the memory, if the driver has any."""
@@ -161,11 +155,11 @@ class FileDriver(Driver):
 
     def describe(self) -> str:
         """Return the names of file and driver, and the parameters that were given."""
-        return ":".join([str(self._reference), *listed(self.parameters)])
+        return labelled(str(self), self.parameters)
 
     def recipe(self) -> Recipe:
         """Return where the code is, and its hash."""
-        return {**self._reference.recipe(), "parameters": self.parameters, "time_step": self.time_step}
+        return {**super().recipe(), "parameters": self.parameters, "time_step": self.time_step}
 
 
 @dataclass(frozen=True)

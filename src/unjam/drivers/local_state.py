@@ -41,15 +41,7 @@ LARGEST_GAP = 100.0
 SPEED_SCALE = 10.0
 """what speeds are divided by before a network sees them [m/s]"""
 
-STATE_UNITS = {
-    "speed": "m/s",
-    "leader_speed": "m/s",
-    "leader_gap": "m",
-    "follower_speed": "m/s",
-    "follower_gap": "m",
-    "route_position": "m",
-    "loop_length": "m",
-}
+STATE_UNITS = dict(zip(LocalState._fields, ("m/s", "m/s", "m", "m/s", "m", "m", "m"), strict=True))
 """units of a `LocalState`, in its order"""
 
 

@@ -1,12 +1,11 @@
 """PI with saturation (Stern et al. 2018): the paper's traffic expert, Eq. 9-11."""
 
-from typing import Annotated, ClassVar, Literal
+from typing import ClassVar, Literal
 
 import numpy as np
-from pydantic import Field
 from pydantic.dataclasses import dataclass
 
-from unjam.drivers.driver import Driver, Memory
+from unjam.drivers.driver import Formula, Memory
 from unjam.drivers.local_state import SPEED_SCALE, LocalState, Observed
 from unjam.drivers.speed_history import empty_window, fill, mean_speed, slide
 from unjam.parameters import STRICT, NotNegative, Positive
@@ -14,7 +13,7 @@ from unjam.physics.arrays import Array, at_least, clip, namespace, stack_columns
 
 
 @dataclass(frozen=True, config=STRICT)
-class PISaturation(Driver):
+class PISaturation(Formula):
     """Drives at the mean of its own speed, a little faster behind a large gap, and yields when close.
 
     The defaults are Table B2 of the paper, but for `time_constant`. The paper divides the wanted change of
@@ -25,8 +24,6 @@ class PISaturation(Driver):
     """
 
     name: ClassVar[str] = "pi"
-    plain_numbers: ClassVar[bool] = True
-    tensors: ClassVar[bool] = True
     observed_memory: ClassVar[tuple[Observed, ...]] = (
         Observed("mean own speed", SPEED_SCALE, "m/s"),
         Observed("commanded speed", SPEED_SCALE, "m/s"),
@@ -44,7 +41,7 @@ class PISaturation(Driver):
     """dx_s: below this gap it follows the leader's speed [m]"""
     safe_gap_rule: Literal["constant", "closing"] = "constant"
     """`constant` as the paper; `closing`: max(2 s (v_lead - v), safe_gap), as Stern et al. and Flow"""
-    time_constant: Annotated[float, Field(ge=0)] = 3.0
+    time_constant: NotNegative = 3.0
     """time over which the wanted speed is reached [s]; 0: one time step, as the paper"""
     first_command: Literal["own-speed", "zero"] = "own-speed"
     """commanded speed before the first step; Flow starts from zero"""

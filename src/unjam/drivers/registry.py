@@ -9,38 +9,25 @@ import numpy as np
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
-from unjam.drivers.acc import ACC, LACC
-from unjam.drivers.bilateral import BCM
-from unjam.drivers.constant import Constant
+from unjam.drivers.car_following import ACC, BCM, IDM, LACC, OVM, Constant, Human
 from unjam.drivers.driver import Driver, Recipe
 from unjam.drivers.follower_stopper import FollowerStopper
 from unjam.drivers.from_file import FileDriver, FileReference, is_file_reference
-from unjam.drivers.idm import IDM, Human
-from unjam.drivers.jam_absorber import JamAbsorber
 from unjam.drivers.network import network_from_arrays
 from unjam.drivers.observation import FeatureName, observation_size
-from unjam.drivers.ovm import OVM
-from unjam.drivers.pacer import Pacer
 from unjam.drivers.pi_saturation import PISaturation
-from unjam.drivers.residual import ResidualDriver
-from unjam.drivers.wrappers import Impaired, Mixed
+from unjam.drivers.residual import EXPERT, ResidualDriver
+from unjam.drivers.road_experts import JamAbsorber, Pacer
+from unjam.drivers.wrappers import INNER, Impaired, Mixed
 from unjam.errors import InputError, wrong
 from unjam.parameters import STRICT, Count, NotNegative, Positive, build, split_parameters
 from unjam.tree import Arrays
 
-DRIVERS: dict[str, type[Driver]] = {
-    "human": Human,
-    "idm": IDM,
-    "pi": PISaturation,
-    "follower-stopper": FollowerStopper,
-    "acc": ACC,
-    "lacc": LACC,
-    "bcm": BCM,
-    "ovm": OVM,
-    "pacer": Pacer,
-    "jam-absorber": JamAbsorber,
-    "constant": Constant,
-}
+_KINDS = (Human, IDM, PISaturation, FollowerStopper, ACC, LACC, BCM, OVM, Pacer, JamAbsorber, Constant)
+DRIVERS: dict[str, type[Driver]] = {kind.name: kind for kind in _KINDS}
+
+Held = Callable[[Recipe, str], Driver]
+"""makes a driver that another one holds, by the name that its networks' weights begin with"""
 
 
 def driver_names() -> str:
@@ -64,10 +51,6 @@ def named_driver(text: str, time_step: float) -> Driver:
         return FileDriver(reference.path, reference.name, parameters, time_step)
     if name not in DRIVERS:
         raise wrong("driver", name, driver_names())
-    return _make(name, parameters, time_step)
-
-
-def _make(name: str, parameters: dict[str, Any], time_step: float) -> Driver:
     kind = DRIVERS[name]
     if any(field.name == "time_step" for field in fields(kind)):  # pyright: ignore[reportArgumentType]
         parameters = {"time_step": time_step, **parameters}
@@ -88,51 +71,6 @@ class _ResidualRecipe:
     files: list[dict[str, Any]] = Field(default_factory=list)
 
 
-def _named(recipe: Recipe, arrays: Arrays, prefix: str) -> Driver:
-    if recipe["name"] not in DRIVERS:
-        raise wrong("driver recipe", recipe["name"], ", ".join(DRIVERS))
-    return build(DRIVERS[recipe["name"]], recipe["parameters"], f"driver {recipe['name']}")
-
-
-def _from_file(recipe: Recipe, arrays: Arrays, prefix: str) -> Driver:
-    return FileDriver(Path(recipe["path"]), recipe["name"], recipe["parameters"], recipe["time_step"])
-
-
-def _mixed(recipe: Recipe, arrays: Arrays, prefix: str) -> Driver:
-    parts = enumerate(recipe["drivers"])
-    return Mixed(tuple(driver_from_recipe(part, arrays, f"{prefix}{number}.") for number, part in parts))
-
-
-def _impaired(recipe: Recipe, arrays: Arrays, prefix: str) -> Driver:
-    worse = {key: float(recipe[key]) for key in ("delay", "gap_noise", "time_step")}
-    return Impaired(driver_from_recipe(recipe["driver"], arrays, f"{prefix}inner."), **worse)
-
-
-def _residual(recipe: Recipe, arrays: Arrays, prefix: str) -> Driver:
-    found, expert = build(_ResidualRecipe, recipe, "driver recipe"), f"{prefix}expert."
-    own = {
-        name.removeprefix(prefix): array
-        for name, array in arrays.items()
-        if name.startswith(prefix) and not name.startswith(expert)
-    }
-    base = driver_from_recipe(found.expert, arrays, expert)
-    network = network_from_arrays(own, found.authority, found.exploration_std)
-    shown = observation_size(found.parts, base)
-    if network.inputs != shown:
-        raise InputError(f"network: {network.inputs} inputs are not allowed; allowed: {shown}")
-    return ResidualDriver(base, network, found.action_limit, found.parts, found.hold)
-
-
-RECIPES: dict[str, Callable[[Recipe, Arrays, str], Driver]] = {
-    "named": _named,
-    "file": _from_file,
-    "residual": _residual,
-    "mixed": _mixed,
-    "impaired": _impaired,
-}
-"""how each kind of recipe becomes a driver again, the prefix being that of its networks' weights"""
-
-
 def recipe_of(driver: Driver) -> tuple[Recipe, Arrays]:
     """Return the recipe of a driver and the arrays of its networks; `driver_from_recipe` undoes it.
 
@@ -147,12 +85,59 @@ def recipe_of(driver: Driver) -> tuple[Recipe, Arrays]:
     return recipe, driver.arrays()
 
 
-def driver_from_recipe(recipe: Recipe, arrays: Arrays, prefix: str = "") -> Driver:
+def driver_from_recipe(recipe: Recipe, arrays: Arrays) -> Driver:
     """Return the driver that `recipe_of` wrote down; raise `InputError` where the recipe is not valid."""
+
+    def held(recipe: Recipe, name: str) -> Driver:
+        prefix = f"{name}."
+        within = {key.removeprefix(prefix): array for key, array in arrays.items() if key.startswith(prefix)}
+        return driver_from_recipe(recipe, within)
+
     kind = recipe.get("kind") if isinstance(recipe, dict) else recipe
     if kind not in RECIPES:
         raise wrong("driver recipe", kind, ", ".join(RECIPES))
-    return RECIPES[kind](recipe, arrays, prefix)
+    return RECIPES[kind](recipe, arrays, held)
+
+
+def _named(recipe: Recipe, arrays: Arrays, held: Held) -> Driver:
+    name = recipe["name"]
+    if name not in DRIVERS:
+        raise wrong("driver recipe", name, ", ".join(DRIVERS))
+    return build(DRIVERS[name], recipe["parameters"], f"driver {name}")
+
+
+def _file(recipe: Recipe, arrays: Arrays, held: Held) -> Driver:
+    return FileDriver(Path(recipe["path"]), recipe["name"], recipe["parameters"], recipe["time_step"])
+
+
+def _residual(recipe: Recipe, arrays: Arrays, held: Held) -> Driver:
+    found = build(_ResidualRecipe, recipe, "driver recipe")
+    expert = held(found.expert, EXPERT)
+    own = {name: array for name, array in arrays.items() if not name.startswith(f"{EXPERT}.")}
+    network = network_from_arrays(own, found.authority, found.exploration_std)
+    shown = observation_size(found.parts, expert)
+    if network.inputs != shown:
+        raise InputError(f"network: {network.inputs} inputs are not allowed; allowed: {shown}")
+    return ResidualDriver(expert, network, found.action_limit, found.parts, found.hold)
+
+
+def _mixed(recipe: Recipe, arrays: Arrays, held: Held) -> Driver:
+    return Mixed(tuple(held(part, str(number)) for number, part in enumerate(recipe["drivers"])))
+
+
+def _impaired(recipe: Recipe, arrays: Arrays, held: Held) -> Driver:
+    worse = {key: float(recipe[key]) for key in ("delay", "gap_noise", "time_step")}
+    return Impaired(held(recipe["driver"], INNER), **worse)
+
+
+RECIPES: dict[str, Callable[[Recipe, Arrays, Held], Driver]] = {
+    "named": _named,
+    "file": _file,
+    "residual": _residual,
+    "mixed": _mixed,
+    "impaired": _impaired,
+}
+"""how each kind of recipe becomes a driver again"""
 
 
 def files_of(recipe: Any) -> list[Recipe]:

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -9,8 +10,8 @@ from unjam.drivers.command import Command, Limits
 from unjam.drivers.driver import Decision, Driver, Memory, Noise, Recipe
 from unjam.drivers.local_state import LocalState, Observed
 from unjam.drivers.network import Network, network_arrays
-from unjam.drivers.observation import Seen, feature, observed, own_files
-from unjam.drivers.observation import observe as observe_features
+from unjam.drivers.observation import Seen, feature, observe, observed, own_files
+from unjam.drivers.wrappers import Wrapper
 from unjam.physics.arrays import Array, namespace
 from unjam.tree import Arrays
 
@@ -19,8 +20,8 @@ EXPERT, RESIDUAL, AGE = "expert", "residual", "age"
 
 
 @dataclass(frozen=True)
-class ResidualDriver(Driver):
-    """Adds what a network has learned to what an expert does, within the action limit.
+class ResidualDriver(Wrapper):
+    """Adds what a network has learned to what an expert does, within the action limit: the paper's Eq. 8.
 
     Any driver can be the expert, another `ResidualDriver` too.
     """
@@ -45,67 +46,37 @@ class ResidualDriver(Driver):
         return self.expert.plain_numbers and all(feature(name).plain for name in self.parts)
 
     @property
-    def tensors(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Whether the expert takes tensors; the network does."""
-        return self.expert.tensors
-
-    @property
-    def needs_loop(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Whether the expert must know its place on a closed road."""
-        return self.expert.needs_loop
-
-    @property
     def observed_memory(self) -> tuple[Observed, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
         """What the expert's `memory_features` are."""
         return self.expert.observed_memory
 
     def initial_memory(self, n: int) -> Memory:
         """Return the expert's memory and, where a residual is held, the residual and its age."""
-        memory = {EXPERT: self.expert.initial_memory(n)}
+        memory = super().initial_memory(n)
         return memory if self.hold == 1 else {**memory, RESIDUAL: np.zeros(n), AGE: np.zeros(n)}
-
-    def recall(self, memory: Memory, history: LocalState) -> Memory:
-        """Return what the expert makes of the warm-up."""
-        return {**memory, EXPERT: self.expert.recall(memory[EXPERT], history)}
 
     def decide(self, state: LocalState, memory: Memory, noise: Noise | None = None) -> Decision:
         """Return the decision taken apart; with `noise`, the network explores."""
         wanted, after = self.expert.act(state, memory[EXPERT])
-        limits = self.limits
-        expert = limits.keep(wanted)
-        if self.hold == 1:
-            seen = Seen(state, expert, self.expert, after)
-            observation = observe_features(self.parts, seen)
-            residual = self._look(observation, noise)
-            after = {EXPERT: after}
+        expert, remembered = self.limits.keep(wanted), {EXPERT: after}
+        due: Any = True if self.hold == 1 else memory[AGE] % self.hold == 0
+        if due is False:  # where one age counts for all rows, as in plain numbers, no network is asked
+            observation, residual = (), memory[RESIDUAL]
         else:
-            observation, residual = self._look_or_hold(state, expert, after, noise, memory)
-            after = {EXPERT: after, RESIDUAL: residual, AGE: memory[AGE] + 1.0}
-        command = Command(limits.keep(expert + residual))
-        return Decision(command, expert, residual, observation, after)
-
-    def _look(self, observation: Array, noise: Noise | None) -> Array:
-        return self.network(observation) if noise is None else self.network.explore(observation, noise())
-
-    def _look_or_hold(
-        self, state: LocalState, expert: Array, after: Memory, noise: Noise | None, memory: Memory
-    ) -> tuple[Array, Array]:
-        """Return what the network sees and the residual: a new one where the held one is old enough.
-
-        Where one age counts for all rows, as for a single CAV in plain numbers, the network need not be asked
-        while a residual is held.
-        """
-        due = memory[AGE] % self.hold == 0
-        if due is False:
-            return (), memory[RESIDUAL]
-        observation = observe_features(self.parts, Seen(state, expert, self.expert, after))
-        fresh = self._look(observation, noise)
-        return observation, fresh if due is True else namespace(fresh).where(due, fresh, memory[RESIDUAL])
+            observation = observe(self.parts, Seen(state, expert, self.expert, after))
+            network = self.network
+            residual = network(observation) if noise is None else network.explore(observation, noise())
+            if due is not True:
+                residual = namespace(residual).where(due, residual, memory[RESIDUAL])
+        if self.hold > 1:
+            remembered |= {RESIDUAL: residual, AGE: memory[AGE] + 1.0}
+        command = Command(self.limits.keep(expert + residual))
+        return Decision(command, expert, residual, observation, remembered)
 
     def observation(self, state: LocalState, memory: Memory) -> Array:
         """Return what the network would see now, whether or not its residual is being held."""
         wanted, after = self.expert.act(state, memory[EXPERT])
-        return observe_features(self.parts, Seen(state, self.limits.keep(wanted), self.expert, after))
+        return observe(self.parts, Seen(state, self.limits.keep(wanted), self.expert, after))
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
         """Return the deterministic acceleration, clip(expert + residual), and the new memory."""
@@ -119,7 +90,7 @@ class ResidualDriver(Driver):
     @property
     def inner(self) -> dict[str, Driver]:
         """Its expert."""
-        return {f"{EXPERT}.": self.expert}
+        return {EXPERT: self.expert}
 
     @property
     def shown(self) -> tuple[Observed, ...]:

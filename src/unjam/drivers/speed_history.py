@@ -40,15 +40,22 @@ class PastSpeeds:
     start: int
     steps: int
 
+    @classmethod
+    def of(cls, speeds: Array) -> "PastSpeeds":
+        """Return the window of `speeds`, shape (steps, n), on a new tape that has room for more."""
+        steps, n = speeds.shape
+        tape = speeds.new_empty((steps + max(steps, SPARE_STEPS), n))
+        tape[:steps] = speeds
+        return cls(_Tape(tape, steps), 0, steps)
+
     def slide(self, speed: Array) -> tuple["PastSpeeds", Array]:
         """Return the window moved on by one step, and the speed that it left behind, shape (n,)."""
-        tape, start = self.tape, self.start
-        if tape.written != start + self.steps or tape.written == len(tape.speeds):
-            tape, start = _new_tape(tape.speeds[start : start + self.steps]), 0
-        oldest = tape.speeds[start]
-        tape.speeds[tape.written] = speed
+        tape, end = self.tape, self.start + self.steps
+        if tape.written != end or end == len(tape.speeds):
+            return PastSpeeds.of(tape.speeds[self.start : end]).slide(speed)
+        tape.speeds[end] = speed
         tape.written += 1
-        return PastSpeeds(tape, start + 1, self.steps), oldest
+        return PastSpeeds(tape, self.start + 1, self.steps), tape.speeds[self.start]
 
 
 @dataclass(frozen=True)
@@ -75,20 +82,12 @@ class WrittenRows:
         return WrittenRows(self.rows.scatter(1, place, speed[:, None]), self.seen + 1.0), oldest
 
 
-def _new_tape(speeds: Array) -> _Tape:
-    """Return a tape that begins with `speeds`, shape (steps, n), and has room for more."""
-    steps, n = speeds.shape
-    longer = speeds.new_empty((steps + max(steps, SPARE_STEPS), n))
-    longer[:steps] = speeds
-    return _Tape(longer, steps)
-
-
 def _past_speeds(window: Array, seen: Array) -> PastSpeeds:
     """Return the window of torch rows, shape (n, steps) as `empty_window` makes it, oldest speed first."""
     xp = namespace(window)
     steps = window.shape[1]
     order = (seen[:, None] + xp.arange(steps, device=window.device)) % steps
-    return PastSpeeds(_new_tape(window.take_along_dim(order.long(), 1).T), 0, steps)
+    return PastSpeeds.of(window.take_along_dim(order.long(), 1).T)
 
 
 def empty_window(n: int, window: float, time_step: float) -> Window:

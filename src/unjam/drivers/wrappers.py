@@ -1,6 +1,7 @@
 """Drivers around drivers: several side by side, or one whose sensors and actuators are worse."""
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
@@ -11,15 +12,30 @@ from unjam.parameters import NotNegative
 from unjam.physics.arrays import Array, namespace
 
 KIND = "kind"
-"""name in the memory of which driver a CAV has"""
+"""name in the memory of a mixture: which driver a CAV has"""
 INNER, AGE, SENT = "inner", "age", "sent"
-"""names in the memory: the other driver's own; decisions made so far; what was said and not yet done"""
+"""names in the memory of an impaired driver: the other driver's own; decisions made so far; what was said and
+not yet done"""
 SMALLEST_SEEN_GAP = 0.1
 """[m], however wrong a sensor is"""
 
 
+class Wrapper(Driver):
+    """A driver that drives by those which it holds."""
+
+    @property
+    def tensors(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Whether all that it holds take tensors."""
+        return all(held.tensors for held in self.inner.values())
+
+    @property
+    def needs_loop(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Whether one that it holds must know its place on a closed road."""
+        return any(held.needs_loop for held in self.inner.values())
+
+
 @dataclass(frozen=True)
-class Mixed(Driver):
+class Mixed(Wrapper):
     """Gives the CAVs different drivers: the first CAV has the first driver, the next the next, and so on.
 
     After the last driver it begins anew; where CAVs come and go, they are counted as they enter.
@@ -33,42 +49,22 @@ class Mixed(Driver):
             raise InputError("driver: 'human' is not allowed among several; idm drives like people")
 
     @property
-    def tensors(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Whether all of them take tensors."""
-        return all(driver.tensors for driver in self.drivers)
-
-    @property
-    def needs_loop(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Whether one of them must know its place on a closed road."""
-        return any(driver.needs_loop for driver in self.drivers)
-
-    @property
-    def _numbered(self) -> dict[str, Driver]:
+    def inner(self) -> dict[str, Driver]:
+        """All of them, by their number."""
         return {str(number): driver for number, driver in enumerate(self.drivers)}
 
     def initial_memory(self, n: int) -> Memory:
         """Return which driver each CAV has, and what all drivers would remember of it."""
-        held = {key: driver.initial_memory(n) for key, driver in self._numbered.items()}
-        return {KIND: np.arange(n, dtype=np.float64) % len(self.drivers), **held}
-
-    def recall(self, memory: Memory, history: LocalState) -> Memory:
-        """Return what all drivers make of the warm-up."""
-        recalled = {key: driver.recall(memory[key], history) for key, driver in self._numbered.items()}
-        return {**memory, **recalled}
+        return {KIND: np.arange(n, dtype=np.float64) % len(self.drivers), **super().initial_memory(n)}
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
         """Return the acceleration that each CAV's own driver wants, and the new memory."""
         after, chosen = dict(memory), None
-        for number, (key, driver) in enumerate(self._numbered.items()):
+        for number, (key, driver) in enumerate(self.inner.items()):
             wanted, after[key] = driver.act(state, memory[key])
             mine = memory[KIND] == number
             chosen = wanted if chosen is None else namespace(wanted).where(mine, wanted, chosen)
         return chosen, after
-
-    @property
-    def inner(self) -> dict[str, Driver]:
-        """All of them, by their number."""
-        return {f"{key}.": driver for key, driver in self._numbered.items()}
 
     def describe(self) -> str:
         """Return all of them, joined by +."""
@@ -80,8 +76,10 @@ class Mixed(Driver):
 
 
 @dataclass(frozen=True)
-class Impaired(Driver):
+class Impaired(Wrapper):
     """Passes what it sees, with noise, to another driver, and hands on what that one said a while ago."""
+
+    tensors: ClassVar[bool] = False  # pyright: ignore[reportIncompatibleMethodOverride]
 
     driver: Driver
     delay: NotNegative = 0.0
@@ -92,18 +90,14 @@ class Impaired(Driver):
     """time between two decisions [s]"""
 
     @property
-    def needs_loop(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Whether the other driver must know its place on a closed road."""
-        return self.driver.needs_loop
+    def inner(self) -> dict[str, Driver]:
+        """The other driver."""
+        return {INNER: self.driver}
 
     def initial_memory(self, n: int) -> Memory:
         """Return that of the other driver, that nothing was said yet, and that no decision was made."""
         late = round(self.delay / self.time_step)
-        return {INNER: self.driver.initial_memory(n), AGE: np.zeros(n), SENT: np.zeros((n, late))}
-
-    def recall(self, memory: Memory, history: LocalState) -> Memory:
-        """Return what the other driver makes of the warm-up."""
-        return {**memory, INNER: self.driver.recall(memory[INNER], history)}
+        return {**super().initial_memory(n), AGE: np.zeros(n), SENT: np.zeros((n, late))}
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
         """Return what was said `delay` ago, and remember what is said now."""
@@ -122,11 +116,6 @@ class Impaired(Driver):
             leader_gap=np.maximum(state.leader_gap + ahead, SMALLEST_SEEN_GAP),
             follower_gap=np.maximum(state.follower_gap + behind, SMALLEST_SEEN_GAP),
         )
-
-    @property
-    def inner(self) -> dict[str, Driver]:
-        """The other driver."""
-        return {f"{INNER}.": self.driver}
 
     def describe(self) -> str:
         """Return the other driver, and what is worse about it."""

@@ -9,8 +9,8 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from unjam.controller import make_driver
+from unjam.drivers.car_following import Constant
 from unjam.drivers.command import Command, Limits
-from unjam.drivers.constant import Constant
 from unjam.drivers.driver import Decision, Driver, Memory, Noise
 from unjam.drivers.local_state import LocalState
 from unjam.drivers.observation import FeatureName, Seen, observation_size, observe

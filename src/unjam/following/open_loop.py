@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from unjam.drivers.idm import SMALLEST_GAP
+from unjam.drivers.car_following import SMALLEST_GAP
 from unjam.following.pairs import Floats, Stretches
 from unjam.physics.arrays import Array, at_least, clip, namespace
 from unjam.physics.idm import PARAMETER_NAMES, IDMParameters, IDMRows, idm_acceleration

@@ -8,6 +8,7 @@ between two steps of SUMO the processor's caches are cold, and a NumPy call on o
 
 import math
 import sys
+from types import SimpleNamespace
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -16,17 +17,14 @@ Array: TypeAlias = Any
 """A NumPy array, a torch tensor or a float; workers run without torch, so it cannot be named here."""
 
 
-class _Floats:
-    """The few array functions that formulas use, for plain floats."""
-
-    minimum = staticmethod(min)
-    isnan = staticmethod(math.isnan)
-    cos = staticmethod(math.cos)
-    sin = staticmethod(math.sin)
-
-    @staticmethod
-    def where(condition: bool, then: float, otherwise: float) -> float:
-        return then if condition else otherwise
+_FLOATS = SimpleNamespace(
+    minimum=min,
+    isnan=math.isnan,
+    cos=math.cos,
+    sin=math.sin,
+    where=lambda condition, then, otherwise: then if condition else otherwise,
+)
+"""the few array functions that formulas use, for plain floats"""
 
 
 def namespace(array: Array) -> Any:
@@ -35,7 +33,7 @@ def namespace(array: Array) -> Any:
     That is `numpy`, `torch`, or their like for plain floats.
     """
     if type(array) is float:
-        return _Floats
+        return _FLOATS
     if isinstance(array, (np.ndarray, np.generic)):
         return np
     return sys.modules["torch"]

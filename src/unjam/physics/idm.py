@@ -1,7 +1,6 @@
 """The Intelligent Driver Model (Treiber, Hennecke, Helbing 2000): how people follow the car ahead."""
 
 from collections.abc import Sequence
-from dataclasses import fields
 from functools import cached_property
 from math import sqrt
 from typing import NamedTuple
@@ -58,9 +57,7 @@ class IDMRows(NamedTuple):
 
 
 PAPER_IDM = IDMParameters()
-
-PARAMETER_NAMES = tuple(field.name for field in fields(IDMParameters))
-
+PARAMETER_NAMES = IDMRows._fields
 HALVINGS = 60
 """of the interval in which the equilibrium speed lies: to the last bit"""
 

@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import Field, model_validator
 from pydantic.dataclasses import dataclass
 
-from unjam.drivers.idm import SMALLEST_GAP
+from unjam.drivers.car_following import SMALLEST_GAP
 from unjam.parameters import STRICT, Count, CountOrNone, NotNegative, Positive
 from unjam.physics.arrays import at_least
 from unjam.physics.idm import IDMParameters, idm_acceleration

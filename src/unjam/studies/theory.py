@@ -12,7 +12,7 @@ import numpy as np
 from matplotlib import rc_context
 from matplotlib.figure import Figure
 
-from unjam.drivers.constant import Constant
+from unjam.drivers.car_following import Constant
 from unjam.drivers.network import Network
 from unjam.drivers.observation import observation_size
 from unjam.drivers.residual import ResidualDriver

@@ -9,7 +9,7 @@ import tomli_w
 from pydantic import AfterValidator, Field, model_validator
 from pydantic.dataclasses import dataclass
 
-from unjam.drivers.constant import Constant
+from unjam.drivers.car_following import Constant
 from unjam.drivers.driver import Driver
 from unjam.drivers.observation import observed
 from unjam.errors import InputError

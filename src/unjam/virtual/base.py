@@ -4,11 +4,9 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from math import nan
 
-from unjam.drivers.acc import ACC
+from unjam.drivers.car_following import ACC, IDM, OVM, SMALLEST_GAP
 from unjam.drivers.driver import Driver, Memory
-from unjam.drivers.idm import IDM, SMALLEST_GAP
 from unjam.drivers.local_state import LARGEST_GAP, LocalState
-from unjam.drivers.ovm import OVM
 from unjam.physics.arrays import Array, as_column, at_least, namespace, stack_columns
 from unjam.physics.idm import idm_acceleration
 from unjam.physics.kinematics import next_position, next_speed

@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from unjam.drivers.constant import Constant
+from unjam.drivers.car_following import Constant
 from unjam.drivers.driver import Driver, Memory
 from unjam.drivers.local_state import LocalState
 from unjam.drivers.residual import ResidualDriver

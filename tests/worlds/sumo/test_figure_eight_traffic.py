@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from unjam.drivers import Driver, LocalState, Memory, PISaturation
+from unjam.drivers.car_following import Human
 from unjam.drivers.command import Command
-from unjam.drivers.idm import Human
-from unjam.drivers.pacer import Pacer
+from unjam.drivers.road_experts import Pacer
 from unjam.measures.metrics import measure
 from unjam.scenarios.figure_eight import FigureEight
 from unjam.worlds.episode import run_episode

@@ -3,7 +3,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from unjam.drivers.idm import Human
+from unjam.drivers.car_following import Human
 from unjam.drivers.network import Network
 from unjam.physics.idm import PAPER_IDM, IDMParameters, idm_acceleration
 from unjam.scenarios.population import Population, write_population

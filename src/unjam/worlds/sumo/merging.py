@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from unjam.drivers.idm import SMALLEST_GAP
+from unjam.drivers.car_following import SMALLEST_GAP
 from unjam.drivers.local_state import LocalState
 from unjam.errors import EpisodeError
 from unjam.physics.idm import idm_acceleration, parameter_rows

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from unjam.drivers.idm import SMALLEST_GAP
+from unjam.drivers.car_following import SMALLEST_GAP
 from unjam.physics.arrays import at_least
 from unjam.physics.idm import IDMParameters, idm_acceleration
 from unjam.physics.kinematics import gap_on_loop

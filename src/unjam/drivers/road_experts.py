@@ -1,4 +1,4 @@
-"""The pacer of the figure eight: leads all others in one queue that never meets its own tail."""
+"""The experts of the figure eight and of the merge, which must know where on the road they are."""
 
 from dataclasses import replace
 from functools import cached_property
@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
-from unjam.drivers.driver import Driver, Memory
+from unjam.drivers.driver import Formula, Memory
 from unjam.drivers.local_state import LocalState, Observed, lap_angle
 from unjam.parameters import STRICT, NotNegative, Positive
 from unjam.physics.arrays import Array, as_column, at_least, namespace
@@ -17,10 +17,36 @@ Harmonics = tuple[float, ...]
 Share = Annotated[float, Field(ge=0, lt=1)]
 SLOWEST_PACE = 1.0
 """[m/s]: whoever stands still never gathers anybody"""
+SEEN = 60.0
+"""a jam farther away is not yet waited for [m]"""
+NOBODY = 99.0
+"""gap from which on there is no leader [m]"""
+OVERRUN = 50.0
+"""[m] beyond `last_position`, where it waits no longer"""
+
+
+def _tuned(harmonics: Harmonics, gain: float, wanted_gap: float) -> dict[str, Any]:
+    """Return the fields of a tuned pacer; all gather until half the lap is free."""
+    gathering = {"gathering_gap": 0.5, "regathering_gap": 0.45}
+    return {"harmonics": harmonics, "gain": gain, "wanted_gap": wanted_gap, **gathering}
+
+
+TUNED: dict[float, dict[str, Any]] = {
+    422.2: _tuned((6.729, -2.092, 1.602, -0.929, 0.851, -0.096, 0.105), 0.051, 0.483),
+    449.0: _tuned((7.449, -2.059, 1.966, -0.94, 0.791, -0.028, 0.01), 0.047, 0.509),
+    462.5: _tuned((7.973, -1.865, 2.48, -0.422, 0.173, 0.027, 0.063), 0.038, 0.545),
+    475.9: _tuned((8.35, -2.057, 3.128, 0.477, 0.086, -0.086, 0.075), 0.04, 0.552),
+    489.3: _tuned((9.039, -1.791, 3.513, 1.051, 0.015, 0.024, 0.216), 0.044, 0.581),
+}
+"""what `varying` uses, by the length of the lap [m], found by results/experts/tune_pacer.py.
+
+Of the figure eight with radii 30, 32, 33, 34 and 35 m; at 34 m 0.1 m/s slower than what the search found,
+which broke on one seed of ten.
+"""
 
 
 @dataclass(frozen=True, config=STRICT)
-class Pacer(Driver):
+class Pacer(Formula):
     """Waits until all have gathered behind it, then leads them round at a pace that they can keep together.
 
     On the figure eight a queue that is longer than half a lap meets its own tail at the crossing. Driven
@@ -29,8 +55,6 @@ class Pacer(Driver):
     """
 
     name: ClassVar[str] = "pacer"
-    plain_numbers: ClassVar[bool] = True
-    tensors: ClassVar[bool] = True
     needs_loop: ClassVar[bool] = True
     observed_memory: ClassVar[tuple[Observed, ...]] = (Observed("all have gathered", 1.0, ""),)
 
@@ -105,21 +129,61 @@ class Pacer(Driver):
         return as_column(memory["gathered"])
 
 
-def _tuned(harmonics: Harmonics, gain: float, wanted_gap: float) -> dict[str, Any]:
-    """Return the fields of a tuned pacer; all gather until half the lap is free."""
-    gathering = {"gathering_gap": 0.5, "regathering_gap": 0.45}
-    return {"harmonics": harmonics, "gain": gain, "wanted_gap": wanted_gap, **gathering}
+@dataclass(frozen=True, config=STRICT)
+class JamAbsorber(Formula):
+    """Follows its leader linearly; where that one is caught in a jam, it crawls until there is room ahead.
 
+    While it crawls less arrives at the bottleneck than leaves it, and the jam ahead of it dissolves; those
+    behind it then pass at speed. It crawls only within a stretch before the bottleneck, so it must know its
+    position along the road; where there is none it only follows. After jam-absorption driving, "slow in, fast
+    out": Nishi et al. 2013, Transp. Res. B 50:116-129.
+    """
 
-TUNED: dict[float, dict[str, Any]] = {
-    422.2: _tuned((6.729, -2.092, 1.602, -0.929, 0.851, -0.096, 0.105), 0.051, 0.483),
-    449.0: _tuned((7.449, -2.059, 1.966, -0.94, 0.791, -0.028, 0.01), 0.047, 0.509),
-    462.5: _tuned((7.973, -1.865, 2.48, -0.422, 0.173, 0.027, 0.063), 0.038, 0.545),
-    475.9: _tuned((8.35, -2.057, 3.128, 0.477, 0.086, -0.086, 0.075), 0.04, 0.552),
-    489.3: _tuned((9.039, -1.791, 3.513, 1.051, 0.015, 0.024, 0.216), 0.044, 0.581),
-}
-"""what `varying` uses, by the length of the lap [m], found by results/experts/tune_pacer.py.
+    name: ClassVar[str] = "jam-absorber"
+    observed_memory: ClassVar[tuple[Observed, ...]] = (Observed("it waits for a jam to go", 1.0, ""),)
 
-Of the figure eight with radii 30, 32, 33, 34 and 35 m; at 34 m 0.1 m/s slower than what the search found,
-which broke on one seed of ten.
-"""
+    jam_speed: NotNegative = 10.0
+    """a leader slower than this is caught in a jam [m/s]"""
+    crawling_speed: NotNegative = 3.5
+    """speed while it waits [m/s]"""
+    room: Positive = 22.0
+    """gap at which it may go on [m], where the leader is fast enough"""
+    going_speed: NotNegative = 8.3
+    """what is fast enough [m/s]"""
+    first_position: float = -580.0
+    """along the road, from where it may begin to wait [m]"""
+    last_position: float = -270.0
+    """up to where it may begin to wait [m]"""
+    gap_gain: NotNegative = 0.25
+    """acceleration for each metre of gap too much [1/s2]"""
+    speed_gain: NotNegative = 1.2
+    """acceleration for each m/s that the leader is faster [1/s]"""
+    time_gap: NotNegative = 1.4
+    """wanted gap over own speed [s]"""
+    standstill_gap: NotNegative = 4.0
+    """wanted gap of a standing vehicle [m]"""
+    push: NotNegative = 0.0
+    """acceleration besides [m/s2]; without a `gap_gain` it so closes up as far as the shield lets it"""
+
+    def initial_memory(self, n: int) -> Memory:
+        """Return that nobody waits."""
+        return {"waits": np.zeros(n)}
+
+    def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
+        """Return the acceleration, and who waits from now on."""
+        xp, zero = namespace(state.speed), state.speed * 0.0
+        place, gap, ahead = state.route_position, state.leader_gap, state.leader_speed
+        within = (place > self.first_position) & (place < self.last_position)
+        jam = within & (ahead < self.jam_speed) & (gap < SEEN)
+        waits = xp.where(jam, zero + 1.0, memory["waits"])
+        gone = ((gap >= self.room) & (ahead >= self.going_speed)) | (gap >= NOBODY)
+        too_far = place > self.last_position + OVERRUN
+        waits = xp.where(gone | too_far, zero, waits)
+        excess = gap - self.standstill_gap - self.time_gap * state.speed
+        follow = self.gap_gain * excess + self.speed_gain * (ahead - state.speed) + self.push
+        crawl = xp.minimum(self.crawling_speed - state.speed, follow)
+        return xp.where(waits > 0.0, crawl, follow), {"waits": waits}
+
+    def memory_features(self, memory: Memory) -> Array:
+        """Return whether it waits, shape (n, 1)."""
+        return as_column(memory["waits"])

@@ -1,0 +1,186 @@
+"""Car following at the wheel of a CAV: how people and cruise controls answer the nearest vehicles."""
+
+from math import pi
+from typing import ClassVar
+
+import numpy as np
+from pydantic.dataclasses import dataclass
+
+from unjam.drivers.driver import Formula, Memory
+from unjam.drivers.local_state import LocalState
+from unjam.parameters import STRICT, NotNegative, Positive
+from unjam.physics.arrays import Array, at_least, clip, namespace
+from unjam.physics.idm import IDMParameters, idm_acceleration
+
+SMALLEST_GAP = 0.01
+"""[m]; the intelligent driver model divides by the gap"""
+
+
+@dataclass(frozen=True, config=STRICT)
+class IDM(IDMParameters, Formula):
+    """A CAV that follows like an ideal human driver, without noise and within the action limit.
+
+    Source: Treiber, Hennecke, Helbing 2000; paper Eq. 5-6 with the parameters of Table B1.
+    """
+
+    name: ClassVar[str] = "idm"
+
+    def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
+        """Return the IDM acceleration; nothing is remembered."""
+        gap = at_least(state.leader_gap, SMALLEST_GAP)
+        return idm_acceleration(state.speed, state.leader_speed, gap, self), memory
+
+
+@dataclass(frozen=True, config=STRICT)
+class Human(Formula):
+    """Nobody automated: the vehicle stays one of the road's human drivers, with their noise.
+
+    With this driver the traffic is all-human. It is the simulator that drives.
+    """
+
+    name: ClassVar[str] = "human"
+    native: ClassVar[bool] = True
+
+    def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
+        """Return what the paper's IDM would do; the simulator does not ask."""
+        return IDM().act(state, memory)
+
+
+@dataclass(frozen=True, config=STRICT)
+class OVM(Formula):
+    """Relaxes to an optimal speed that depends on the gap, and to the leader's speed.
+
+    Source: Bando et al. 1995, Phys. Rev. E 51:1035, with relative speed; defaults as Flow's `OVMController`.
+    """
+
+    name: ClassVar[str] = "ovm"
+
+    gap_gain: NotNegative = 1.0
+    """alpha [1/s]"""
+    speed_gain: NotNegative = 1.0
+    """beta [1/s]"""
+    stop_gap: NotNegative = 2.0
+    """h_st: gap below which the optimal speed is zero [m]"""
+    go_gap: Positive = 15.0
+    """h_go: gap from which on it is the largest [m]"""
+    largest_speed: Positive = 30.0
+    """v_max [m/s]"""
+
+    def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
+        """Return the acceleration towards the optimal speed; nothing is remembered."""
+        share = clip((state.leader_gap - self.stop_gap) / (self.go_gap - self.stop_gap), 0.0, 1.0)
+        optimal = self.largest_speed / 2.0 * (1.0 - namespace(share).cos(pi * share))
+        acceleration = self.gap_gain * (optimal - state.speed)
+        return acceleration + self.speed_gain * (state.leader_speed - state.speed), memory
+
+
+@dataclass(frozen=True, config=STRICT)
+class BCM(Formula):
+    """Steers towards equal gaps and equal relative speeds ahead and behind, and towards a desired speed.
+
+    Where all drive so, waves cannot grow; one among people is another matter.
+    Source: Horn and Wang 2017, IEEE Trans. Intell. Transp. Syst. 19(10); defaults as Flow's `BCMController`.
+    """
+
+    name: ClassVar[str] = "bcm"
+
+    gap_gain: NotNegative = 1.0
+    """k_d [1/s2]"""
+    speed_gain: NotNegative = 1.0
+    """k_v [1/s]"""
+    desired_speed_gain: NotNegative = 1.0
+    """k_c [1/s]"""
+    desired_speed: NotNegative = 8.0
+    """[m/s]"""
+
+    def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
+        """Return the bilateral acceleration; nothing is remembered."""
+        speed = state.speed
+        between = (state.leader_speed - speed) - (speed - state.follower_speed)
+        acceleration = (
+            self.gap_gain * (state.leader_gap - state.follower_gap)
+            + self.speed_gain * between
+            + self.desired_speed_gain * (self.desired_speed - speed)
+        )
+        return acceleration, memory
+
+
+@dataclass(frozen=True, config=STRICT)
+class ACC(Formula):
+    """Keeps a constant time gap to the leader, and never drives faster than its set speed.
+
+    The defaults are those fitted to production cars. Source: Milanés and Shladover 2014, Transp. Res. C
+    48:285-300, Eq. 4 and 5.
+    """
+
+    name: ClassVar[str] = "acc"
+
+    time_gap: Positive = 1.1
+    """wanted gap over own speed [s]"""
+    standstill_gap: NotNegative = 2.0
+    """wanted gap of a standing vehicle [m]"""
+    set_speed: Positive = 30.0
+    """speed on a free road [m/s]"""
+    gap_gain: NotNegative = 0.23
+    """acceleration for each metre of gap too much [1/s2]"""
+    speed_gain: NotNegative = 0.07
+    """acceleration for each m/s that the leader is faster [1/s]"""
+    free_gain: NotNegative = 0.4
+    """acceleration for each m/s below the set speed [1/s]"""
+
+    def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
+        """Return the smaller of following and free driving; nothing is remembered."""
+        excess = state.leader_gap - self.standstill_gap - self.time_gap * state.speed
+        following = self.gap_gain * excess + self.speed_gain * (state.leader_speed - state.speed)
+        free = self.free_gain * (self.set_speed - state.speed)
+        return namespace(state.speed).minimum(following, free), memory
+
+
+@dataclass(frozen=True, config=STRICT)
+class LACC(Formula):
+    """Linear adaptive cruise control whose acceleration follows its command with a lag.
+
+    Source: Rajamani 2012, Vehicle Dynamics and Control, chapter 6; the defaults are those of Flow's
+    `LACController`, which also subtracts a vehicle length from the gap (here `standstill_gap`).
+    """
+
+    name: ClassVar[str] = "lacc"
+
+    gap_gain: NotNegative = 0.3
+    """k_1 [1/s2]"""
+    speed_gain: NotNegative = 0.4
+    """k_2 [1/s]"""
+    time_gap: NotNegative = 1.0
+    """h [s]"""
+    standstill_gap: NotNegative = 5.0
+    """wanted gap of a standing vehicle [m]"""
+    lag: Positive = 0.1
+    """tau: time after which the acceleration has come near the command [s]"""
+    time_step: Positive = 0.1
+    """time between two decisions [s]; set by the road"""
+
+    def initial_memory(self, n: int) -> Memory:
+        """Return zero accelerations."""
+        return {"acceleration": np.zeros(n)}
+
+    def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
+        """Return the lagged acceleration, and remember it."""
+        excess = state.leader_gap - self.standstill_gap - self.time_gap * state.speed
+        command = self.gap_gain * excess + self.speed_gain * (state.leader_speed - state.speed)
+        share = min(1.0, self.time_step / self.lag)  # a step longer than the lag reaches the command
+        acceleration = memory["acceleration"] + share * (command - memory["acceleration"])
+        return acceleration, {"acceleration": acceleration}
+
+
+@dataclass(frozen=True, config=STRICT)
+class Constant(Formula):
+    """Asks for the same acceleration in every step; only the shield keeps it from the car ahead."""
+
+    name: ClassVar[str] = "constant"
+
+    acceleration: float = 0.0
+    """[m/s2]"""
+
+    def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
+        """Return the constant; nothing is remembered."""
+        return state.speed * 0.0 + self.acceleration, memory
