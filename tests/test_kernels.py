@@ -136,7 +136,7 @@ assert not pinned()
 values, folder = json.loads({given!r})
 rows, judged = [], []
 config = build(RunConfig, values, "")
-result = unjam.train(config, folder, told=rows.append, progress=lambda *each: judged.append(each))
+result = unjam.train(config, folder, on_iteration=rows.append, progress=lambda *each: judged.append(each))
 print(json.dumps([[row["iteration"] for row in rows], len(judged) > 0, result.gain.count]))
 """
 REFUSED = """

@@ -1,6 +1,6 @@
 """What episodes are made of: `unjam scenarios`, `unjam drivers`, and people made by `unjam fit-drivers`."""
 
-from dataclasses import asdict, fields, is_dataclass
+from dataclasses import asdict, is_dataclass
 from io import BytesIO
 from pathlib import Path
 from typing import Annotated, Any
@@ -36,12 +36,10 @@ def scenarios(
     """
     from rich.markup import escape
 
-    from unjam.scenarios.registry import SCENARIOS, scenario_recipe
+    from unjam.scenarios.registry import SCENARIOS, make_scenario, scenario_recipe
 
-    if picture is not None:
-        if name is None or picture.suffix.lower() != ".png":
-            raise InputError("picture: wants the name of a scenario, and a file that ends in .png")
-        _draw(_scenario(name), name, picture)
+    if picture is not None and (name is None or picture.suffix.lower() != ".png"):
+        raise InputError("picture: wants the name of a scenario, and a file that ends in .png")
     if name is None:
         if json:
             print_json({key: scenario_recipe(scenario) for key, scenario in SCENARIOS.items()})
@@ -54,7 +52,10 @@ def scenarios(
             table.add_row(key, *(facts[fact] for fact in shown), f"{scenario.horizon:,}", warmup)
         console.print(table)
         return
-    scenario = _scenario(name)
+    # Your own network has no default share of CAVs, and gets one here.
+    scenario = make_scenario(name, {"cav_share": SHOWN_SHARE} if name.endswith(".sumocfg") else None)
+    if picture is not None:
+        _draw(scenario, name, picture)
     facts = [*scenario.facts(), *_common_facts(scenario)]
     if json:
         print_json({"name": name, "facts": dict(facts), "parameters": scenario_recipe(scenario)})
@@ -65,13 +66,6 @@ def scenarios(
         table.add_row(*map(escape, fact))
     console.print(table)
     console.print(_parameter_table(parameter_rows(scenario), "parameter (--set key=value)"))
-
-
-def _scenario(name: str) -> Any:
-    """Return a scenario by name; your own network has no default share of CAVs, and gets one here."""
-    from unjam.scenarios.registry import make_scenario
-
-    return make_scenario(name, {"cav_share": SHOWN_SHARE} if name.endswith(".sumocfg") else None)
 
 
 def _draw(scenario: Any, name: str, path: Path) -> None:
@@ -164,10 +158,9 @@ def parameter_rows(instance: Any) -> list[dict[str, Any]]:
     for base in reversed(type(instance).__mro__):  # pydantic forgets the texts of inherited fields
         own = getattr(base, "__pydantic_fields__", {})
         about |= {name: field.description for name, field in own.items() if field.description}
-    values = asdict(instance)
     return [
-        {"name": field.name, "default": values[field.name], "about": about.get(field.name, "")}
-        for field in fields(instance)
+        {"name": name, "default": value, "about": about.get(name, "")}
+        for name, value in asdict(instance).items()
     ]
 
 

@@ -1,12 +1,12 @@
 """What a run is worth: `unjam evaluate`, `unjam model`, `unjam report`; and shipped: `export`, `verify`."""
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from unjam.cli.options import DEFAULT_WORKERS, HumansOption, JsonOption, WorkersOption
+from unjam.cli.options import DEFAULT_WORKERS, HumansOption, JsonOption, WorkersOption, scenario_changes
 from unjam.cli.output import aside, console, counting_steps, metrics_table, new_table, print_json
 from unjam.errors import InputError
 
@@ -39,14 +39,15 @@ def evaluate(
     from unjam.drivers.registry import DRIVERS
     from unjam.reports.html import write_report
     from unjam.reports.story import signed
-    from unjam.training.evaluate import among, comparison, judge
+    from unjam.training.evaluate import comparison, judge
     from unjam.training.folder import read_config
     from unjam.training.train import TrainResult, gain_of
     from unjam.worlds.workers import Workers
 
     if humans is not None and out is None:
         raise InputError("humans: it is not allowed without --out: the run keeps its own evaluation")
-    config = among(read_config(run), humans)
+    config = read_config(run)
+    config = replace(config, road={**config.road, **scenario_changes(humans=humans)})
     if config.tasks:
         raise InputError(f"run: {str(run)!r} is of several roads; allowed: the folder of one of them")
     if not (run / "controller.unjam").is_file():
