@@ -10,14 +10,11 @@ from typing import Annotated
 import typer
 
 from unjam import __version__
-from unjam.cli.controllers import export, verify
 from unjam.cli.drive import drive, watch
-from unjam.cli.fit_drivers import fit_drivers
-from unjam.cli.lists import drivers, scenarios
 from unjam.cli.machine import bench, doctor
-from unjam.cli.results import evaluate, model, report
-from unjam.cli.search import reproduce, search
-from unjam.cli.train import train
+from unjam.cli.parts import drivers, fit_drivers, scenarios
+from unjam.cli.results import evaluate, export, model, report, verify
+from unjam.cli.train import reproduce, search, train
 from unjam.errors import DISK_ERRNOS, UnjamError, disk_error
 
 INTERRUPTED, TERMINATED = 130, 143

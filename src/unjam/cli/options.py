@@ -4,6 +4,7 @@ import inspect
 import os
 from collections.abc import Callable
 from functools import wraps
+from itertools import count
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -159,15 +160,13 @@ def new_folder(out: Path | None, name: str) -> Path:
     """Return the folder for new results: `out`, or the next free one under `runs/`."""
     if out is not None:
         return out
-    words, number = Path(name).stem, 1  # a scenario may be a file
-    while (Path("runs") / f"{words}-{number:03d}").exists():
-        number += 1
-    return Path("runs") / f"{words}-{number:03d}"
+    words = Path(name).stem  # a scenario may be a file
+    folders = (Path("runs") / f"{words}-{number:03d}" for number in count(1))
+    return next(folder for folder in folders if not folder.exists())
 
 
 def executor_named(name: str) -> Executor:
     """Return where trainings run; raise `InputError` where there is no such executor."""
-    for executor in EXECUTORS:
-        if executor == name:
-            return executor
-    raise wrong_name("executor", name, EXECUTORS)
+    if name not in EXECUTORS:
+        raise wrong_name("executor", name, EXECUTORS)
+    return name

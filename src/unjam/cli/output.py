@@ -51,12 +51,10 @@ def metrics_table(rows_by_driver: dict[str, list[dict[str, Any]]]) -> Table:
             if found.count == 0:
                 cells.append("–")
                 continue
-            digits = metric.digits
-            interval = (
-                f" [dim]\\[{found.low:.{digits}f}, {found.high:.{digits}f}][/dim]" if found.count > 1 else ""
-            )
+            mean, low, high = (f"{value:.{metric.digits}f}" for value in (found.mean, found.low, found.high))
+            interval = f" [dim]\\[{low}, {high}][/dim]" if found.count > 1 else ""
             share = f" [dim]{found.count} of {len(rows)}[/dim]" if found.count < len(rows) else ""
-            cells.append(f"{found.mean:.{digits}f}{interval}{share}")
+            cells.append(f"{mean}{interval}{share}")
         table.add_row(metric.label, metric.unit, *cells)
     return table
 
@@ -66,29 +64,25 @@ class Counted:
 
     def __init__(self, label: str, unit: str = "", total: int | None = None) -> None:
         """Prepare to count what is called `label`, in `unit`."""
-        self._label = label
-        self._unit = f" {unit}" if unit else ""
-        self._total = total
-        self._bar: Progress | None = None
+        self._label, self._unit = label, f" {unit}" if unit else ""
+        self._plain = not aside.is_terminal
+        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+        self._bar = Progress(*columns, console=aside, transient=True, disable=self._plain)
+        self._task = self._bar.add_task(label, total=total)
         self._last_line = time.monotonic()
 
     def __enter__(self) -> Self:
-        if aside.is_terminal:
-            columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
-            self._bar = Progress(*columns, TimeRemainingColumn(), console=aside, transient=True)
-            self._bar.start()
-            self._task = self._bar.add_task(self._label, total=self._total)
+        self._bar.start()
         return self
 
     def __exit__(self, *_: object) -> None:
-        if self._bar is not None:
+        if not self._plain:  # it ends a line, even where it is disabled, in older versions of rich
             self._bar.stop()
 
     def __call__(self, done: int, of: int) -> None:
         """Note how many are done, and of how many."""
-        if self._bar is not None:
-            self._bar.update(self._task, completed=done, total=of)
-        elif time.monotonic() - self._last_line > LINE_SECONDS:
+        self._bar.update(self._task, completed=done, total=of)
+        if self._plain and time.monotonic() - self._last_line > LINE_SECONDS:
             self._last_line = time.monotonic()
             aside.print(f"{self._label}: {done:,} of {of:,}{self._unit}")
 

@@ -1,12 +1,12 @@
-"""What a run is worth: `unjam evaluate` and `unjam model` measure it anew, `unjam report` shows it."""
+"""What a run is worth: `unjam evaluate`, `unjam model`, `unjam report`; and shipped: `export`, `verify`."""
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from unjam.cli.options import DEFAULT_WORKERS, HumansOption, JsonOption, WorkersOption
+from unjam.cli.options import DEFAULT_WORKERS, HumansOption, JsonOption, WorkersOption, scenario_changes
 from unjam.cli.output import aside, console, counting_steps, metrics_table, new_table, print_json
 from unjam.errors import InputError
 
@@ -39,14 +39,15 @@ def evaluate(
     from unjam.drivers.registry import DRIVERS
     from unjam.reports.html import write_report
     from unjam.reports.story import signed
-    from unjam.training.evaluate import among, comparison, judge
+    from unjam.training.evaluate import comparison, judge
     from unjam.training.folder import read_config
     from unjam.training.train import TrainResult, gain_of
     from unjam.worlds.workers import Workers
 
     if humans is not None and out is None:
         raise InputError("humans: it is not allowed without --out: the run keeps its own evaluation")
-    config = among(read_config(run), humans)
+    config = read_config(run)
+    config = replace(config, road={**config.road, **scenario_changes(humans=humans)})
     if config.tasks:
         raise InputError(f"run: {str(run)!r} is of several roads; allowed: the folder of one of them")
     if not (run / "controller.unjam").is_file():
@@ -58,9 +59,7 @@ def evaluate(
     write_report([result.folder], result.report)
     if json:
         gain, means = asdict(result.gain) if result.gain else None, found.means()
-        drivers = [
-            {"driver": driver, "episodes": rows, "mean": means[driver]} for driver, rows in found.rows.items()
-        ]
+        drivers = [{"driver": one, "episodes": rows, "mean": means[one]} for one, rows in found.rows.items()]
         print_json({"run": str(run), "scenario": config.scenario, "gain": gain, "drivers": drivers})
         return
     console.print(metrics_table(found.rows))
@@ -129,3 +128,66 @@ def report(
         print_json({"report": str(written), "folders": [str(folder) for folder in folders]})
     else:
         console.print(str(written))
+
+
+def export(
+    source: Annotated[
+        str, typer.Argument(help="Folder of a training run; or any driver, as in drive --driver.")
+    ],
+    to: Annotated[Path, typer.Option("--to", help="The file to write; ends in .unjam.")],
+    onnx: Annotated[
+        bool, typer.Option("--onnx", help="Add the ONNX graph of the whole controller, and write it beside.")
+    ] = False,
+    scenario: Annotated[
+        str,
+        typer.Option(help="Road whose time step and bounds a driver by itself gets.", show_default="ring"),
+    ] = "",
+    json: JsonOption = False,
+) -> None:
+    """Write a controller into one file with all that is needed to run it elsewhere.
+
+    Its manifest says what it observes, in which order and units, what it remembers, and how far it may be
+    trusted. A sample of a held-out episode goes with it, on which `unjam verify` compares.
+
+    Examples:
+
+      unjam export runs/ring-001 --to ring.unjam
+
+      unjam export runs/ring-001 --to ring.unjam --onnx
+
+      unjam export pi:window=30 --scenario merge --to pi.unjam
+    """
+    from unjam.training.export import export_controller
+
+    done = export_controller(source, to, onnx, scenario)
+    if json:
+        files = {"file": str(done.file), "onnx": str(done.graph) if done.graph else None}
+        print_json({**files, "driver": done.driver, "decisions": done.decisions})
+        return
+    for written in filter(None, (done.file, done.graph)):
+        console.print(f"{written}: {written.stat().st_size:,} bytes")
+    aside.print(f"{done.driver}, verified on {done.decisions:,} decisions of a held-out episode")
+
+
+def verify(
+    file: Annotated[Path, typer.Argument(help="A .unjam file, or the folder of a training run.")],
+    json: JsonOption = False,
+) -> None:
+    """Check a controller: hashes, shapes, names, and that its forms agree on its recorded sample.
+
+    Nothing of the file is executed. Exit code 2 and one line where something is wrong.
+
+    Example:
+
+      unjam verify ring.unjam
+    """
+    from rich.markup import escape
+
+    from unjam.controller.verify import verify_controller
+
+    verified = verify_controller(file)
+    if json:
+        print_json({"file": str(file), "ok": True, "verified": {each.name: each.found for each in verified}})
+        return
+    for each in verified:
+        console.print(f"[green]ok[/green] {each.name}: {escape(each.found)}")

@@ -21,12 +21,13 @@ from unjam.training.presets import preset_values
 from unjam.virtual.settings import VirtualSettings
 from unjam.worlds.task import Task
 
-ScenarioChanges = dict[str, Any]
 
-
-def _plain(road: ScenarioChanges) -> ScenarioChanges:
+def _plain(road: dict[str, Any]) -> dict[str, Any]:
     """Return changes as a TOML file gives them back, so that a run knows its own road again."""
     return {key: list(value) if isinstance(value, tuple) else value for key, value in road.items()}
+
+
+ScenarioChanges = Annotated[dict[str, Any], AfterValidator(_plain)]
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -48,7 +49,7 @@ class TaskConfig:
     """One of several roads of a training; what is left out, or empty, is the run's own."""
 
     scenario: str = ""
-    road: Annotated[ScenarioChanges, AfterValidator(_plain)] = field(default_factory=dict)
+    road: ScenarioChanges = field(default_factory=dict)
     """changes to the scenario's parameters, beside the run's"""
     expert: str = ""
     reward: str = ""
@@ -63,7 +64,7 @@ class RunConfig(Agents):
     """One training run. Every key can be set in a TOML file, by `--set key=value`, and in Python."""
 
     scenario: str = "ring"
-    road: Annotated[ScenarioChanges, AfterValidator(_plain)] = field(default_factory=dict)
+    road: ScenarioChanges = field(default_factory=dict)
     """changes to the scenario's parameters"""
     expert: str = "pi"
     """driver that the residual is added to: a name, `path.py:name`, a run folder, a .unjam file; `none`:
@@ -89,8 +90,7 @@ class RunConfig(Agents):
 
     @model_validator(mode="after")
     def _possible(self) -> "RunConfig":
-        self.make_scenario()
-        for road in self.roads().values():
+        for road in (self, *self.roads().values()):
             road.make_scenario()
         return self
 

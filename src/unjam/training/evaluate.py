@@ -5,7 +5,7 @@
 
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ from safetensors.numpy import save
 from unjam.controller import make_driver
 from unjam.drivers.driver import Driver
 from unjam.drivers.registry import driver_names, free_label
-from unjam.errors import DiskError, EpisodeError, InputError, MissingPartError, UnjamError, wrong
+from unjam.errors import InputError, wrong
 from unjam.files import make_folder, to_json, write_whole
 from unjam.manifest import manifest
 from unjam.measures.metrics import METRICS, measure
@@ -26,6 +26,7 @@ from unjam.reports.results import PICTURED
 from unjam.scenarios.registry import make_scenario
 from unjam.scenarios.scenario import Scenario
 from unjam.training.config import RunConfig
+from unjam.training.executors import error_named
 from unjam.training.folder import make_new_folder
 from unjam.worlds.episode import can_drive
 from unjam.worlds.record import Episode
@@ -38,7 +39,10 @@ VALIDATION = 1_000_033
 """first number of the seeds that choose a controller"""
 TRAINED = "trained"
 """label of the trained controller in tables and pictures"""
-ABOUT_SHOWN = ("drawn", "loop_length", "crossings", "branches", "limit_speed", "vehicle_ids", "cav_ids")
+ABOUT_SHOWN = (
+    *("step", "seed", "drawn", "loop_length", "crossings", "branches", "limit_speed"),
+    *("vehicle_ids", "cav_ids"),
+)
 """what is written of an episode that pictures show, beside its arrays"""
 
 Progress = Callable[[tuple[str, int], int], None]
@@ -101,10 +105,8 @@ def raise_failure(rows: Sequence[dict[str, Any]]) -> None:
     """Raise the first failure among the rows of episodes, as the error that it was."""
     for row in rows:
         if row["status"] == "failed":
-            kinds = {kind.__name__: kind for kind in (InputError, MissingPartError, DiskError, EpisodeError)}
-            kind = kinds.get(row["error"], UnjamError)
-            again = "" if kind is InputError else f" (seed {row['seed']})"
-            raise kind(f"{row['reason']}{again}")
+            again = "" if row["error"] == InputError.__name__ else f" (seed {row['seed']})"
+            raise error_named(row["error"], f"{row['reason']}{again}")
 
 
 def raise_failures(result: "Evaluation | DriveResult") -> None:
@@ -127,24 +129,12 @@ def save_evaluation(folder: Path, evaluation: Evaluation, about: dict[str, Any])
         for name in PICTURED
     }
     about_shown = [
-        {
-            "driver": label,
-            "step": episode.step,
-            "seed": list(episode.seed),
-            **{name: getattr(episode, name) for name in ABOUT_SHOWN},
-        }
+        {"driver": label, **{name: getattr(episode, name) for name in ABOUT_SHOWN}}
         for label, episode in evaluation.shown.items()
     ]
     write_whole(folder / "shown.safetensors", save(arrays))
     write_whole(folder / "episodes.parquet", frame.to_parquet())
     write_whole(folder / "evaluation.json", to_json({**about, "rows": rows, "shown": about_shown}, indent=1))
-
-
-def among(config: RunConfig, humans: Path | None) -> RunConfig:
-    """Return a run's configuration with other people on its road: those of a population's file, if any."""
-    if humans is None:
-        return config
-    return replace(config, road={**config.road, "population": str(humans.absolute())})
 
 
 def comparison(config: RunConfig, folder: Path, baselines: Sequence[str]) -> dict[str, Driver]:

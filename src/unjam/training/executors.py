@@ -1,5 +1,11 @@
-"""Running many command lines of unjam at once: in processes of this machine, or on a Ray cluster."""
+"""Trainings in processes of their own: many command lines at once, here or on a Ray cluster; or one alone.
 
+The one alone is for a program that imported NumPy before unjam: see `unjam.kernels`. Its child, `python -m
+unjam.training.executors`, reads one line of JSON and answers lines: a list of a word and what belongs to it.
+"""
+
+import json
+import os
 import shlex
 import subprocess
 import sys
@@ -7,20 +13,25 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, as_completed
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
+from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from unjam.errors import MissingPartError, UnjamError
 from unjam.files import make_folder, write_whole
+from unjam.parameters import build
 
 if TYPE_CHECKING:  # the command line asks which executors there are: it is to be quick
     from unjam.training.config import RunConfig
+    from unjam.training.evaluate import Progress, Rows
 
 Executor = Literal["local", "ray"]
 EXECUTORS: tuple[Executor, ...] = ("local", "ray")
 OnLine = Callable[[str], None]
 """gets a line of progress"""
+OnIteration = Callable[[dict[str, Any]], None]
+"""called with each row of progress as it is written"""
 ATTEMPTS = 3
 """how often a command line is started that a signal kills, or whose machine is lost"""
 
@@ -113,12 +124,14 @@ def running(executor: Executor, workers: int) -> Iterator[Callable[[Command], Fu
     Raises:
         MissingPartError: Ray is not installed.
     """
-    place = _ray(workers) if executor == "ray" else _this_machine()
+    processes = Processes()
+    place = _ray(workers) if executor == "ray" else nullcontext(processes.run)
     with ThreadPoolExecutor(workers) as threads, place as run:
         try:
             yield lambda command: threads.submit(run, command)
         except BaseException:
             threads.shutdown(wait=False, cancel_futures=True)
+            processes.stop()
             raise
 
 
@@ -146,16 +159,6 @@ def run_all(commands: dict[str, Command], workers: int, executor: Executor, on_l
 
 
 @contextmanager
-def _this_machine() -> Iterator[Callable[[Command], int]]:
-    processes = Processes()
-    try:
-        yield processes.run
-    except BaseException:
-        processes.stop()
-        raise
-
-
-@contextmanager
 def _ray(workers: int) -> Iterator[Callable[[Command], int]]:
     """Give what runs a command line somewhere on the Ray cluster that is there, or on one of this machine."""
     try:
@@ -175,3 +178,74 @@ def _ray(workers: int) -> Iterator[Callable[[Command], int]]:
 
 def _run_here(command: Command) -> int:
     return Processes().run(command)
+
+
+def train_apart(
+    config: "RunConfig",
+    folder: Path,
+    resume: bool,
+    on_iteration: OnIteration | None,
+    progress: "Progress | None",
+) -> "dict[str, Rows]":
+    """Train as `unjam.train` does, and return the rows of the judgement, by road and driver.
+
+    Raises:
+        UnjamError: of the same kind as in this process.
+    """
+    command = [sys.executable, "-m", "unjam.training.executors"]
+    child = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, encoding="utf-8")
+    try:
+        assert child.stdin is not None
+        assert child.stdout is not None
+        child.stdin.write(json.dumps([asdict(config), os.fspath(folder), resume, sys.path]))
+        child.stdin.close()
+        for line in child.stdout:
+            match json.loads(line):
+                case ["row", row] if on_iteration is not None:
+                    on_iteration(row)
+                case ["judged", driver, episode, steps] if progress is not None:
+                    progress((driver, episode), steps)
+                case ["error", kind, words]:
+                    raise error_named(kind, words)
+                case ["done", rows]:
+                    return rows
+        raise UnjamError(f"training: its process ended with code {child.wait()}")
+    finally:
+        child.terminate()  # where it has ended by itself, this does nothing
+        child.wait()
+
+
+def error_named(kind: str, words: str) -> UnjamError:
+    """Return the error that another process told of; of a kind that is not ours, it is an `UnjamError`."""
+    kinds = {each.__name__: each for each in UnjamError.__subclasses__()}
+    return kinds.get(kind, UnjamError)(words)
+
+
+def main() -> None:
+    """Train as the line on standard input says."""
+    answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
+    os.dup2(2, 1)  # SUMO and user code may print: not into the answers
+    values, folder, resume, path = json.loads(sys.stdin.read())
+    sys.path[:] = path  # a user's driver imports what it did in the program
+
+    def say(*words: Any) -> None:
+        print(json.dumps(words), file=answers, flush=True)
+
+    try:
+        from unjam.training.config import RunConfig
+        from unjam.training.train import train_here
+
+        rows = train_here(
+            build(RunConfig, values, ""),
+            Path(folder),
+            resume,
+            lambda row: say("row", row),
+            lambda episode, steps: say("judged", *episode, steps),
+        )
+        say("done", rows)
+    except UnjamError as error:
+        say("error", type(error).__name__, str(error))
+
+
+if __name__ == "__main__":
+    main()

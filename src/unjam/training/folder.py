@@ -36,22 +36,18 @@ STATE, TENSORS = "state.json", "tensors.safetensors"
 def check_possible(config: RunConfig) -> None:
     """Raise `InputError` where an expert, what the network sees, a reward or a baseline is at fault."""
     for road in config.roads().values():
-        _check_road(road)
+        scenario = road.make_scenario()
+        for name in road.policy.observe:
+            needs = feature(name).needs
+            if needs == "loop" and not scenario.closed:
+                raise InputError(f"policy.observe: {name!r} is not allowed on a road with ends")
+            if needs == "coordinate" and not scenario.has_coordinate:
+                raise InputError(f"policy.observe: {name!r} is not allowed on a network of one's own")
+        observation_size(road.policy.observe, road.make_expert())
+        make_reward(road.reward or scenario.reward)
+        for name in road.evaluation.baselines:
+            make_driver(name, scenario.decision_step)
     config.make_tasks()
-
-
-def _check_road(config: RunConfig) -> None:
-    scenario = config.make_scenario()
-    for name in config.policy.observe:
-        needs = feature(name).needs
-        if needs == "loop" and not scenario.closed:
-            raise InputError(f"policy.observe: {name!r} is not allowed on a road with ends")
-        if needs == "coordinate" and not scenario.has_coordinate:
-            raise InputError(f"policy.observe: {name!r} is not allowed on a network of one's own")
-    observation_size(config.policy.observe, config.make_expert())
-    make_reward(config.reward or scenario.reward)
-    for name in config.evaluation.baselines:
-        make_driver(name, scenario.decision_step)
 
 
 def make_new_folder(folder: Path, otherwise: str = "") -> None:
@@ -157,6 +153,4 @@ def _hash(state: dict[str, Any], data: bytes) -> str:
 
 
 def _places(folder: Path) -> list[Path]:
-    if not folder.is_dir():
-        return []
-    return sorted(place for place in folder.iterdir() if place.is_dir() and place.name.isdigit())
+    return sorted(place for place in folder.glob("*") if place.is_dir() and place.name.isdigit())

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from unjam.errors import InputError
 from unjam.files import to_json, write_whole
@@ -21,7 +20,6 @@ from unjam.scenarios.scenario import Scenario
 from unjam.training.config import RunConfig
 from unjam.training.folder import load_checkpoint
 from unjam.virtual.comparison import OneStepErrors, one_step_errors, open_loop, recorded, replay
-from unjam.virtual.data import ActualData
 from unjam.virtual.model import NUMBERS, TARGETS, EnvironmentModel
 from unjam.virtual.model_error import root_mean_square
 from unjam.worlds.record import Floats
@@ -51,7 +49,12 @@ def newest_model_facts(folder: Path, config: RunConfig) -> dict[str, Any]:
     Raises:
         InputError: the run has no virtual environment, or no checkpoint yet.
     """
-    _check_virtual(folder, config)
+    if config.tasks:
+        raise InputError(f"run: {str(folder)!r} is of several roads; allowed: a run of one")
+    if config.virtual.virtual_ratio == 0:
+        raise InputError(
+            f"run: {str(folder)!r} has no virtual environment: its virtual.virtual_ratio is 0; allowed: > 0"
+        )
     kept, progress = read_model(folder), read_progress(folder)
     if kept is None or not progress or kept.get("iteration") != progress[-1]["iteration"]:
         write_model_facts(folder, config)
@@ -69,9 +72,8 @@ def measure_model(folder: Path, config: RunConfig) -> dict[str, Any]:
     """Return the facts about the virtual environment in a run's newest checkpoint, to four digits.
 
     Raises:
-        InputError: the run has no virtual environment, or no checkpoint yet.
+        InputError: the run has no checkpoint yet.
     """
-    _check_virtual(folder, config)
     checkpoint = load_checkpoint(folder / "checkpoint")
     if checkpoint is None:
         raise InputError(
@@ -103,15 +105,6 @@ def measure_model(folder: Path, config: RunConfig) -> dict[str, Any]:
             "bound": _bounds(imagination, newest, config.learner.gamma),
         }
     )
-
-
-def _check_virtual(folder: Path, config: RunConfig) -> None:
-    if config.tasks:
-        raise InputError(f"run: {str(folder)!r} is of several roads; allowed: a run of one")
-    if config.virtual.virtual_ratio == 0:
-        raise InputError(
-            f"run: {str(folder)!r} has no virtual environment: its virtual.virtual_ratio is 0; allowed: > 0"
-        )
 
 
 def _by_bins(values: Floats, errors: OneStepErrors) -> dict[str, Any]:
@@ -156,6 +149,8 @@ def _replayed(imagination: Imagination, scenario: Scenario, generator: np.random
     moments = np.unique(np.linspace(0, decisions - 1, MOMENTS).round().astype(int))
     found, base = (open_loop(each, data, starts, decisions, scenario) for each in (model, alone))
     examples = starts[generator.permutation(len(starts))[:EXAMPLES]]
+    actual = recorded(data, examples, decisions)
+    members, lone = (replay(each, data, examples, decisions, scenario) for each in (model, alone))
     return {
         "seconds": (moments + 1) * scenario.decision_step,
         "starts": len(starts),
@@ -168,36 +163,22 @@ def _replayed(imagination: Imagination, scenario: Scenario, generator: np.random
             }
             for name in NUMBERS
         },
-        "examples": _examples(data, examples, moments, (model, alone), scenario),
+        "examples": [
+            {
+                "begins": at * scenario.decision_step,
+                "drawn": data.recordings[place].drawn,
+                "numbers": {
+                    name: {
+                        "actual": actual[name][example, 1:][moments],
+                        "members": members[name][:, example, moments],
+                        "base": lone[name][0, example, moments],
+                    }
+                    for name in SHOWN
+                },
+            }
+            for example, (place, at) in enumerate(examples)
+        ],
     }
-
-
-def _examples(
-    data: ActualData,
-    starts: NDArray[np.int64],
-    moments: NDArray[np.int64],
-    models: tuple[EnvironmentModel, EnvironmentModel],
-    scenario: Scenario,
-) -> list[dict[str, Any]]:
-    """Return what happened after `starts`, what each member of the model says, and what the base says."""
-    decisions = int(moments[-1]) + 1
-    actual = recorded(data, starts, decisions)
-    model, base = (replay(each, data, starts, decisions, scenario) for each in models)
-    return [
-        {
-            "begins": at * scenario.decision_step,
-            "drawn": data.recordings[place].drawn,
-            "numbers": {
-                name: {
-                    "actual": actual[name][example, 1:][moments],
-                    "members": model[name][:, example, moments],
-                    "base": base[name][0, example, moments],
-                }
-                for name in SHOWN
-            },
-        }
-        for example, (place, at) in enumerate(starts)
-    ]
 
 
 def _bounds(imagination: Imagination, newest: dict[str, Any], gamma: float) -> dict[str, Any] | None:

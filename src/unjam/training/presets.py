@@ -73,10 +73,7 @@ BEST: dict[str, dict[str, Any]] = {
     "merge": {
         "expert": CLOSING_ABSORBER,
         "steps": 300_000,
-        "policy": {
-            "observe": ["local", "expert_acceleration", "expert_memory"],
-            "exploration_std": 0.4,
-        },
+        "policy": {"observe": ["local", "expert_acceleration", "expert_memory"], "exploration_std": 0.4},
         "trpo": {"batch_steps": 6000, "gamma": 0.998, "gae_lambda": 0.99},
         "virtual": {"virtual_ratio": 0.0},
         "evaluation": {"every": 10, "validation_episodes": 32},

@@ -5,9 +5,10 @@ choose a training's controller anyway; the held-out ones stay unseen.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from dataclasses import asdict, dataclass, replace
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,7 +23,6 @@ from unjam.training.folder import check_possible
 
 if TYPE_CHECKING:
     from optuna import Study
-    from optuna.trial import FrozenTrial
     from optuna.trial import Trial as OptunaTrial
 
 CONFIG, FOUND, BEST = "config.toml", "search.json", "best.toml"
@@ -154,19 +154,17 @@ def search(
         UnjamError: all trainings failed.
     """
     study = _study(base, space, folder)
-    waiting = [trial for trial in study.get_trials() if trial.state.name == "RUNNING"]
+    proposed = _proposed(study, space, trials)
     with running(executor, workers) as start:
         jobs: dict[Future[int], int] = {}
         while True:
-            while len(jobs) < workers and (trial := _next(study, space, trials, waiting)) is not None:
-                number, values = trial
+            for number, values in islice(proposed, workers - len(jobs)):
                 jobs[start(_command(base, folder, number, values))] = number
             if not jobs:
                 break
             for done in wait(jobs, return_when=FIRST_COMPLETED).done:
                 number = jobs.pop(done)
-                gain = None if done.result() else gain_of(_trial_folder(folder, number))
-                _tell(study, number, gain)
+                _tell(study, number, None if done.result() else gain_of(_trial_folder(folder, number)))
                 on_line(_words(study, number, trials))
     found = [
         Trial(trial.number, trial.params, _trial_folder(folder, trial.number), trial.value)
@@ -222,21 +220,18 @@ def _study(base: RunConfig, space: Space, folder: Path) -> "Study":
     return study
 
 
-def _next(
-    study: "Study", space: Space, trials: int, waiting: list["FrozenTrial"]
-) -> tuple[int, dict[str, Any]] | None:
-    """Return number and values of the next trial: one that was stopped, or a new one; None after the last."""
-    while waiting:
-        stopped = waiting.pop(0)
+def _proposed(study: "Study", space: Space, trials: int) -> Iterator[tuple[int, dict[str, Any]]]:
+    """Yield number and values of what is to be tried: what was stopped, then new ones, so many in all."""
+    for stopped in [trial for trial in study.get_trials() if trial.state.name == "RUNNING"]:
         if stopped.params.keys() == space.keys():
-            return stopped.number, stopped.params
-        _tell(study, stopped.number, None)  # it was stopped before it had all its values
-    if len(study.get_trials(deepcopy=False)) >= trials:
-        return None
-    trial = study.ask()
-    for key, values in space.items():
-        values.suggest(trial, key)
-    return trial.number, trial.params
+            yield stopped.number, stopped.params
+        else:
+            _tell(study, stopped.number, None)  # it was stopped before it had all its values
+    while len(study.get_trials(deepcopy=False)) < trials:
+        trial = study.ask()
+        for key, values in space.items():
+            values.suggest(trial, key)
+        yield trial.number, trial.params
 
 
 def _tell(study: "Study", number: int, gain: float | None) -> None:

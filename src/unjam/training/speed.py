@@ -183,10 +183,10 @@ def _virtual_rate(
     world = VirtualDynamics(model, scenario, "", generator)
     starts = draw_starts(data, rows, 1, (0,))
 
-    def run() -> None:
-        imagine(driver, world, begin(data, starts, driver.expert, "cpu"), decisions, generator)
-
-    return _rate(run, rows * decisions)
+    return _rate(
+        lambda: imagine(driver, world, begin(data, starts, driver.expert, "cpu"), decisions, generator),
+        rows * decisions,
+    )
 
 
 def _step(simulation: Simulation, steps: int) -> None:

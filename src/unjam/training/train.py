@@ -21,9 +21,9 @@ from unjam.measures.metrics import measure
 from unjam.measures.statistics import Estimate, paired_difference
 from unjam.reports.html import write_report
 from unjam.reports.results import read_progress
-from unjam.training.apart import OnIteration, OnProgress, Rows, train_apart
 from unjam.training.config import RunConfig, to_toml
-from unjam.training.evaluate import TRAINED, VALIDATION, judge, raise_failure
+from unjam.training.evaluate import TRAINED, VALIDATION, Progress, Rows, judge, raise_failure
+from unjam.training.executors import OnIteration, train_apart
 from unjam.training.folder import (
     check_possible,
     continue_folder,
@@ -71,7 +71,7 @@ def train(
     folder: Path | str,
     resume: bool = False,
     on_iteration: OnIteration | None = None,
-    progress: OnProgress | None = None,
+    progress: Progress | None = None,
 ) -> TrainResult:
     """Train as `config` says into `folder`, judge the controller on held-out seeds, and write the report.
 
@@ -108,7 +108,7 @@ def train_here(
     folder: Path,
     resume: bool = False,
     on_iteration: OnIteration | None = None,
-    progress: OnProgress | None = None,
+    progress: Progress | None = None,
 ) -> dict[str, Rows]:
     """Train in this process, as `train` does; return the rows of the judgement, by road and driver."""
     check_possible(config)  # what is wrong is said before anything is written
@@ -153,7 +153,7 @@ class Trainer:
         self.tasks = config.make_tasks()
         self.folders = [folder / task.name for task in self.tasks]
         self.training = begin(self.tasks, config.policy, config.learner, config.virtual, config.seed)
-        self._on_iteration = on_iteration
+        self._on_iteration = on_iteration or (lambda row: None)
         total = sum(task.weight for task in self.tasks)
         self._shares = [task.weight / total for task in self.tasks]
         self._validation_best = -np.inf
@@ -234,8 +234,7 @@ class Trainer:
             **({"expert_returns": self._expert_returns} if self.config.tasks else {}),
         }
         save_checkpoint(self.folder / "checkpoint", state, tensors)
-        if self._on_iteration is not None:
-            self._on_iteration(whole)
+        self._on_iteration(whole)
 
     def returns_of(self, drivers: Sequence[Driver]) -> list[float]:
         """Return the mean return on the validation seeds, by road, each driven by its own of `drivers`."""

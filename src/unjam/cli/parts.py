@@ -1,14 +1,14 @@
-"""`unjam scenarios` and `unjam drivers`: what there is."""
+"""What episodes are made of: `unjam scenarios`, `unjam drivers`, and people made by `unjam fit-drivers`."""
 
-from dataclasses import asdict, fields, is_dataclass
+from dataclasses import asdict, is_dataclass
 from io import BytesIO
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from unjam.cli.options import JsonOption
-from unjam.cli.output import console, new_table, print_json
+from unjam.cli.options import JsonOption, SeedOption, assignments
+from unjam.cli.output import Counted, aside, console, new_table, print_json
 from unjam.errors import InputError
 
 SHOWN_SHARE = 0.1
@@ -36,12 +36,10 @@ def scenarios(
     """
     from rich.markup import escape
 
-    from unjam.scenarios.registry import SCENARIOS, scenario_recipe
+    from unjam.scenarios.registry import SCENARIOS, make_scenario, scenario_recipe
 
-    if picture is not None:
-        if name is None or picture.suffix.lower() != ".png":
-            raise InputError("picture: wants the name of a scenario, and a file that ends in .png")
-        _draw(_scenario(name), name, picture)
+    if picture is not None and (name is None or picture.suffix.lower() != ".png"):
+        raise InputError("picture: wants the name of a scenario, and a file that ends in .png")
     if name is None:
         if json:
             print_json({key: scenario_recipe(scenario) for key, scenario in SCENARIOS.items()})
@@ -54,7 +52,10 @@ def scenarios(
             table.add_row(key, *(facts[fact] for fact in shown), f"{scenario.horizon:,}", warmup)
         console.print(table)
         return
-    scenario = _scenario(name)
+    # Your own network has no default share of CAVs, and gets one here.
+    scenario = make_scenario(name, {"cav_share": SHOWN_SHARE} if name.endswith(".sumocfg") else None)
+    if picture is not None:
+        _draw(scenario, name, picture)
     facts = [*scenario.facts(), *_common_facts(scenario)]
     if json:
         print_json({"name": name, "facts": dict(facts), "parameters": scenario_recipe(scenario)})
@@ -65,13 +66,6 @@ def scenarios(
         table.add_row(*map(escape, fact))
     console.print(table)
     console.print(_parameter_table(parameter_rows(scenario), "parameter (--set key=value)"))
-
-
-def _scenario(name: str) -> Any:
-    """Return a scenario by name; your own network has no default share of CAVs, and gets one here."""
-    from unjam.scenarios.registry import make_scenario
-
-    return make_scenario(name, {"cav_share": SHOWN_SHARE} if name.endswith(".sumocfg") else None)
 
 
 def _draw(scenario: Any, name: str, path: Path) -> None:
@@ -121,10 +115,10 @@ def drivers(json: JsonOption = False) -> None:
     from unjam.controller import SHIPPED, shipped_names
     from unjam.drivers.registry import DRIVERS
 
-    listed: dict[str, dict[str, Any]] = {}
-    for name, kind in DRIVERS.items():
-        about = (kind.__doc__ or "").strip().splitlines()[0]
-        listed[name] = {"about": about, "parameters": parameter_rows(kind())}
+    listed: dict[str, dict[str, Any]] = {
+        name: {"about": (kind.__doc__ or "").strip().splitlines()[0], "parameters": parameter_rows(kind())}
+        for name, kind in DRIVERS.items()
+    }
     for name in shipped_names():
         listed[f"{SHIPPED}{name}"] = {"about": _about_shipped(name), "parameters": []}
     if json:
@@ -164,10 +158,9 @@ def parameter_rows(instance: Any) -> list[dict[str, Any]]:
     for base in reversed(type(instance).__mro__):  # pydantic forgets the texts of inherited fields
         own = getattr(base, "__pydantic_fields__", {})
         about |= {name: field.description for name, field in own.items() if field.description}
-    values = asdict(instance)
     return [
-        {"name": field.name, "default": values[field.name], "about": about.get(field.name, "")}
-        for field in fields(instance)
+        {"name": name, "default": value, "about": about.get(name, "")}
+        for name, value in asdict(instance).items()
     ]
 
 
@@ -181,3 +174,75 @@ def _parameter_table(rows: list[dict[str, Any]], title: str) -> Any:
             value = ", ".join(f"{key}={entry:g}" for key, entry in value.items())
         table.add_row(f"  {row['name']}", escape(str(value)), escape(" ".join(row["about"].split())))
     return table
+
+
+def fit_drivers(
+    data: Annotated[
+        list[Path],
+        typer.Argument(help="Recorded trajectories: .parquet or .csv; several files are one data set."),
+    ],
+    out: Annotated[Path, typer.Option(help="File for the population.")] = Path("drivers.json"),
+    format: Annotated[
+        str,
+        typer.Option(
+            help="table, ngsim, ngsim-reconstructed, openacc.", show_default="told from the columns"
+        ),
+    ] = "",
+    driver: Annotated[
+        str, typer.Option(help="Columns of a table that together name the driver: period,follower.")
+    ] = "",
+    only: Annotated[
+        list[str] | None, typer.Option(help="Only trajectories with column=value, like kind=human.")
+    ] = None,
+    residual: Annotated[
+        bool, typer.Option(help="Also learn what all drivers do beside their own IDM: minutes.")
+    ] = False,
+    cut_bad: Annotated[
+        bool, typer.Option("--cut-bad", help="Cut bad rows out of their trajectories instead of refusing.")
+    ] = False,
+    settings: Annotated[
+        list[str] | None,
+        typer.Option("--set", help="calibration.generations=200, multi_step.steps=500 and the like."),
+    ] = None,
+    seed: SeedOption = 0,
+    json: JsonOption = False,
+) -> None:
+    """Calibrate how people drive on recorded trajectories: a population that any road can have.
+
+    All drivers get the IDM with which the simulated gaps are nearest to the recorded ones, each with a time
+    headway of its own (--set 'own=["time_headway","minimum_gap"]' says what else). What was read and what was
+    not is said line by line.
+
+    Examples:
+
+      unjam fit-drivers data.parquet
+
+      unjam fit-drivers trajectories.csv --format ngsim --out people.json --residual
+
+      unjam drive ring-jammed -d human -d pi --humans drivers.json
+    """
+    from unjam.following.fit_drivers import fit_from_files
+    from unjam.scenarios.population import write_population
+
+    changes: dict[str, Any] = {"residual": residual, "seed": seed, **assignments(settings)}
+    columns = tuple(name for name in driver.split(",") if name)
+    chosen = {name: str(value) for name, value in assignments(only).items()}
+    with Counted("calibrating drivers") as counted:
+        found = fit_from_files(data, changes, format, cut_bad, columns, chosen, out, counted)
+    write_population(out, found.population)
+    if json:
+        print_json({"population": str(out), "read": found.words, **found.facts()})
+        return
+    for line in found.words:
+        aside.print(line)
+    population: Any = found.population
+    typical = asdict(population.typical)
+    table = new_table(("parameter",), ("one for all", "mean", "std", "quartiles of the drivers"))
+    for name, spread in population.spread().items():
+        quartiles = "  ".join(f"{value:.2f}" for value in spread["quartiles"])
+        values = (typical[name], spread["mean"], spread["std"])
+        table.add_row(name, *(f"{value:.2f}" for value in values), quartiles)
+    console.print(table)
+    for line in found.verdict():
+        console.print(line)
+    aside.print(f"population: {out}")
