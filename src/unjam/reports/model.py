@@ -225,7 +225,7 @@ def errors(facts: dict[str, Any]) -> Figure:
         axes.plot(found["at"], found["model"][name], color=MODEL, lw=1.6, marker="o", ms=3)
         axes.set_ylim(bottom=0)
         _titled(axes, f"error one step ahead: {NUMBERS[name][0]}", _named(by))
-    _legend(figure, panels[0], 5)
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper left", ncols=5)
     return figure
 
 
@@ -246,7 +246,7 @@ def examples(facts: dict[str, Any]) -> Figure:
         if name == "leader_gap":
             axes.set_ylim(bottom=0)
         _titled(axes, f"{_named(name)}, from {each['begins']:.0f} s on", "time ahead [s]")
-    _legend(figure, panels[0], 3)
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper left", ncols=3)
     return figure
 
 
@@ -262,10 +262,6 @@ def _named(name: str) -> str:
 
 
 def _titled(axes: Axes, title: str, horizontal: str) -> None:
-    axes.set_title(title, loc="left", fontsize=9, color=INK)
+    axes.set_title(title)
     axes.set_xlabel(horizontal)
     axes.margins(x=0.02)
-
-
-def _legend(figure: Figure, axes: Axes, columns: int) -> None:
-    figure.legend(*axes.get_legend_handles_labels(), loc="outside upper left", ncols=columns, fontsize=9)

@@ -28,7 +28,7 @@ from unjam.following.open_loop import always, idm_follow, with_residual
 from unjam.following.pairs import SPLITS, Floats, Moments, moments_of, of_split, split_by_trajectory
 from unjam.physics.arrays import at_least
 from unjam.physics.idm import PAPER_IDM, idm_acceleration
-from unjam.reports.figures import INK, LINES, STYLE
+from unjam.reports.figures import INK, LINES, STYLE, new_figure
 from unjam.studies.study import OnProgress, Part, Study, Table, about_study, measure_parts
 
 Split = Literal["trajectories", "rows", "released"]
@@ -212,23 +212,23 @@ def run(
         for row in rows
     ]
     write_whole(folder / "figure-6.json", to_json({"manifest": about, "rows": kept}, indent=1))
-    picture(rows).savefig(folder / "figure-6.png", dpi=130)
+    picture(rows).savefig(folder / "figure-6.png")
 
 
+@rc_context(STYLE)
 def picture(rows: Table) -> Figure:
     """Return training loss, error by the share of the data, and the same with more gradient steps."""
     main = [row for row in rows if row["split"] == "trajectories" and row["driver"] == "other"]
-    with rc_context(STYLE):
-        figure = Figure(figsize=(11, 3.7), layout="constrained")
-        left, middle, right = figure.subplots(1, 3)
-        _losses(left, [row for row in main if row["size"] == 1.0])
-        _errors(middle, [row for row in main if not row["longer"]], "200 passes, as in the paper")
-        longer = [row for row in main if row["longer"] or row["size"] == 0.3]
-        _errors(right, longer, "at 1 % as many gradient steps as at 30 %")
-        right.sharey(middle)
-        middle.set_ylabel("error of the acceleration, noise aside [m/s²]")
-        middle.legend()
-        return figure
+    figure = new_figure(3.7, width=11)
+    left, middle, right = figure.subplots(1, 3)
+    _losses(left, [row for row in main if row["size"] == 1.0])
+    _errors(middle, [row for row in main if not row["longer"]], "200 passes, as in the paper")
+    longer = [row for row in main if row["longer"] or row["size"] == 0.3]
+    _errors(right, longer, "at 1 % as many gradient steps as at 30 %")
+    right.sharey(middle)
+    middle.set_ylabel("error of the acceleration, noise aside [m/s²]")
+    middle.legend()
+    return figure
 
 
 def _losses(axes: Axes, rows: Table) -> None:
@@ -265,7 +265,7 @@ def _logarithmic(axes: Axes, title: str) -> None:
     axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 4.0, 6.0)))
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axes.yaxis.set_minor_locator(NullLocator())
-    axes.set_title(title, loc="left", fontsize=9, color=INK)
+    axes.set_title(title)
 
 
 FIGURE_6 = Study(

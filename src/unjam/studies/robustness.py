@@ -1,4 +1,10 @@
-"""Robustness: trained controllers and experts on roads, and with sensors, that are not those of training."""
+"""What controllers are worth where they have not trained: on other roads, with other sensors and people.
+
+Three studies: the shipped controllers under single changes (`robustness`); other numbers of vehicles
+(Figure 10); and calibrated people on the ring: are their waves like real ones, and does a CAV still calm
+them? In the experiment of Sugiyama et al. (2008), 22 cars on 230 m, a jam arose by itself and travelled
+against the traffic at about 20 km/h, 5.6 m/s; on motorways it is 15 to 20 km/h.
+"""
 
 import json
 from dataclasses import dataclass, field
@@ -6,21 +12,53 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 
 from unjam.controller import make_driver
 from unjam.drivers.driver import Driver
 from unjam.drivers.wrappers import Impaired
-from unjam.files import to_json, write_whole
+from unjam.files import make_folder, to_json, write_whole
+from unjam.manifest import manifest
+from unjam.measures.metrics import measure, wave_speed
 from unjam.measures.statistics import paired_difference
-from unjam.studies.study import REFERENCES, ROADS, PlannedRun, Study, StudyFolder, Table
-from unjam.studies.table import entries, estimates, interval, number
+from unjam.reports.figures import png_bytes, space_time
+from unjam.reports.results import read_results
+from unjam.scenarios.registry import make_scenario
+from unjam.studies.comparison import (
+    HONEST,
+    entries,
+    estimates,
+    interval,
+    number,
+    table_rows,
+    unbroken,
+    write_table,
+)
+from unjam.studies.study import (
+    REFERENCES,
+    ROADS,
+    OnProgress,
+    PlannedRun,
+    Study,
+    StudyFolder,
+    Table,
+    planned,
+)
 from unjam.training.config import load_config
-from unjam.training.evaluate import evaluate, held_out_seeds
-from unjam.worlds.workers import Workers
+from unjam.training.evaluate import (
+    TRAINED,
+    Evaluation,
+    evaluate,
+    held_out_seeds,
+    raise_failure,
+    save_evaluation,
+)
+from unjam.worlds.record import Episode
+from unjam.worlds.workers import EpisodeTask, Workers
 
 EPISODES = 10
-TRAINED = "trained"
+"""of each driver under each condition"""
 SHOWN = ("mean_speed", "mean_speed_steady", "speed_std_fleet", "min_headway", "collisions", "backlog_veh")
 PEOPLE = {
     "desired_speed": 17.49,
@@ -93,6 +131,26 @@ EXPERTS = {
 """the shipped controller's own comes first"""
 
 
+VOLUMES = ("ring-5", "ring-11", "ring")
+"""of Figure 10; controllers of the last are carried over to OTHER_ROADS"""
+AMONG_VOLUMES = ("trpo", "ppo", "sac", "without-model", "proposed", "ours")
+CARRIED = ("proposed", "ours")
+TRAINED_ON = "ring"
+OTHER_ROADS: dict[str, dict[str, Any]] = {
+    "5 vehicles": ROADS["ring-5"],
+    "11 vehicles": ROADS["ring-11"],
+    "22 vehicles": ROADS["ring"],
+    "44 vehicles on 520 m": {"scenario": "ring", "road.vehicles": 44, "road.length": [520, 520]},
+}
+OTHER_EPISODES = 20
+"""of each driver on each of them"""
+RING_CHANGES: dict[str, Any] = {"length": (230, 230)}
+"""changes to `ring-jammed` for calibrated people: as long as in the experiment [m]"""
+PAPERS = "paper's IDM"
+"""label of the people among whom the trained controller learned"""
+TITLES = {"human": "no CAV", "pi": "PI", TRAINED: "PI + residual"}
+
+
 def under_conditions(studies: StudyFolder, road: str, processes: int, episodes: int = EPISODES) -> Table:
     """Return a row per condition and driver: people alone, experts, the trained controller."""
     rows = []
@@ -134,10 +192,103 @@ def _table(road: str, folder: Path) -> pd.DataFrame:
     return pd.DataFrame(table.values())
 
 
+def carried_over(studies: StudyFolder, seeds: int, processes: int = 2) -> Table:
+    """Return what controllers that were trained among 22 vehicles do among others, without training."""
+    names = {"human": "human", "pi": "pi"}
+    for run in (PlannedRun(TRAINED_ON, variant, seed) for variant in CARRIED for seed in range(seeds)):
+        names[f"{run.variant} {run.seed}"] = str(studies.folder_of(run))
+    rows = []
+    with Workers(processes) as workers:
+        for road, changes in OTHER_ROADS.items():
+            scenario = load_config(changes=changes).make_scenario()
+            drivers = {label: make_driver(name, scenario.decision_step) for label, name in names.items()}
+            found = evaluate(scenario, drivers, held_out_seeds(OTHER_EPISODES), workers).rows
+            rows += [
+                {"road": road, "driver": label, **estimates(driven, HONEST)}
+                for label, driven in found.items()
+            ]
+    return rows
+
+
+def _figure_10(studies: StudyFolder, seeds: int, folder: Path, workers: int) -> None:
+    """Train for 5, 11 and 22 vehicles, as in the paper; and carry controllers over without training."""
+    write_table([row for road in VOLUMES for row in table_rows(studies, road, AMONG_VOLUMES, seeds)], folder)
+    write_whole(folder / "carried-over.json", to_json(carried_over(studies, seeds, workers), indent=1))
+
+
+def _carried_over_table(folder: Path) -> pd.DataFrame:
+    """Return the mean speed by driver and traffic: over trainings, with the smallest and the largest."""
+    speeds: dict[str, dict[str, list[float]]] = {}
+    for row in json.loads((folder / "carried-over.json").read_text()):
+        by_driver = speeds.setdefault(row["road"], {})
+        by_driver.setdefault(row["driver"].rstrip(" 0123456789"), []).append(row["mean_speed"]["mean"])
+    table = []
+    for road, by_driver in speeds.items():
+        cells = {"": road}
+        for driver, means in by_driver.items():
+            cells[driver] = f"{sum(means) / len(means):.2f}"
+            if len(means) > 1:
+                cells[driver] = unbroken(f"{cells[driver]} [{min(means):.2f}, {max(means):.2f}]")
+        table.append(cells)
+    return pd.DataFrame(table)
+
+
+def people_on_ring(
+    folder: Path,
+    populations: dict[str, Path],
+    controller: Path,
+    workers: int = 2,
+    on_progress: OnProgress = lambda name: None,
+) -> None:
+    """Write `ring.json` and `ring.png` into `folder`: people alone, with PI, and with a trained controller.
+
+    Args:
+        folder: for the results.
+        populations: files of `unjam fit-drivers`, by the label that they get.
+        controller: run folder or .unjam file of a controller for the ring.
+        workers: processes.
+        on_progress: told the name of each finished group of episodes.
+    """
+    make_folder(folder)
+    about, rows = manifest(), []
+    roads: dict[str, dict[str, Any]] = {PAPERS: {}}
+    roads |= {label: {"population": str(file.absolute())} for label, file in populations.items()}
+    shown: dict[str, Episode] = {}
+    largest = 0
+    with Workers(workers) as pool:
+        for people, changes in roads.items():
+            scenario = make_scenario("ring-jammed", {**RING_CHANGES, **changes})
+            drivers = {name: make_driver(name, scenario.decision_step) for name in ("human", "pi")}
+            drivers[TRAINED] = make_driver(str(controller), scenario.decision_step)
+            for label, driver in drivers.items():
+                tasks = [EpisodeTask(scenario, driver, (seed,), full=True) for seed in range(EPISODES)]
+                episodes = pool.run(tasks)
+                found = [measure(episode) for episode in episodes]
+                raise_failure(found)
+                for episode, row in zip(episodes, found, strict=True):
+                    rows.append({"people": people, "driver": label, **row, "wave_speed": wave_speed(episode)})
+                if label == "human":  # shown is where people alone make the largest wave
+                    largest = int(np.argmax([row["speed_std_fleet_steady"] for row in found]))
+                shown[f"{people}: {TITLES[label]}"] = episodes[largest]
+                on_progress(f"{people}, {label}")
+    write_whole(folder / "ring.json", to_json({"manifest": about, "rows": rows}, indent=1))
+    save_evaluation(folder / "shown", Evaluation({}, shown), {})
+    pictured = list(read_results(folder / "shown").shown.values())
+    write_whole(folder / "ring.png", png_bytes(space_time(pictured), dpi=90))
+
+
 ROBUSTNESS = Study(
     "the shipped controllers on roads, among people and with sensors that they have not trained with",
     lambda seeds: list(CONTROLLERS.values()),
     _write,
     minutes=40.0,
     tables={road: partial(_table, road) for road in CONDITIONS},
+)
+FIGURE_10 = Study(
+    "5, 11 and 22 vehicles, trained for each, and carried over",
+    lambda seeds: planned(VOLUMES, AMONG_VOLUMES, seeds),
+    _figure_10,
+    VOLUMES,
+    minutes=3.0,
+    tables={"carried over": _carried_over_table},
 )
