@@ -229,8 +229,7 @@ def learning_curve(runs: dict[str, list[dict[str, Any]]], references: dict[str, 
     for (label, rows), colour in zip(runs.items(), cycle(LINES[2:]), strict=False):
         steps = np.array([row["actual_steps"] for row in rows]) / 1000
         prefix = f"{label}: " if len(runs) > 1 else ""
-        training = [row["return_mean"] for row in rows]
-        label = f"{prefix}training, with exploration"
+        training, label = [row["return_mean"] for row in rows], f"{prefix}training, with exploration"
         axes.plot(steps, training, color=colour, lw=1, alpha=0.45, label=label)
         validated = [(0.0, rows[0]["return_expert"])]  # the policy starts as exactly its expert
         validated += [(step, row["return_validation"]) for step, row in zip(steps, rows, strict=True)]

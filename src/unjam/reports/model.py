@@ -172,7 +172,7 @@ def trust(progress: Sequence[dict[str, Any]], facts: dict[str, Any]) -> Figure:
     virtual = [row["virtual"] for row in progress]
 
     def over_steps(axes: Axes, values: list[Any], colour: str, label: str, **style: Any) -> None:
-        known = np.array([np.nan if value is None else value for value in values], float)
+        known = np.array(values, float)  # None becomes NaN
         axes.plot(steps, known, color=colour, lw=1.4, marker="o", ms=2.5, label=label, **style)
 
     over_steps(lengths, [each["k_star"] for each in virtual], MODEL, "k*")

@@ -18,6 +18,7 @@ from unjam.files import to_json, write_whole
 from unjam.measures.statistics import (
     Estimate,
     estimate,
+    estimate_of,
     interquartile_mean,
     paired_difference,
     probability_of_improvement,
@@ -99,7 +100,7 @@ def metric_of(road: str, variant: str) -> str:
 def best_expert(references: dict[str, Table], metric: str = "return") -> str:
     """Return the label of the expert with the largest mean of a metric."""
     there = [label for label in EXPERTS if label in references]
-    return max(there, key=lambda label: estimate([row[metric] for row in references[label]]).mean)
+    return max(there, key=lambda label: estimate_of(references[label], metric).mean)
 
 
 def table_rows(studies: StudyFolder, road: str, variants: Sequence[str], seeds: int) -> Table:
@@ -165,7 +166,7 @@ def _by_draw(road: str, rows: Table) -> dict[str, dict[str, float]]:
 
 def estimates(rows: Table, names: Sequence[str]) -> dict[str, dict[str, float]]:
     """Return the mean of each of these metrics over episodes, with its interval."""
-    return {name: entries(estimate([row[name] for row in rows])) for name in names}
+    return {name: entries(estimate_of(rows, name)) for name in names}
 
 
 def entries(found: Estimate) -> dict[str, float]:
@@ -264,7 +265,7 @@ def draw_curves(
                 axes.plot(steps, values.mean(0), color=colour, lw=1.5, label=VARIANTS[variant].label)
         of_rows = metric if name == "return_mean" else name
         for (reference, rows), style in zip(references.items(), ("--", ":"), strict=False):
-            value = estimate([row[of_rows] for row in rows]).mean
+            value = estimate_of(rows, of_rows).mean
             axes.axhline(value, color=INK, lw=1.0, ls=style, label=reference)
         axes.set_title(f"{road}: {label}")
         axes.margins(x=0.01)

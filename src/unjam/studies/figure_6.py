@@ -10,12 +10,12 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from functools import cache
 from itertools import product
-from operator import itemgetter
 from pathlib import Path
 from time import perf_counter
 from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
+import pandas as pd
 from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -186,9 +186,8 @@ def _nearest(training: Moments, test: Moments) -> Floats:
     """Return the acceleration of the training row that is most similar to each test row."""
     from scipy.spatial import KDTree
 
-    seen = np.column_stack([training.speed, training.leader_speed, training.gap])
+    seen, wanted = (np.column_stack([rows.speed, rows.leader_speed, rows.gap]) for rows in (training, test))
     scale = seen.std(0)
-    wanted = np.column_stack([test.speed, test.leader_speed, test.gap])
     _, places = KDTree(seen / scale).query(wanted / scale)
     return training.acceleration[np.asarray(places, np.int64)]
 
@@ -243,17 +242,15 @@ def _losses(axes: Axes, rows: Table) -> None:
 
 
 def _errors(axes: Axes, rows: Table, title: str) -> None:
+    fits = pd.DataFrame(rows).assign(share=lambda fits: 100 * fits["size"])
     for network, colour in COLOURS.items():
-        by_size: dict[float, list[float]] = {}
-        for row in sorted(rows, key=itemgetter("size")):
-            if row["network"] == network:
-                by_size.setdefault(100 * row["size"], []).append(row["error_of_driver"])
-        mean, spread = np.array([(np.mean(found), np.std(found)) for found in by_size.values()]).T
+        errors: Any = fits[fits["network"] == network].groupby("share")["error_of_driver"]
+        mean, spread = errors.mean(), errors.std(ddof=0)
         look = {"color": colour, "lw": 1.5, "marker": "o", "ms": 4, "capsize": 3}
-        axes.errorbar(list(by_size), mean, spread, label=LABELS[network], **look)
+        axes.errorbar(mean.index, mean, spread, label=LABELS[network], **look)
     axes.set_xlabel("share of the training rows [%]")
     _logarithmic(axes, title)
-    ticks = sorted({100 * row["size"] for row in rows})
+    ticks = sorted(fits["share"].unique())
     axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
     axes.minorticks_off()
 

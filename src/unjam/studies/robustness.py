@@ -16,7 +16,6 @@ import numpy as np
 import pandas as pd
 
 from unjam.controller import make_driver
-from unjam.drivers.driver import Driver
 from unjam.drivers.wrappers import Impaired
 from unjam.files import make_folder, to_json, write_whole
 from unjam.manifest import manifest
@@ -25,26 +24,8 @@ from unjam.measures.statistics import paired_difference
 from unjam.reports.figures import png_bytes, space_time
 from unjam.reports.results import read_results
 from unjam.scenarios.registry import make_scenario
-from unjam.studies.comparison import (
-    HONEST,
-    entries,
-    estimates,
-    interval,
-    number,
-    table_rows,
-    unbroken,
-    write_table,
-)
-from unjam.studies.study import (
-    REFERENCES,
-    ROADS,
-    OnProgress,
-    PlannedRun,
-    Study,
-    StudyFolder,
-    Table,
-    planned,
-)
+from unjam.studies.comparison import HONEST, entries, estimates, interval, number, table_rows, write_table
+from unjam.studies.study import REFERENCES, ROADS, OnProgress, PlannedRun, Study, StudyFolder, Table, planned
 from unjam.training.config import load_config
 from unjam.training.evaluate import (
     TRAINED,
@@ -129,8 +110,6 @@ EXPERTS = {
     "merge": ("closing jam absorber", "jam absorber", "PI (paper)"),
 }
 """the shipped controller's own comes first"""
-
-
 VOLUMES = ("ring-5", "ring-11", "ring")
 """of Figure 10; controllers of the last are carried over to OTHER_ROADS"""
 AMONG_VOLUMES = ("trpo", "ppo", "sac", "without-model", "proposed", "ours")
@@ -159,18 +138,25 @@ def under_conditions(studies: StudyFolder, road: str, processes: int, episodes: 
     with Workers(processes) as workers:
         for condition in CONDITIONS[road]:
             changes = {f"road.{key}": value for key, value in condition.scenario_changes.items()}
-            scenario = load_config(changes={**ROADS[road], **changes}).make_scenario()
-            step = scenario.decision_step
-            drivers: dict[str, Driver] = {}
-            for label, name in names.items():
-                made, how = make_driver(name, step), {} if name == "human" else condition.impaired
-                drivers[label] = Impaired(made, **how, time_step=step) if how else made
-            found = evaluate(scenario, drivers, held_out_seeds(episodes), workers).rows
+            found = _driven({**ROADS[road], **changes}, names, episodes, workers, **condition.impaired)
             for label, driven in found.items():
                 row: dict[str, Any] = {"road": road, "condition": condition.name, "driver": label}
                 gain = paired_difference(driven, found[EXPERTS[road][0]], "mean_speed")
                 rows.append({**row, **estimates(driven, SHOWN), "faster_than_expert": entries(gain)})
     return rows
+
+
+def _driven(
+    changes: dict[str, Any], names: dict[str, str], episodes: int, workers: Workers, **impaired: float
+) -> dict[str, Table]:
+    """Return the rows of drivers with these names on a road, by label; all but people are `impaired`."""
+    scenario = load_config(changes=changes).make_scenario()
+    step = scenario.decision_step
+    drivers = {label: make_driver(name, step) for label, name in names.items()}
+    for label, driver in drivers.items():
+        if impaired and not driver.native:
+            drivers[label] = Impaired(driver, **impaired, time_step=step)
+    return evaluate(scenario, drivers, held_out_seeds(episodes), workers).rows
 
 
 def _write(studies: StudyFolder, seeds: int, folder: Path, workers: int) -> None:
@@ -200,13 +186,8 @@ def carried_over(studies: StudyFolder, seeds: int, processes: int = 2) -> Table:
     rows = []
     with Workers(processes) as workers:
         for road, changes in OTHER_ROADS.items():
-            scenario = load_config(changes=changes).make_scenario()
-            drivers = {label: make_driver(name, scenario.decision_step) for label, name in names.items()}
-            found = evaluate(scenario, drivers, held_out_seeds(OTHER_EPISODES), workers).rows
-            rows += [
-                {"road": road, "driver": label, **estimates(driven, HONEST)}
-                for label, driven in found.items()
-            ]
+            found = _driven(changes, names, OTHER_EPISODES, workers).items()
+            rows += [{"road": road, "driver": label, **estimates(driven, HONEST)} for label, driven in found]
     return rows
 
 
@@ -218,19 +199,15 @@ def _figure_10(studies: StudyFolder, seeds: int, folder: Path, workers: int) -> 
 
 def _carried_over_table(folder: Path) -> pd.DataFrame:
     """Return the mean speed by driver and traffic: over trainings, with the smallest and the largest."""
-    speeds: dict[str, dict[str, list[float]]] = {}
-    for row in json.loads((folder / "carried-over.json").read_text()):
-        by_driver = speeds.setdefault(row["road"], {})
-        by_driver.setdefault(row["driver"].rstrip(" 0123456789"), []).append(row["mean_speed"]["mean"])
-    table = []
-    for road, by_driver in speeds.items():
-        cells = {"": road}
-        for driver, means in by_driver.items():
-            cells[driver] = f"{sum(means) / len(means):.2f}"
-            if len(means) > 1:
-                cells[driver] = unbroken(f"{cells[driver]} [{min(means):.2f}, {max(means):.2f}]")
-        table.append(cells)
-    return pd.DataFrame(table)
+    rows = pd.json_normalize(json.loads((folder / "carried-over.json").read_text()))
+    rows["trained as"] = rows["driver"].str.rstrip(" 0123456789")
+    speeds = rows.pivot_table("mean_speed.mean", "road", "trained as", _mean_and_range, sort=False)
+    return speeds.rename_axis(index="", columns=None).reset_index()
+
+
+def _mean_and_range(values: pd.Series) -> str:
+    found = {"mean": values.mean(), "low": values.min(), "high": values.max()}
+    return interval(found, 2) if len(values) > 1 else number(found["mean"], 2)
 
 
 def people_on_ring(
@@ -253,14 +230,14 @@ def people_on_ring(
     about, rows = manifest(), []
     roads: dict[str, dict[str, Any]] = {PAPERS: {}}
     roads |= {label: {"population": str(file.absolute())} for label, file in populations.items()}
+    names = {"human": "human", "pi": "pi", TRAINED: str(controller)}
     shown: dict[str, Episode] = {}
     largest = 0
     with Workers(workers) as pool:
         for people, changes in roads.items():
             scenario = make_scenario("ring-jammed", {**RING_CHANGES, **changes})
-            drivers = {name: make_driver(name, scenario.decision_step) for name in ("human", "pi")}
-            drivers[TRAINED] = make_driver(str(controller), scenario.decision_step)
-            for label, driver in drivers.items():
+            for label, name in names.items():
+                driver = make_driver(name, scenario.decision_step)
                 tasks = [EpisodeTask(scenario, driver, (seed,), full=True) for seed in range(EPISODES)]
                 episodes = pool.run(tasks)
                 found = [measure(episode) for episode in episodes]

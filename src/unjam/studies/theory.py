@@ -8,7 +8,7 @@ import json
 import tempfile
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import pairwise
+from itertools import pairwise, product
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,7 @@ from unjam.drivers.network import Network
 from unjam.drivers.observation import observation_size
 from unjam.drivers.residual import ResidualDriver
 from unjam.files import to_json, write_whole
-from unjam.measures.statistics import estimate
+from unjam.measures.statistics import estimate, estimate_of
 from unjam.reports.figures import LINES, STYLE, new_figure, stacked_bars
 from unjam.reports.results import read_progress, seconds_by_part
 from unjam.studies.comparison import entries
@@ -71,15 +71,14 @@ def untrained(
             config = PlannedRun(road, "proposed", 0).config
             scenario, expert, parts = config.make_scenario(), config.make_expert(), config.policy.observe
             limit = scenario.action_limit
-            drivers = {"expert alone": expert}
-            for number in range(policies):
-                for kind, base in (("expert + random", expert), ("random", Constant())):
-                    network = random_network(observation_size(parts, base), limit, number)
-                    drivers[f"{kind} {number}"] = ResidualDriver(base, network, limit, parts)
+            drivers, bases = {"expert alone": expert}, {"expert + random": expert, "random": Constant()}
+            for number, (kind, base) in product(range(policies), bases.items()):
+                network = random_network(observation_size(parts, base), limit, number)
+                drivers[f"{kind} {number}"] = ResidualDriver(base, network, limit, parts)
             found = evaluate(scenario, drivers, held_out_seeds(4), workers)
-            returns = {label: means["return"] for label, means in found.means().items()}
-            for kind in ("expert + random", "random"):
-                values = [mean for label, mean in returns.items() if label.startswith(f"{kind} ")]
+            returns = {label: estimate_of(driven, "return").mean for label, driven in found.rows.items()}
+            for kind in bases:
+                values = [returns[f"{kind} {number}"] for number in range(policies)]
                 rows.append({"road": road, "policy": kind, "returns": values, **entries(estimate(values))})
             rows.append({"road": road, "policy": "expert alone", "mean": returns["expert alone"]})
     return rows
@@ -172,15 +171,11 @@ def measured_seconds(steps: int = STEPS, rounds: int = ROUNDS) -> dict[str, list
                 folder = Path(place) / f"{variant}-{turn}"
                 start_folder(folder, config)
                 Trainer(folder, config, workers).train()
-                found[variant].append(_per_thousand(folder))
+                rows = read_progress(folder)
+                thousands, parts = rows[-1]["actual_steps"] / 1000.0, seconds_by_part(rows)
+                parts.pop(NOT_MEASURED, None)
+                found[variant].append({part: seconds / thousands for part, seconds in parts.items()})
     return found
-
-
-def _per_thousand(folder: Path) -> dict[str, float]:
-    rows = read_progress(folder)
-    thousands = rows[-1]["actual_steps"] / 1000.0
-    parts = seconds_by_part(rows).items()
-    return {part: seconds / thousands for part, seconds in parts if part != NOT_MEASURED}
 
 
 def _write_time(studies: StudyFolder, seeds: int, folder: Path, workers: int) -> None:
