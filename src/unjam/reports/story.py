@@ -133,11 +133,9 @@ def _notes_of(result: Results, label: str) -> list[str]:
         notes.append(f"{label} ended in a collision in {crashes} of {len(rows)} episodes.")
     closest = min((row["min_headway"] for row in rows if np.isfinite(row["min_headway"])), default=np.inf)
     if closest < CLOSE_HEADWAY:
-        blamed = " The reward (released) does not ask for distance."
-        notes.append(
-            f"{label} drives close: its smallest time headway is {closest:.2f} s."
-            + (blamed if result.about["reward"] == "released" else "")
-        )
+        released = result.about["reward"] == "released"
+        blamed = " The reward (released) does not ask for distance." if released else ""
+        notes.append(f"{label} drives close: its smallest time headway is {closest:.2f} s.{blamed}")
     ratio = estimate_of(rows, "speed_limit_ratio_steady").mean
     if ratio > BEYOND_LIMIT:
         notes.append(
