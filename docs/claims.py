@@ -9,8 +9,8 @@ from tables import RESULTS
 
 from studies import rows_of
 from unjam.measures.statistics import estimate
+from unjam.studies.comparison import interval, number
 from unjam.studies.study import VARIANTS
-from unjam.studies.table import interval, number
 
 Claim = tuple[str, str, str]
 """what the paper says, whether it held, by which numbers"""

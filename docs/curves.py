@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from tables import RESULTS
 
 from studies import rows_of
-from unjam.studies.table import interval
+from unjam.studies.comparison import interval
 
 LABELS = {"ours": "with the virtual environment", "ours-without-model": "without"}
 COLOURS = {"ours": "#2b6cb0", "ours-without-model": "#e07a1f"}

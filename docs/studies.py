@@ -9,8 +9,8 @@ from tables import RESULTS, metrics_of
 from tables import rows_of as rows_of_file
 
 from unjam.studies import STUDIES
+from unjam.studies.comparison import interval, number, unbroken
 from unjam.studies.study import REFERENCES, VARIANTS
-from unjam.studies.table import interval, number, unbroken
 
 FREE = 15.0
 """mean speed of an episode on the merge in which no jam stayed [m/s]"""

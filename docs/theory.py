@@ -7,8 +7,8 @@ import numpy as np
 import pandas as pd
 from tables import RESULTS
 
+from unjam.studies.comparison import interval
 from unjam.studies.study import VARIANTS
-from unjam.studies.table import interval
 
 
 def measured() -> dict[str, Any]:

@@ -7,9 +7,11 @@ FOLDER gets ring.json and ring.png.
 import sys
 from pathlib import Path
 
-from unjam.studies.people_on_ring import run
+from unjam.studies.robustness import people_on_ring
 
 if __name__ == "__main__":
     folder, controller, headway, everything = map(Path, sys.argv[1:5])
     populations = {"own headways": headway, "all parameters own": everything}
-    run(folder, populations, controller, int(sys.argv[5]) if len(sys.argv) > 5 else 2, on_progress=print)
+    people_on_ring(
+        folder, populations, controller, int(sys.argv[5]) if len(sys.argv) > 5 else 2, on_progress=print
+    )

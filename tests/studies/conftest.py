@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from unjam.cli import app
-from unjam.studies import STUDIES, study, table
+from unjam.studies import STUDIES, comparison, study
 from unjam.studies import reproduce as reproduction
 from unjam.studies.comparison import comparison_of
 from unjam.studies.reproduce import make_plan, reproduce
@@ -44,7 +44,7 @@ def little() -> Iterator[pytest.MonkeyPatch]:
         for name, variant in VARIANTS.items():
             patch.setitem(study.VARIANTS, name, variant)
         patch.setattr(reproduction, "REFERENCES", REFERENCES)
-        patch.setattr(table, "EXPERTS", ("PI", "ACC"))
+        patch.setattr(comparison, "EXPERTS", ("PI", "ACC"))
         yield patch
 
 

@@ -6,21 +6,21 @@ import pytest
 from unjam.controller import controller_bytes, make_driver
 from unjam.physics.idm import PAPER_IDM, IDMParameters
 from unjam.scenarios.population import Population, write_population
-from unjam.studies import people_on_ring
+from unjam.studies import robustness
 
 
 def test_people_are_put_on_the_ring_with_and_without_a_cav(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     road = {"length": (80, 80), "vehicles": 8, "warmup": 300, "horizon": 200}
-    monkeypatch.setattr(people_on_ring, "SCENARIO_CHANGES", road)
-    monkeypatch.setattr(people_on_ring, "EPISODES", 1)
+    monkeypatch.setattr(robustness, "RING_CHANGES", road)
+    monkeypatch.setattr(robustness, "EPISODES", 1)
     drivers = (PAPER_IDM, IDMParameters(time_headway=1.4))
     write_population(tmp_path / "drivers.json", Population(PAPER_IDM, drivers, (-4.0, 2.0)))
     (tmp_path / "pi.unjam").write_bytes(controller_bytes(make_driver("pi", 0.1), {}))
     told: list[str] = []
     populations = {"calibrated": tmp_path / "drivers.json"}
-    people_on_ring.run(tmp_path / "out", populations, tmp_path / "pi.unjam", 1, told.append)
+    robustness.people_on_ring(tmp_path / "out", populations, tmp_path / "pi.unjam", 1, told.append)
     rows = json.loads((tmp_path / "out" / "ring.json").read_text())["rows"]
     found = [(row["people"], row["driver"]) for row in rows]
     assert found == [

@@ -11,11 +11,10 @@ import pytest
 import torch
 
 from unjam.reports.results import read_rows
-from unjam.studies import comparison, figure_8, robustness, study, theory
-from unjam.studies.comparison import curves_of
+from unjam.studies import comparison, robustness, study, theory
+from unjam.studies.comparison import curves_of, table_rows
 from unjam.studies.robustness import Condition
 from unjam.studies.study import PlannedRun, StudyFolder
-from unjam.studies.table import table_rows
 
 Made = tuple[Path, list[str]]
 VARIANTS = ("plain", "virtual")
@@ -25,14 +24,14 @@ VARIANTS = ("plain", "virtual")
 def test_training_time_is_measured_in_turns_for_all_variants(
     monkeypatch: pytest.MonkeyPatch, little: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(figure_8, "ROAD", "little")
-    monkeypatch.setattr(figure_8, "MEASURED", VARIANTS)
-    found = figure_8.measured_seconds(steps=320, rounds=2)
+    monkeypatch.setattr(theory, "ROAD", "little")
+    monkeypatch.setattr(theory, "MEASURED", VARIANTS)
+    found = theory.measured_seconds(steps=320, rounds=2)
     assert [len(found[variant]) for variant in VARIANTS] == [2, 2]
     plain, virtual = (found[variant][0] for variant in VARIANTS)
     assert set(virtual) - set(plain) == {"fit", "imagine"}
     assert min(plain["actual"], plain["update"], virtual["fit"], virtual["imagine"]) > 0
-    axes = figure_8.draw({variant: found[variant][0] for variant in VARIANTS}).axes[0]
+    axes = theory.draw_time({variant: found[variant][0] for variant in VARIANTS}).axes[0]
     longest = max(sum(plain.values()), sum(virtual.values()))
     assert longest < axes.get_xlim()[1] < 1.2 * longest
 
@@ -42,11 +41,11 @@ def test_controllers_are_carried_over_to_other_traffic(
 ) -> None:
     folder, _ = reproduced
     road = {"scenario": "ring", "road.length": [80, 80], "road.vehicles": 6, "road.horizon": 60}
-    monkeypatch.setattr(comparison, "OTHER_ROADS", {"six": road})
-    monkeypatch.setattr(comparison, "CARRIED", ("plain",))
-    monkeypatch.setattr(comparison, "TRAINED_ON", "little")
-    monkeypatch.setattr(comparison, "EPISODES", 2)
-    rows = comparison.carried_over(StudyFolder(folder), 2)
+    monkeypatch.setattr(robustness, "OTHER_ROADS", {"six": road})
+    monkeypatch.setattr(robustness, "CARRIED", ("plain",))
+    monkeypatch.setattr(robustness, "TRAINED_ON", "little")
+    monkeypatch.setattr(robustness, "OTHER_EPISODES", 2)
+    rows = robustness.carried_over(StudyFolder(folder), 2)
     assert [row["driver"] for row in rows] == ["human", "pi", "plain 0", "plain 1"]
     assert all(row["road"] == "six" and np.isfinite(row["mean_speed"]["mean"]) for row in rows)
 

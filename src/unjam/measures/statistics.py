@@ -31,13 +31,10 @@ def estimate(values: Sequence[float], statistic: Callable[..., Any] = np.mean) -
     `statistic` than the mean takes the values and an axis, like NumPy's.
     """
     finite = np.array([value for value in values if np.isfinite(value)], float)
-    if len(finite) == 0:
-        return Estimate(float("nan"), float("nan"), float("nan"), 0)
-    mean = float(statistic(finite, axis=0))
-    if len(finite) == 1:
-        return Estimate(mean, float("nan"), float("nan"), 1)
-    if np.ptp(finite) == 0:
-        return Estimate(mean, mean, mean, len(finite))
+    mean = float(statistic(finite, axis=0)) if len(finite) else float("nan")
+    if len(finite) < 2 or np.ptp(finite) == 0:
+        end = mean if len(finite) > 1 else float("nan")
+        return Estimate(mean, end, end, len(finite))
     found = bootstrap(
         (finite,), statistic, confidence_level=CONFIDENCE, n_resamples=RESAMPLES, method="percentile", rng=0
     )
@@ -45,9 +42,14 @@ def estimate(values: Sequence[float], statistic: Callable[..., Any] = np.mean) -
     return Estimate(mean, float(low), float(high), len(finite))
 
 
+def estimate_of(rows: Sequence[dict[str, Any]], name: str) -> Estimate:
+    """Return the estimate of a metric over the rows of `measure`."""
+    return estimate([row[name] for row in rows])
+
+
 def summarise(rows: Sequence[dict[str, Any]]) -> dict[str, Estimate]:
     """Return the estimate of every metric over the rows of `measure`."""
-    return {name: estimate([row[name] for row in rows]) for name in METRICS}
+    return {name: estimate_of(rows, name) for name in METRICS}
 
 
 def paired_difference(

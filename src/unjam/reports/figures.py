@@ -12,11 +12,11 @@ from matplotlib import colormaps, rc_context
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection
-from matplotlib.colors import Normalize
+from matplotlib.colors import Normalize, to_hex
 from matplotlib.figure import Figure
 from PIL import Image
 
-from unjam.reports.results import Shown
+from unjam.reports.results import Shown, seconds_by_part
 
 SPEED_COLOURS = "viridis"
 """slow is dark, fast is bright: also without colour vision, and in print"""
@@ -25,9 +25,9 @@ CAV_COLOUR = "#d7263d"
 LINES = ["#7b8794", "#e07a1f", "#2b6cb0", "#2f855a", "#b83280", "#805ad5", "#1a202c", "#00a3c4"]
 """of drivers, in the order in which they are shown"""
 WIDTH = 10.5
-"""of a figure [inch]: its letters are legible from 760 pixels on, the least that the page gives it"""
+"""of a figure of the page [inch]: its letters are legible from 760 pixels on, the least that it gets there"""
 DPI = 130
-"""resolution of what is drawn in pixels"""
+"""pixels per inch of what is drawn in pixels"""
 POINTS_IN_TIME = 600
 """moments that a picture shows of an episode"""
 
@@ -36,6 +36,9 @@ STYLE: dict[Any, Any] = {
     "font.size": 9,
     "axes.edgecolor": MUTED,
     "axes.labelcolor": INK,
+    "axes.titlecolor": INK,
+    "axes.titlelocation": "left",
+    "axes.titlesize": 9,
     "axes.grid": True,
     "axes.axisbelow": True,
     "axes.spines.top": False,
@@ -48,9 +51,9 @@ STYLE: dict[Any, Any] = {
 }
 
 
-def new_figure(height: float) -> Figure:
-    """Return an empty figure as wide as the page and `height` inches high."""
-    return Figure(figsize=(WIDTH, height), layout="constrained")
+def new_figure(height: float, width: float = WIDTH) -> Figure:
+    """Return an empty figure of so many inches; as wide as the page where nothing is said."""
+    return Figure(figsize=(width, height), layout="constrained", dpi=DPI)
 
 
 def data_uri(figure: Figure) -> str:
@@ -118,7 +121,7 @@ def space_time(shown: Sequence[Shown]) -> Figure:
             axes.set_xlim(0, longest)
             axes.set_ylim(*extent)
             if part == 0:
-                axes.set_title(episode.driver, loc="left", fontsize=10, color=INK)
+                axes.set_title(episode.driver, fontsize=10)
             if column == 0:
                 axes.set_ylabel(f"{branch} [m]" if branch else "position along the road [m]")
             if part == parts - 1 and number + columns >= count:
@@ -198,7 +201,7 @@ def over_time(shown: Sequence[Shown]) -> Figure:
         axes.set_ylim(bottom=0)
     panels[-1].set_xlabel("time [s]")
     panels[0].margins(x=0)
-    figure.legend(loc="outside upper left", ncols=6, fontsize=9)
+    figure.legend(loc="outside upper left", ncols=6)
     return figure
 
 
@@ -226,8 +229,7 @@ def learning_curve(runs: dict[str, list[dict[str, Any]]], references: dict[str, 
     for (label, rows), colour in zip(runs.items(), cycle(LINES[2:]), strict=False):
         steps = np.array([row["actual_steps"] for row in rows]) / 1000
         prefix = f"{label}: " if len(runs) > 1 else ""
-        training = [row["return_mean"] for row in rows]
-        label = f"{prefix}training, with exploration"
+        training, label = [row["return_mean"] for row in rows], f"{prefix}training, with exploration"
         axes.plot(steps, training, color=colour, lw=1, alpha=0.45, label=label)
         validated = [(0.0, rows[0]["return_expert"])]  # the policy starts as exactly its expert
         validated += [(step, row["return_validation"]) for step, row in zip(steps, rows, strict=True)]
@@ -240,30 +242,37 @@ def learning_curve(runs: dict[str, list[dict[str, Any]]], references: dict[str, 
     axes.set_xlabel("actual simulator steps [thousands]")
     axes.set_ylabel("return of an episode")
     axes.margins(x=0.01, y=0.06)
-    figure.legend(loc="outside upper left", ncols=3, fontsize=9)
+    figure.legend(loc="outside upper left", ncols=3)
     return figure
 
 
 @rc_context(STYLE)
 def time_split(progress: Sequence[dict[str, Any]]) -> Figure:
     """Draw how the wall time of training divides among its parts."""
-    parts = dict.fromkeys(part for row in progress for part in row["seconds"])
-    totals = {part: sum(row["seconds"].get(part, 0.0) for row in progress) for part in parts}
-    figure = new_figure(1.5)
-    axes = figure.subplots()
-    start = 0.0
-    for (part, seconds), colour in zip(totals.items(), LINES, strict=False):
-        axes.barh([0], [seconds], left=start, color=colour, label=f"{part} {seconds:.0f} s")
-        start += seconds
+    totals = {f"{part} {seconds:.0f} s": seconds for part, seconds in seconds_by_part(progress).items()}
+    figure = stacked_bars({"": totals}, "wall time [s]", height=1.5)
+    axes = figure.axes[0]
     axes.set_yticks([])
-    axes.set_xlabel("wall time [s]")
     axes.margins(x=0)
     axes.spines["left"].set_visible(False)
-    figure.legend(loc="outside upper left", ncols=5, fontsize=9)
+    return figure
+
+
+@rc_context(STYLE)
+def stacked_bars(bars: dict[str, dict[str, float]], label: str, height: float) -> Figure:
+    """Draw a bar per name, its parts end to end; the same part has the same colour in all."""
+    figure = new_figure(height)
+    axes, left = figure.subplots(), np.zeros(len(bars))
+    parts = dict.fromkeys(part for bar in bars.values() for part in bar)
+    for part, colour in zip(parts, LINES, strict=False):
+        widths = np.array([bar.get(part, 0.0) for bar in bars.values()])
+        axes.barh(list(bars), widths, left=left, color=colour, label=part)
+        left = left + widths
+    axes.set_xlabel(label)
+    figure.legend(loc="outside upper left", ncols=6)
     return figure
 
 
 def colour_table(steps: int = 32) -> list[str]:
     """Return the colours of speed as hex codes, slowest first: for pictures that matplotlib does not draw."""
-    table = colormaps[SPEED_COLOURS](np.linspace(0, 1, steps))[:, :3]
-    return [f"#{round(r * 255):02x}{round(g * 255):02x}{round(b * 255):02x}" for r, g, b in table]
+    return [to_hex(colour) for colour in colormaps[SPEED_COLOURS](np.linspace(0, 1, steps))]

@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 
 from unjam import __version__
 from unjam.files import check_folder, write_whole
-from unjam.measures.statistics import estimate
+from unjam.measures.statistics import estimate_of
 from unjam.reports.figures import (
     colour_table,
     data_uri,
@@ -117,7 +117,7 @@ def _references(results: Sequence[Results]) -> dict[str, float]:
             found.setdefault(f"{expert}, validation", result.progress[0]["return_expert"])
         for label, rows in result.rows.items():
             if label not in (result.trained, expert):
-                found.setdefault(f"{label}, held-out", estimate([row["return"] for row in rows]).mean)
+                found.setdefault(f"{label}, held-out", estimate_of(rows, "return").mean)
     return found
 
 

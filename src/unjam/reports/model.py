@@ -172,7 +172,7 @@ def trust(progress: Sequence[dict[str, Any]], facts: dict[str, Any]) -> Figure:
     virtual = [row["virtual"] for row in progress]
 
     def over_steps(axes: Axes, values: list[Any], colour: str, label: str, **style: Any) -> None:
-        known = np.array([np.nan if value is None else value for value in values], float)
+        known = np.array(values, float)  # None becomes NaN
         axes.plot(steps, known, color=colour, lw=1.4, marker="o", ms=2.5, label=label, **style)
 
     over_steps(lengths, [each["k_star"] for each in virtual], MODEL, "k*")
@@ -225,7 +225,7 @@ def errors(facts: dict[str, Any]) -> Figure:
         axes.plot(found["at"], found["model"][name], color=MODEL, lw=1.6, marker="o", ms=3)
         axes.set_ylim(bottom=0)
         _titled(axes, f"error one step ahead: {NUMBERS[name][0]}", _named(by))
-    _legend(figure, panels[0], 5)
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper left", ncols=5)
     return figure
 
 
@@ -246,7 +246,7 @@ def examples(facts: dict[str, Any]) -> Figure:
         if name == "leader_gap":
             axes.set_ylim(bottom=0)
         _titled(axes, f"{_named(name)}, from {each['begins']:.0f} s on", "time ahead [s]")
-    _legend(figure, panels[0], 3)
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper left", ncols=3)
     return figure
 
 
@@ -262,10 +262,6 @@ def _named(name: str) -> str:
 
 
 def _titled(axes: Axes, title: str, horizontal: str) -> None:
-    axes.set_title(title, loc="left", fontsize=9, color=INK)
+    axes.set_title(title)
     axes.set_xlabel(horizontal)
     axes.margins(x=0.02)
-
-
-def _legend(figure: Figure, axes: Axes, columns: int) -> None:
-    figure.legend(*axes.get_legend_handles_labels(), loc="outside upper left", ncols=columns, fontsize=9)

@@ -2,6 +2,7 @@
 
 import json
 import shlex
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -133,6 +134,12 @@ def read_progress(folder: Path) -> list[dict[str, Any]]:
         except ValueError:
             break
     return rows
+
+
+def seconds_by_part(progress: Sequence[dict[str, Any]]) -> dict[str, float]:
+    """Return the wall time of each part of training [s], over all rows of progress."""
+    parts = dict.fromkeys(part for row in progress for part in row["seconds"])
+    return {part: sum(row["seconds"].get(part, 0.0) for row in progress) for part in parts}
 
 
 def read_model(folder: Path) -> dict[str, Any] | None:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from unjam.measures.metrics import METRICS
-from unjam.measures.statistics import Estimate, estimate, paired_difference
+from unjam.measures.statistics import Estimate, estimate_of, paired_difference
 from unjam.reports.results import Results, Shown
 
 CLOSE_HEADWAY = 1.0
@@ -74,7 +74,7 @@ def lead_of(result: Results) -> str:
     if result.trained is None:
         return _lead_of_drives(result)
     trained, expert = result.rows[result.trained], result.rows.get(result.about["expert"])
-    earned = estimate([row["return"] for row in trained]).mean
+    earned = estimate_of(trained, "return").mean
     if expert is None:
         return f"On {len(trained)} held-out seeds the trained controller earns {earned:.0f} an episode."
     gain = paired_difference(trained, expert, "return")
@@ -86,7 +86,7 @@ def lead_of(result: Results) -> str:
         verdict = "The residual makes it worse."
     else:
         verdict = "No gain is shown: the interval holds zero."
-    alone = estimate([row["return"] for row in expert]).mean
+    alone = estimate_of(expert, "return").mean
     return (
         f"On {gain.count} held-out seeds the trained controller earns {earned:.0f} an episode, its expert "
         f"{result.about['expert']} alone {alone:.0f}: {signed(gain)}. {verdict}"
@@ -96,10 +96,7 @@ def lead_of(result: Results) -> str:
 def _lead_of_drives(result: Results) -> str:
     """Return how fast all vehicles drive with each driver."""
     scenario = result.about["scenario"]
-    ratios = {
-        label: estimate([row["speed_limit_ratio_steady"] for row in rows])
-        for label, rows in result.rows.items()
-    }
+    ratios = {label: estimate_of(rows, "speed_limit_ratio_steady") for label, rows in result.rows.items()}
     if len(ratios) > 1:
         words = ", ".join(
             f"{label} {100 * ratio.mean:.0f}\u00a0%" if ratio.count else f"{label} failed"
@@ -107,7 +104,7 @@ def _lead_of_drives(result: Results) -> str:
         )
         return f"Mean speed of all vehicles in steady state on {scenario}, of the limit: {words}."
     [(label, rows)] = result.rows.items()
-    speed = estimate([row["mean_speed"] for row in rows])
+    speed = estimate_of(rows, "mean_speed")
     if speed.count == 0:
         return f"{label} on {scenario}: all {len(rows)} episodes failed."
     return (
@@ -136,18 +133,16 @@ def _notes_of(result: Results, label: str) -> list[str]:
         notes.append(f"{label} ended in a collision in {crashes} of {len(rows)} episodes.")
     closest = min((row["min_headway"] for row in rows if np.isfinite(row["min_headway"])), default=np.inf)
     if closest < CLOSE_HEADWAY:
-        blamed = " The reward (released) does not ask for distance."
-        notes.append(
-            f"{label} drives close: its smallest time headway is {closest:.2f} s."
-            + (blamed if result.about["reward"] == "released" else "")
-        )
-    ratio = estimate([row["speed_limit_ratio_steady"] for row in rows]).mean
+        released = result.about["reward"] == "released"
+        blamed = " The reward (released) does not ask for distance." if released else ""
+        notes.append(f"{label} drives close: its smallest time headway is {closest:.2f} s.{blamed}")
+    ratio = estimate_of(rows, "speed_limit_ratio_steady").mean
     if ratio > BEYOND_LIMIT:
         notes.append(
             f"With {label} all vehicles drive at {100 * ratio:.0f} % of the limit, which is how fast people "
             "alone could drive alike: the CAV keeps a smaller gap than they would."
         )
-    leaning = estimate([row["shield_override_share"] for row in rows]).mean
+    leaning = estimate_of(rows, "shield_override_share").mean
     if leaning > 0.01:
         hardest = max(row["shield_max_braking"] for row in rows)
         notes.append(
@@ -174,7 +169,7 @@ def cards_of(result: Results) -> list[dict[str, str]]:
     )
     cards = []
     for title, name, digits, unit, scale in figures:
-        found, people = (estimate([row[name] for row in of]) for of in (rows, human))
+        found, people = (estimate_of(of, name) for of in (rows, human))
         value, beside = (
             f"{scale * each.mean:.{digits}f} {unit}" if each.count else "–" for each in (found, people)
         )
@@ -196,8 +191,7 @@ def table_of(columns: Sequence[Column]) -> list[dict[str, Any]]:
             "unit": metric.unit,
             "about": " ".join((metric.function.__doc__ or "").split()),
             "cells": [
-                cell_of(estimate([row[name] for row in column.rows]), metric.digits, len(column.rows))
-                for column in columns
+                cell_of(estimate_of(column.rows, name), metric.digits, len(column.rows)) for column in columns
             ],
         }
         for name, metric in METRICS.items()

@@ -1,11 +1,10 @@
 """The studies of `unjam reproduce`: the paper's tables and figures."""
 
-from unjam.studies.comparison import FIGURE_5, FIGURE_10, comparison_of
+from unjam.studies.comparison import FIGURE_5, comparison_of
 from unjam.studies.figure_6 import FIGURE_6
-from unjam.studies.figure_8 import FIGURE_8
-from unjam.studies.robustness import ROBUSTNESS
+from unjam.studies.robustness import FIGURE_10, ROBUSTNESS
 from unjam.studies.study import PAPERS_ROADS, Study
-from unjam.studies.theory import THEORY
+from unjam.studies.theory import FIGURE_8, THEORY
 
 TABLE_1: dict[str, Study] = {
     f"table-1-{road}": comparison_of(

@@ -1,9 +1,9 @@
-"""The paper's comparisons of learners: Tables 1 and 2, Figures 4, 5, 7, 9 and 10.
+"""The paper's comparisons of learners: Tables 1 and 2, Figures 4, 5, 7 and 9.
 
-Curves are of several trainings of each variant: mean and range over the seeds.
+A table has the paper's convention beside the paper's numbers, and the honest one. Curves are of several
+trainings of each variant: mean and range over the seeds.
 """
 
-import json
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -14,43 +14,68 @@ import pandas as pd
 from matplotlib import rc_context
 from matplotlib.figure import Figure
 
-from unjam.controller import make_driver
 from unjam.files import to_json, write_whole
-from unjam.measures.statistics import estimate
-from unjam.reports.figures import INK, LINES, STYLE, space_time
+from unjam.measures.statistics import (
+    Estimate,
+    estimate,
+    estimate_of,
+    interquartile_mean,
+    paired_difference,
+    probability_of_improvement,
+)
+from unjam.reports.figures import INK, LINES, STYLE, new_figure, space_time
 from unjam.reports.results import Shown, read_results
-from unjam.studies.study import PAPERS_ROADS, ROADS, VARIANTS, PlannedRun, Study, StudyFolder, Table, planned
-from unjam.studies.table import (
-    HONEST,
-    best_expert,
-    estimates,
-    metric_of,
-    table_rows,
-    unbroken,
-    write_table,
+from unjam.studies.study import (
+    PAPERS_ROADS,
+    REFERENCES,
+    ROADS,
+    VARIANTS,
+    PlannedRun,
+    Study,
+    StudyFolder,
+    Table,
+    TrainedRun,
+    planned,
 )
 from unjam.training.config import load_config
-from unjam.training.evaluate import evaluate, held_out_seeds
-from unjam.worlds.workers import Workers
 
+PAPER: dict[tuple[str, str], tuple[float, float, float]] = {
+    ("ring", "trpo"): (1699.15, 3.42, 0.55),
+    ("ring", "ppo"): (1057.14, 3.43, 0.75),
+    ("ring", "sac"): (1048.97, 3.24, 0.38),
+    ("ring", "proposed"): (1753.66, 4.04, 0.48),
+    ("ring", "mb-trpo"): (1717.45, 3.55, 0.73),
+    ("ring", "no-initial-policy"): (1633.28, 3.53, 0.57),
+    ("figure-eight", "trpo"): (542.42, 1.84, 1.43),
+    ("figure-eight", "ppo"): (228.86, 1.60, 1.20),
+    ("figure-eight", "sac"): (435.72, 2.30, 1.94),
+    ("figure-eight", "proposed"): (862.81, 6.41, 2.04),
+    ("merge", "trpo"): (420.07, 15.26, 2.46),
+    ("merge", "ppo"): (415.02, 14.67, 2.77),
+    ("merge", "sac"): (449.72, 16.47, 2.38),
+    ("merge", "proposed"): (492.93, 17.44, 2.22),
+}
+"""Tables 1 and 2, by road and variant: reward, and of the CAV's own speed, start-up and exploration included,
+the mean (`average speed`) and the standard deviation over time (`speed std`) [m/s]"""
+CONVENTION = {
+    "reward": ("return", "return_mean"),
+    "speed": ("cav_mean_speed", "cav_mean_speed"),
+    "std": ("speed_std_cav", "speed_std_cav"),
+}
+"""the paper's columns: each as a metric of episodes, and as a number of the training batches"""
+HONEST = (
+    *("return", "return_eq16", "mean_speed", "mean_speed_steady", "speed_limit_ratio_steady"),
+    *("speed_std_fleet", "time_to_dissolve", "throughput_veh_per_h", "backlog_veh"),
+    *("min_headway", "collisions"),
+)
+"""metrics of the deterministic policy on held-out seeds"""
+EXPERTS = tuple(label for label in REFERENCES if label not in ("human", "zero", "constant +0.1"))
 POINTS = 100
 """of a curve"""
 DRAWN = {"return_mean": "return, in training", "cav_mean_speed": "CAV's mean speed, in training [m/s]"}
 RETURNS, SPEEDS = ("return_mean", "return_validation"), ("cav_mean_speed", "speed_std_cav")
 SHOWN = ("proposed", "ours")
 """in Figure 5"""
-VOLUMES = ("ring-5", "ring-11", "ring")
-"""of Figure 10; controllers of the last are carried over to OTHER_ROADS"""
-AMONG_VOLUMES = ("trpo", "ppo", "sac", "without-model", "proposed", "ours")
-CARRIED = ("proposed", "ours")
-TRAINED_ON = "ring"
-OTHER_ROADS: dict[str, dict[str, Any]] = {
-    "5 vehicles": ROADS["ring-5"],
-    "11 vehicles": ROADS["ring-11"],
-    "22 vehicles": ROADS["ring"],
-    "44 vehicles on 520 m": {"scenario": "ring", "road.vehicles": 44, "road.length": [520, 520]},
-}
-EPISODES = 20
 
 
 def comparison_of(title: str, variants: Sequence[str], road: str = "ring") -> Study:
@@ -67,6 +92,134 @@ def comparison_of(title: str, variants: Sequence[str], road: str = "ring") -> St
     return Study(title, lambda seeds: planned([road], variants, seeds), write, (road,))
 
 
+def metric_of(road: str, variant: str) -> str:
+    """Return which return trainings are judged by: that of their reward, which all drivers have."""
+    return "return_eq16" if PlannedRun(road, variant, 0).config.reward == "eq16" else "return"
+
+
+def best_expert(references: dict[str, Table], metric: str = "return") -> str:
+    """Return the label of the expert with the largest mean of a metric."""
+    there = [label for label in EXPERTS if label in references]
+    return max(there, key=lambda label: estimate_of(references[label], metric).mean)
+
+
+def table_rows(studies: StudyFolder, road: str, variants: Sequence[str], seeds: int) -> Table:
+    """Return a row per driver that does not learn, and per variant, on a road."""
+    references = studies.references(road)
+    best = best_expert(references, metric_of(road, variants[0]))
+    rows: Table = []
+    for label, found in references.items():
+        row = {"road": road, "name": label, "learns": False, "trainings": 0, "episodes": len(found)}
+        row |= {"best_expert": label == best, **estimates(found, HONEST)}
+        convention = {key: _mean_and_std(_finite(found, name)) for key, (name, _) in CONVENTION.items()}
+        rows.append({**row, "paper_convention": convention, "steady_by_draw": _by_draw(road, found)})
+    trained = {variant: studies.trained(road, variant, seeds) for variant in variants}
+    return [*rows, *(_of_variant(road, variant, runs, references) for variant, runs in trained.items())]
+
+
+def _of_variant(
+    road: str, variant: str, runs: list[TrainedRun], references: dict[str, Table]
+) -> dict[str, Any]:
+    reported, metric = PAPER.get((road, variant)), metric_of(road, variant)
+    best = best_expert(references, metric)
+    row: dict[str, Any] = {
+        "road": road,
+        "name": VARIANTS[variant].label,
+        "variant": variant,
+        "learns": True,
+        "trainings": len(runs),
+        "episodes": len(runs[0].rows),
+        "steps": runs[0].run.config.steps,
+        "paper": dict(zip(CONVENTION, reported, strict=True)) if reported else None,
+    }
+    for name in HONEST:
+        own = name != "return" or metric == "return"  # returns of another reward are no returns here
+        values = [_mean(_finite(run.rows, name)) if own else float("nan") for run in runs]
+        row[name] = entries(estimate(values, interquartile_mean))
+    gains = [paired_difference(run.rows, references[best], metric).mean for run in runs]
+    improved = probability_of_improvement([run.rows for run in runs], references[best], metric)
+    return {
+        **row,
+        "paper_convention": {
+            key: _mean_and_std([run.in_training(name) for run in runs])
+            for key, (_, name) in CONVENTION.items()
+        },
+        "steady_by_draw": _by_draw(road, [one for run in runs for one in run.rows]),
+        "beyond": {"expert": best, "metric": metric},
+        "beyond_best_expert": entries(estimate(gains)),
+        "probability_of_improvement": entries(improved),
+        "seconds": _mean([run.seconds for run in runs]),
+        "gains": gains,
+    }
+
+
+def _by_draw(road: str, rows: Table) -> dict[str, dict[str, float]]:
+    """Return the steady mean speed by each number that episodes draw: the length, or the radius."""
+    return {
+        name: {
+            f"{value:g}": _mean(_finite([row for row in rows if row[name] == value], "mean_speed_steady"))
+            for value in sorted({row[name] for row in rows})
+        }
+        for name in load_config(changes=ROADS[road]).make_scenario().drawn_ranges
+    }
+
+
+def estimates(rows: Table, names: Sequence[str]) -> dict[str, dict[str, float]]:
+    """Return the mean of each of these metrics over episodes, with its interval."""
+    return {name: entries(estimate_of(rows, name)) for name in names}
+
+
+def entries(found: Estimate) -> dict[str, float]:
+    """Return an estimate as tables keep it."""
+    return {"mean": found.mean, "low": found.low, "high": found.high}
+
+
+def number(value: float | None, digits: int, sign: str = "") -> str:
+    """Return a number as pages show it; a dash where there is none."""
+    return "–" if value is None else f"{value:{sign}.{digits}f}"
+
+
+def interval(entries: dict[str, Any], digits: int, sign: str = "") -> str:
+    """Return an estimate with its interval as pages show it."""
+    mean, low, high = (number(entries[name], digits, sign) for name in ("mean", "low", "high"))
+    return unbroken(f"{mean} [{low}, {high}]")
+
+
+def unbroken(text: str) -> str:
+    """Return a text that stays on one line of a table."""
+    return text.replace(" ", "\N{NO-BREAK SPACE}")
+
+
+def _mean_and_std(values: Sequence[float]) -> dict[str, float]:
+    return {"mean": _mean(values), "std": float(np.std(values)) if len(values) else float("nan")}
+
+
+def _mean(values: Sequence[float]) -> float:
+    return float(np.mean(values)) if len(values) else float("nan")
+
+
+def _finite(rows: Table, name: str) -> list[float]:
+    return [row[name] for row in rows if np.isfinite(row[name])]
+
+
+def write_table(rows: Table, folder: Path) -> None:
+    """Write a table as JSON, all of it, and as CSV, the numbers that people look at."""
+    write_whole(folder / "table.json", to_json(rows, indent=1))
+    write_whole(folder / "table.csv", pd.DataFrame([_flat(row) for row in rows]).to_csv(index=False))
+
+
+def _flat(row: dict[str, Any]) -> dict[str, Any]:
+    paper = row.get("paper") or {}
+    flat: dict[str, Any] = {"road": row["road"], "name": row["name"], "trainings": row["trainings"]}
+    for key in CONVENTION:
+        flat[f"{key}, paper"] = paper.get(key)
+        flat[f"{key}, paper convention"] = round(row["paper_convention"][key]["mean"], 2)
+    for name in (*HONEST, "beyond_best_expert", "probability_of_improvement"):
+        if name in row:  # drivers that do not learn are not compared with experts
+            flat[name] = round(row[name]["mean"], 3)
+    return flat
+
+
 def curves_of(studies: StudyFolder, road: str, variants: Sequence[str], seeds: int) -> dict[str, Any]:
     """Return the curves of a road: by variant the steps, and what is drawn over them, a list per seed.
 
@@ -75,13 +228,12 @@ def curves_of(studies: StudyFolder, road: str, variants: Sequence[str], seeds: i
     found: dict[str, Any] = {}
     metric = metric_of(road, variants[0])
     for variant in variants:
-        comparable = metric_of(road, variant) == metric
         runs = studies.trained(road, variant, seeds)
         first = max(run.progress[0]["actual_steps"] for run in runs)
         last = min(run.progress[-1]["actual_steps"] for run in runs)
         grid = np.linspace(first, last, POINTS)
         found[variant] = {"steps": grid.round().tolist()}
-        for name in (*RETURNS, *SPEEDS) if comparable else SPEEDS:
+        for name in (*RETURNS, *SPEEDS) if metric_of(road, variant) == metric else SPEEDS:
             found[variant][name] = [_on(grid, run.progress, name) for run in runs]
     return found
 
@@ -92,6 +244,7 @@ def _on(grid: np.ndarray, progress: Table, name: str) -> list[float]:
     return np.interp(grid, steps, values).round(4).tolist()
 
 
+@rc_context(STYLE)
 def draw_curves(
     road: str, curves: dict[str, Any], references: dict[str, Table], metric: str = "return"
 ) -> Figure:
@@ -103,30 +256,28 @@ def draw_curves(
         references: rows of drivers that do not learn, by label, drawn as lines.
         metric: which of their returns.
     """
-    with rc_context(STYLE):
-        figure = Figure(figsize=(10.5, 3.1), layout="constrained", dpi=130)
-        for (name, label), axes in zip(DRAWN.items(), figure.subplots(1, len(DRAWN)), strict=True):
-            for (variant, curve), colour in zip(curves.items(), LINES[1:], strict=False):
-                if name in curve:
-                    steps, values = np.array(curve["steps"]) / 1000.0, np.array(curve[name])
-                    axes.fill_between(steps, values.min(0), values.max(0), color=colour, alpha=0.15, lw=0)
-                    axes.plot(steps, values.mean(0), color=colour, lw=1.5, label=VARIANTS[variant].label)
-            of_rows = metric if name == "return_mean" else name
-            for (reference, rows), style in zip(references.items(), ("--", ":"), strict=False):
-                value = estimate([row[of_rows] for row in rows]).mean
-                axes.axhline(value, color=INK, lw=1.0, ls=style, label=reference)
-            axes.set_title(f"{road}: {label}", loc="left", fontsize=9, color=INK)
-            axes.margins(x=0.01)
-            axes.set_xlabel("actual simulator steps [thousands]")
-        handles = figure.axes[-1].get_legend_handles_labels()
-        figure.legend(*handles, loc="outside upper left", ncols=6)
-        return figure
+    figure = new_figure(3.1)
+    for (name, label), axes in zip(DRAWN.items(), figure.subplots(1, len(DRAWN)), strict=True):
+        for (variant, curve), colour in zip(curves.items(), LINES[1:], strict=False):
+            if name in curve:
+                steps, values = np.array(curve["steps"]) / 1000.0, np.array(curve[name])
+                axes.fill_between(steps, values.min(0), values.max(0), color=colour, alpha=0.15, lw=0)
+                axes.plot(steps, values.mean(0), color=colour, lw=1.5, label=VARIANTS[variant].label)
+        of_rows = metric if name == "return_mean" else name
+        for (reference, rows), style in zip(references.items(), ("--", ":"), strict=False):
+            value = estimate_of(rows, of_rows).mean
+            axes.axhline(value, color=INK, lw=1.0, ls=style, label=reference)
+        axes.set_title(f"{road}: {label}")
+        axes.margins(x=0.01)
+        axes.set_xlabel("actual simulator steps [thousands]")
+    figure.legend(*figure.axes[-1].get_legend_handles_labels(), loc="outside upper left", ncols=6)
+    return figure
 
 
 def _figure_5(studies: StudyFolder, seeds: int, folder: Path, workers: int) -> None:
     """Draw a space-time picture per road: people alone, the best expert, the paper's method and ours."""
     for road in PAPERS_ROADS:
-        space_time(shown_on(studies, road)).savefig(folder / f"{road}.png", dpi=130)
+        space_time(shown_on(studies, road)).savefig(folder / f"{road}.png")
 
 
 def shown_on(studies: StudyFolder, road: str) -> list[Shown]:
@@ -140,59 +291,10 @@ def shown_on(studies: StudyFolder, road: str) -> list[Shown]:
     return episodes
 
 
-def carried_over(studies: StudyFolder, seeds: int, processes: int = 2) -> Table:
-    """Return what controllers that were trained among 22 vehicles do among others, without training."""
-    names = {"human": "human", "pi": "pi"}
-    for run in (PlannedRun(TRAINED_ON, variant, seed) for variant in CARRIED for seed in range(seeds)):
-        names[f"{run.variant} {run.seed}"] = str(studies.folder_of(run))
-    rows = []
-    with Workers(processes) as workers:
-        for road, changes in OTHER_ROADS.items():
-            scenario = load_config(changes=changes).make_scenario()
-            drivers = {label: make_driver(name, scenario.decision_step) for label, name in names.items()}
-            found = evaluate(scenario, drivers, held_out_seeds(EPISODES), workers).rows
-            rows += [
-                {"road": road, "driver": label, **estimates(driven, HONEST)}
-                for label, driven in found.items()
-            ]
-    return rows
-
-
-def _figure_10(studies: StudyFolder, seeds: int, folder: Path, workers: int) -> None:
-    """Train for 5, 11 and 22 vehicles, as in the paper; and carry controllers over without training."""
-    write_table([row for road in VOLUMES for row in table_rows(studies, road, AMONG_VOLUMES, seeds)], folder)
-    write_whole(folder / "carried-over.json", to_json(carried_over(studies, seeds, workers), indent=1))
-
-
-def _carried_over_table(folder: Path) -> pd.DataFrame:
-    """Return the mean speed by driver and traffic: over trainings, with the smallest and the largest."""
-    speeds: dict[str, dict[str, list[float]]] = {}
-    for row in json.loads((folder / "carried-over.json").read_text()):
-        by_driver = speeds.setdefault(row["road"], {})
-        by_driver.setdefault(row["driver"].rstrip(" 0123456789"), []).append(row["mean_speed"]["mean"])
-    table = []
-    for road, by_driver in speeds.items():
-        cells = {"": road}
-        for driver, means in by_driver.items():
-            cells[driver] = f"{sum(means) / len(means):.2f}"
-            if len(means) > 1:
-                cells[driver] = unbroken(f"{cells[driver]} [{min(means):.2f}, {max(means):.2f}]")
-        table.append(cells)
-    return pd.DataFrame(table)
-
-
 FIGURE_5 = Study(
     "space-time pictures",
     lambda seeds: planned(PAPERS_ROADS, SHOWN, 1),
     _figure_5,
     PAPERS_ROADS,
     minutes=0.5,
-)
-FIGURE_10 = Study(
-    "5, 11 and 22 vehicles, trained for each, and carried over",
-    lambda seeds: planned(VOLUMES, AMONG_VOLUMES, seeds),
-    _figure_10,
-    VOLUMES,
-    minutes=3.0,
-    tables={"carried over": _carried_over_table},
 )

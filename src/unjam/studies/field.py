@@ -39,7 +39,7 @@ from unjam.following.open_loop import (
 )
 from unjam.following.pairs import Pair, Stretches, moments_of, of_split, split_by_trajectory, stretches_of
 from unjam.physics.idm import PAPER_IDM, parameter_rows
-from unjam.reports.figures import INK, LINES, STYLE
+from unjam.reports.figures import INK, LINES, STYLE, new_figure
 from unjam.studies.study import OnProgress, Part, Table, about_study, measure_parts
 
 LIMITS: Limits = (-4.0, 2.0)
@@ -240,7 +240,7 @@ def run(
     rows = summary(measure_parts(folder / "parts", parts, workers, on_progress))
     about["command"] = [about["command"][0], "FOLDER", ngsim.name, astazero.name]
     write_whole(folder / "field.json", to_json({"manifest": about, "rows": rows}, indent=1))
-    picture(rows).savefig(folder / "field.png", dpi=130)
+    picture(rows).savefig(folder / "field.png")
 
 
 def summary(parts: Table) -> Table:
@@ -268,24 +268,24 @@ def _estimates(found: dict[str, list[float]]) -> dict[str, Any]:
     return errors
 
 
+@rc_context(STYLE)
 def picture(rows: Table) -> Figure:
     """Return, for NGSIM, the errors of the simulated gap, and beside them those of one step."""
-    with rc_context(STYLE):
-        figure = Figure(figsize=(11, 4.2), layout="constrained")
-        left, right = figure.subplots(1, 2, sharey=True, width_ratios=(3, 2))
-        styles = zip(TESTS.items(), (LINES[2], LINES[0]), (0.14, -0.14), strict=True)
-        for (test, label), colour, shift in styles:
-            judged = [row for row in rows if row["data"] == "ngsim" and row["test"] == test]
-            for axes, name in ((left, "gap"), (right, "one_step")):
-                _dots(axes, judged, name, colour, shift, label)
-        left.axvline(PUBLISHED, color=INK, lw=0.9, ls=":")
-        left.annotate("published", (PUBLISHED + 0.1, len(NAMES) - 0.45), fontsize=8, color=INK)
-        left.set_yticks(range(len(NAMES)), list(NAMES.values())[::-1])
-        left.set(xlim=SHOWN["gap"], ylim=(-0.6, len(NAMES) - 0.2), xlabel="error of the gap, driving on [m]")
-        right.set(xlim=SHOWN["one_step"], xlabel="error of the acceleration, one step [m/s²]")
-        left.plot([], [], "o", ms=4.5, color=INK, mfc="white", label="some collide")
-        left.legend(loc="lower right")
-        return figure
+    figure = new_figure(4.2, width=11)
+    left, right = figure.subplots(1, 2, sharey=True, width_ratios=(3, 2))
+    styles = zip(TESTS.items(), (LINES[2], LINES[0]), (0.14, -0.14), strict=True)
+    for (test, label), colour, shift in styles:
+        judged = [row for row in rows if row["data"] == "ngsim" and row["test"] == test]
+        for axes, name in ((left, "gap"), (right, "one_step")):
+            _dots(axes, judged, name, colour, shift, label)
+    left.axvline(PUBLISHED, color=INK, lw=0.9, ls=":")
+    left.annotate("published", (PUBLISHED + 0.1, len(NAMES) - 0.45), fontsize=8, color=INK)
+    left.set_yticks(range(len(NAMES)), list(NAMES.values())[::-1])
+    left.set(xlim=SHOWN["gap"], ylim=(-0.6, len(NAMES) - 0.2), xlabel="error of the gap, driving on [m]")
+    right.set(xlim=SHOWN["one_step"], xlabel="error of the acceleration, one step [m/s²]")
+    left.plot([], [], "o", ms=4.5, color=INK, mfc="white", label="some collide")
+    left.legend(loc="lower right")
+    return figure
 
 
 def _dots(axes: Axes, rows: Table, name: str, colour: str, shift: float, label: str | None) -> None:

@@ -10,12 +10,12 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from functools import cache
 from itertools import product
-from operator import itemgetter
 from pathlib import Path
 from time import perf_counter
 from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
+import pandas as pd
 from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -28,7 +28,7 @@ from unjam.following.open_loop import always, idm_follow, with_residual
 from unjam.following.pairs import SPLITS, Floats, Moments, moments_of, of_split, split_by_trajectory
 from unjam.physics.arrays import at_least
 from unjam.physics.idm import PAPER_IDM, idm_acceleration
-from unjam.reports.figures import INK, LINES, STYLE
+from unjam.reports.figures import INK, LINES, STYLE, new_figure
 from unjam.studies.study import OnProgress, Part, Study, Table, about_study, measure_parts
 
 Split = Literal["trajectories", "rows", "released"]
@@ -186,9 +186,8 @@ def _nearest(training: Moments, test: Moments) -> Floats:
     """Return the acceleration of the training row that is most similar to each test row."""
     from scipy.spatial import KDTree
 
-    seen = np.column_stack([training.speed, training.leader_speed, training.gap])
+    seen, wanted = (np.column_stack([rows.speed, rows.leader_speed, rows.gap]) for rows in (training, test))
     scale = seen.std(0)
-    wanted = np.column_stack([test.speed, test.leader_speed, test.gap])
     _, places = KDTree(seen / scale).query(wanted / scale)
     return training.acceleration[np.asarray(places, np.int64)]
 
@@ -212,23 +211,23 @@ def run(
         for row in rows
     ]
     write_whole(folder / "figure-6.json", to_json({"manifest": about, "rows": kept}, indent=1))
-    picture(rows).savefig(folder / "figure-6.png", dpi=130)
+    picture(rows).savefig(folder / "figure-6.png")
 
 
+@rc_context(STYLE)
 def picture(rows: Table) -> Figure:
     """Return training loss, error by the share of the data, and the same with more gradient steps."""
     main = [row for row in rows if row["split"] == "trajectories" and row["driver"] == "other"]
-    with rc_context(STYLE):
-        figure = Figure(figsize=(11, 3.7), layout="constrained")
-        left, middle, right = figure.subplots(1, 3)
-        _losses(left, [row for row in main if row["size"] == 1.0])
-        _errors(middle, [row for row in main if not row["longer"]], "200 passes, as in the paper")
-        longer = [row for row in main if row["longer"] or row["size"] == 0.3]
-        _errors(right, longer, "at 1 % as many gradient steps as at 30 %")
-        right.sharey(middle)
-        middle.set_ylabel("error of the acceleration, noise aside [m/s²]")
-        middle.legend()
-        return figure
+    figure = new_figure(3.7, width=11)
+    left, middle, right = figure.subplots(1, 3)
+    _losses(left, [row for row in main if row["size"] == 1.0])
+    _errors(middle, [row for row in main if not row["longer"]], "200 passes, as in the paper")
+    longer = [row for row in main if row["longer"] or row["size"] == 0.3]
+    _errors(right, longer, "at 1 % as many gradient steps as at 30 %")
+    right.sharey(middle)
+    middle.set_ylabel("error of the acceleration, noise aside [m/s²]")
+    middle.legend()
+    return figure
 
 
 def _losses(axes: Axes, rows: Table) -> None:
@@ -243,17 +242,15 @@ def _losses(axes: Axes, rows: Table) -> None:
 
 
 def _errors(axes: Axes, rows: Table, title: str) -> None:
+    fits = pd.DataFrame(rows).assign(share=lambda fits: 100 * fits["size"])
     for network, colour in COLOURS.items():
-        by_size: dict[float, list[float]] = {}
-        for row in sorted(rows, key=itemgetter("size")):
-            if row["network"] == network:
-                by_size.setdefault(100 * row["size"], []).append(row["error_of_driver"])
-        mean, spread = np.array([(np.mean(found), np.std(found)) for found in by_size.values()]).T
+        errors: Any = fits[fits["network"] == network].groupby("share")["error_of_driver"]
+        mean, spread = errors.mean(), errors.std(ddof=0)
         look = {"color": colour, "lw": 1.5, "marker": "o", "ms": 4, "capsize": 3}
-        axes.errorbar(list(by_size), mean, spread, label=LABELS[network], **look)
+        axes.errorbar(mean.index, mean, spread, label=LABELS[network], **look)
     axes.set_xlabel("share of the training rows [%]")
     _logarithmic(axes, title)
-    ticks = sorted({100 * row["size"] for row in rows})
+    ticks = sorted(fits["share"].unique())
     axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
     axes.minorticks_off()
 
@@ -265,7 +262,7 @@ def _logarithmic(axes: Axes, title: str) -> None:
     axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 4.0, 6.0)))
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axes.yaxis.set_minor_locator(NullLocator())
-    axes.set_title(title, loc="left", fontsize=9, color=INK)
+    axes.set_title(title)
 
 
 FIGURE_6 = Study(

@@ -1,4 +1,10 @@
-"""Robustness: trained controllers and experts on roads, and with sensors, that are not those of training."""
+"""What controllers are worth where they have not trained: on other roads, with other sensors and people.
+
+Three studies: the shipped controllers under single changes (`robustness`); other numbers of vehicles
+(Figure 10); and calibrated people on the ring: are their waves like real ones, and does a CAV still calm
+them? In the experiment of Sugiyama et al. (2008), 22 cars on 230 m, a jam arose by itself and travelled
+against the traffic at about 20 km/h, 5.6 m/s; on motorways it is 15 to 20 km/h.
+"""
 
 import json
 from dataclasses import dataclass, field
@@ -6,21 +12,34 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 
 from unjam.controller import make_driver
-from unjam.drivers.driver import Driver
 from unjam.drivers.wrappers import Impaired
-from unjam.files import to_json, write_whole
+from unjam.files import make_folder, to_json, write_whole
+from unjam.manifest import manifest
+from unjam.measures.metrics import measure, wave_speed
 from unjam.measures.statistics import paired_difference
-from unjam.studies.study import REFERENCES, ROADS, PlannedRun, Study, StudyFolder, Table
-from unjam.studies.table import entries, estimates, interval, number
+from unjam.reports.figures import png_bytes, space_time
+from unjam.reports.results import read_results
+from unjam.scenarios.registry import make_scenario
+from unjam.studies.comparison import HONEST, entries, estimates, interval, number, table_rows, write_table
+from unjam.studies.study import REFERENCES, ROADS, OnProgress, PlannedRun, Study, StudyFolder, Table, planned
 from unjam.training.config import load_config
-from unjam.training.evaluate import evaluate, held_out_seeds
-from unjam.worlds.workers import Workers
+from unjam.training.evaluate import (
+    TRAINED,
+    Evaluation,
+    evaluate,
+    held_out_seeds,
+    raise_failure,
+    save_evaluation,
+)
+from unjam.worlds.record import Episode
+from unjam.worlds.workers import EpisodeTask, Workers
 
 EPISODES = 10
-TRAINED = "trained"
+"""of each driver under each condition"""
 SHOWN = ("mean_speed", "mean_speed_steady", "speed_std_fleet", "min_headway", "collisions", "backlog_veh")
 PEOPLE = {
     "desired_speed": 17.49,
@@ -91,6 +110,24 @@ EXPERTS = {
     "merge": ("closing jam absorber", "jam absorber", "PI (paper)"),
 }
 """the shipped controller's own comes first"""
+VOLUMES = ("ring-5", "ring-11", "ring")
+"""of Figure 10; controllers of the last are carried over to OTHER_ROADS"""
+AMONG_VOLUMES = ("trpo", "ppo", "sac", "without-model", "proposed", "ours")
+CARRIED = ("proposed", "ours")
+TRAINED_ON = "ring"
+OTHER_ROADS: dict[str, dict[str, Any]] = {
+    "5 vehicles": ROADS["ring-5"],
+    "11 vehicles": ROADS["ring-11"],
+    "22 vehicles": ROADS["ring"],
+    "44 vehicles on 520 m": {"scenario": "ring", "road.vehicles": 44, "road.length": [520, 520]},
+}
+OTHER_EPISODES = 20
+"""of each driver on each of them"""
+RING_CHANGES: dict[str, Any] = {"length": (230, 230)}
+"""changes to `ring-jammed` for calibrated people: as long as in the experiment [m]"""
+PAPERS = "paper's IDM"
+"""label of the people among whom the trained controller learned"""
+TITLES = {"human": "no CAV", "pi": "PI", TRAINED: "PI + residual"}
 
 
 def under_conditions(studies: StudyFolder, road: str, processes: int, episodes: int = EPISODES) -> Table:
@@ -101,18 +138,25 @@ def under_conditions(studies: StudyFolder, road: str, processes: int, episodes: 
     with Workers(processes) as workers:
         for condition in CONDITIONS[road]:
             changes = {f"road.{key}": value for key, value in condition.scenario_changes.items()}
-            scenario = load_config(changes={**ROADS[road], **changes}).make_scenario()
-            step = scenario.decision_step
-            drivers: dict[str, Driver] = {}
-            for label, name in names.items():
-                made, how = make_driver(name, step), {} if name == "human" else condition.impaired
-                drivers[label] = Impaired(made, **how, time_step=step) if how else made
-            found = evaluate(scenario, drivers, held_out_seeds(episodes), workers).rows
+            found = _driven({**ROADS[road], **changes}, names, episodes, workers, **condition.impaired)
             for label, driven in found.items():
                 row: dict[str, Any] = {"road": road, "condition": condition.name, "driver": label}
                 gain = paired_difference(driven, found[EXPERTS[road][0]], "mean_speed")
                 rows.append({**row, **estimates(driven, SHOWN), "faster_than_expert": entries(gain)})
     return rows
+
+
+def _driven(
+    changes: dict[str, Any], names: dict[str, str], episodes: int, workers: Workers, **impaired: float
+) -> dict[str, Table]:
+    """Return the rows of drivers with these names on a road, by label; all but people are `impaired`."""
+    scenario = load_config(changes=changes).make_scenario()
+    step = scenario.decision_step
+    drivers = {label: make_driver(name, step) for label, name in names.items()}
+    for label, driver in drivers.items():
+        if impaired and not driver.native:
+            drivers[label] = Impaired(driver, **impaired, time_step=step)
+    return evaluate(scenario, drivers, held_out_seeds(episodes), workers).rows
 
 
 def _write(studies: StudyFolder, seeds: int, folder: Path, workers: int) -> None:
@@ -134,10 +178,94 @@ def _table(road: str, folder: Path) -> pd.DataFrame:
     return pd.DataFrame(table.values())
 
 
+def carried_over(studies: StudyFolder, seeds: int, processes: int = 2) -> Table:
+    """Return what controllers that were trained among 22 vehicles do among others, without training."""
+    names = {"human": "human", "pi": "pi"}
+    for run in (PlannedRun(TRAINED_ON, variant, seed) for variant in CARRIED for seed in range(seeds)):
+        names[f"{run.variant} {run.seed}"] = str(studies.folder_of(run))
+    rows = []
+    with Workers(processes) as workers:
+        for road, changes in OTHER_ROADS.items():
+            found = _driven(changes, names, OTHER_EPISODES, workers).items()
+            rows += [{"road": road, "driver": label, **estimates(driven, HONEST)} for label, driven in found]
+    return rows
+
+
+def _figure_10(studies: StudyFolder, seeds: int, folder: Path, workers: int) -> None:
+    """Train for 5, 11 and 22 vehicles, as in the paper; and carry controllers over without training."""
+    write_table([row for road in VOLUMES for row in table_rows(studies, road, AMONG_VOLUMES, seeds)], folder)
+    write_whole(folder / "carried-over.json", to_json(carried_over(studies, seeds, workers), indent=1))
+
+
+def _carried_over_table(folder: Path) -> pd.DataFrame:
+    """Return the mean speed by driver and traffic: over trainings, with the smallest and the largest."""
+    rows = pd.json_normalize(json.loads((folder / "carried-over.json").read_text()))
+    rows["trained as"] = rows["driver"].str.rstrip(" 0123456789")
+    speeds = rows.pivot_table("mean_speed.mean", "road", "trained as", _mean_and_range, sort=False)
+    return speeds.rename_axis(index="", columns=None).reset_index()
+
+
+def _mean_and_range(values: pd.Series) -> str:
+    found = {"mean": values.mean(), "low": values.min(), "high": values.max()}
+    return interval(found, 2) if len(values) > 1 else number(found["mean"], 2)
+
+
+def people_on_ring(
+    folder: Path,
+    populations: dict[str, Path],
+    controller: Path,
+    workers: int = 2,
+    on_progress: OnProgress = lambda name: None,
+) -> None:
+    """Write `ring.json` and `ring.png` into `folder`: people alone, with PI, and with a trained controller.
+
+    Args:
+        folder: for the results.
+        populations: files of `unjam fit-drivers`, by the label that they get.
+        controller: run folder or .unjam file of a controller for the ring.
+        workers: processes.
+        on_progress: told the name of each finished group of episodes.
+    """
+    make_folder(folder)
+    about, rows = manifest(), []
+    roads: dict[str, dict[str, Any]] = {PAPERS: {}}
+    roads |= {label: {"population": str(file.absolute())} for label, file in populations.items()}
+    names = {"human": "human", "pi": "pi", TRAINED: str(controller)}
+    shown: dict[str, Episode] = {}
+    largest = 0
+    with Workers(workers) as pool:
+        for people, changes in roads.items():
+            scenario = make_scenario("ring-jammed", {**RING_CHANGES, **changes})
+            for label, name in names.items():
+                driver = make_driver(name, scenario.decision_step)
+                tasks = [EpisodeTask(scenario, driver, (seed,), full=True) for seed in range(EPISODES)]
+                episodes = pool.run(tasks)
+                found = [measure(episode) for episode in episodes]
+                raise_failure(found)
+                for episode, row in zip(episodes, found, strict=True):
+                    rows.append({"people": people, "driver": label, **row, "wave_speed": wave_speed(episode)})
+                if label == "human":  # shown is where people alone make the largest wave
+                    largest = int(np.argmax([row["speed_std_fleet_steady"] for row in found]))
+                shown[f"{people}: {TITLES[label]}"] = episodes[largest]
+                on_progress(f"{people}, {label}")
+    write_whole(folder / "ring.json", to_json({"manifest": about, "rows": rows}, indent=1))
+    save_evaluation(folder / "shown", Evaluation({}, shown), {})
+    pictured = list(read_results(folder / "shown").shown.values())
+    write_whole(folder / "ring.png", png_bytes(space_time(pictured), dpi=90))
+
+
 ROBUSTNESS = Study(
     "the shipped controllers on roads, among people and with sensors that they have not trained with",
     lambda seeds: list(CONTROLLERS.values()),
     _write,
     minutes=40.0,
     tables={road: partial(_table, road) for road in CONDITIONS},
+)
+FIGURE_10 = Study(
+    "5, 11 and 22 vehicles, trained for each, and carried over",
+    lambda seeds: planned(VOLUMES, AMONG_VOLUMES, seeds),
+    _figure_10,
+    VOLUMES,
+    minutes=3.0,
+    tables={"carried over": _carried_over_table},
 )

@@ -1,14 +1,20 @@
-"""The paper's theorems, each with what can be measured of it.
+"""What trainings tell beside what they earn: the paper's theorems, and what training costs (Figure 8).
 
-A1 is about untrained policies, A2 about convergence, A3 about the model and the bound.
+Theorem A1 is about untrained policies, A2 about convergence, A3 about the model and the bound: each has what
+can be measured of it. Costs are measured of all variants side by side, in one run.
 """
 
+import json
+import tempfile
 from collections.abc import Sequence
-from itertools import pairwise
+from dataclasses import replace
+from itertools import pairwise, product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
+import torch
 from matplotlib import rc_context
 from matplotlib.figure import Figure
 
@@ -17,11 +23,14 @@ from unjam.drivers.network import Network
 from unjam.drivers.observation import observation_size
 from unjam.drivers.residual import ResidualDriver
 from unjam.files import to_json, write_whole
-from unjam.measures.statistics import estimate
-from unjam.reports.figures import INK, LINES, STYLE
+from unjam.measures.statistics import estimate, estimate_of
+from unjam.reports.figures import LINES, STYLE, new_figure, stacked_bars
+from unjam.reports.results import read_progress, seconds_by_part
+from unjam.studies.comparison import entries
 from unjam.studies.study import PAPERS_ROADS, VARIANTS, PlannedRun, Study, StudyFolder, Table, planned
-from unjam.studies.table import entries
 from unjam.training.evaluate import evaluate, held_out_seeds
+from unjam.training.folder import start_folder
+from unjam.training.train import Trainer
 from unjam.worlds.workers import Workers
 
 ROAD = "ring"
@@ -30,6 +39,15 @@ COMPARED = ("trpo", "ppo", "sac", "proposed", "ours")
 RANDOM_POLICIES = 10
 TOLERANCE = 0.05
 """share of the best known return within which a training counts as converged (A2)"""
+MEASURED = (
+    *("trpo", "ppo", "sac", "mb-trpo", "without-model"),
+    *("proposed", "proposed-ppo", "proposed-sac", "ours"),
+)
+STEPS, ROUNDS = 24_000, 3
+"""actual steps of each measured training, and how often all take their turn"""
+START_STEPS = 3_000
+NOT_MEASURED = "validation"
+"""the part that is switched off, for it is the same for all"""
 
 
 def random_network(inputs: int, authority: float, seed: int, hidden: int = 64) -> Network:
@@ -53,15 +71,14 @@ def untrained(
             config = PlannedRun(road, "proposed", 0).config
             scenario, expert, parts = config.make_scenario(), config.make_expert(), config.policy.observe
             limit = scenario.action_limit
-            drivers = {"expert alone": expert}
-            for number in range(policies):
-                for kind, base in (("expert + random", expert), ("random", Constant())):
-                    network = random_network(observation_size(parts, base), limit, number)
-                    drivers[f"{kind} {number}"] = ResidualDriver(base, network, limit, parts)
+            drivers, bases = {"expert alone": expert}, {"expert + random": expert, "random": Constant()}
+            for number, (kind, base) in product(range(policies), bases.items()):
+                network = random_network(observation_size(parts, base), limit, number)
+                drivers[f"{kind} {number}"] = ResidualDriver(base, network, limit, parts)
             found = evaluate(scenario, drivers, held_out_seeds(4), workers)
-            returns = {label: means["return"] for label, means in found.means().items()}
-            for kind in ("expert + random", "random"):
-                values = [mean for label, mean in returns.items() if label.startswith(f"{kind} ")]
+            returns = {label: estimate_of(driven, "return").mean for label, driven in found.rows.items()}
+            for kind in bases:
+                values = [returns[f"{kind} {number}"] for number in range(policies)]
                 rows.append({"road": road, "policy": kind, "returns": values, **entries(estimate(values))})
             rows.append({"road": road, "policy": "expert alone", "mean": returns["expert alone"]})
     return rows
@@ -108,26 +125,26 @@ def _model_facts(row: dict[str, Any]) -> dict[str, Any]:
     return {"steps": row["actual_steps"], "gap": gap, **{name: virtual.get(name) for name in names}}
 
 
+@rc_context(STYLE)
 def draw(by_variant: dict[str, list[Table]]) -> Figure:
     """Draw the model error and the rollout length over training, a line per training."""
-    with rc_context(STYLE):
-        figure = Figure(figsize=(10.5, 3.4), layout="constrained", dpi=130)
-        panels = figure.subplots(1, 2)
-        labels = {"eps_m": "model error eps_m (unexplained)", "k_star": "rollout length k* [decisions]"}
-        for (name, label), axes in zip(labels.items(), panels, strict=True):
-            for (variant, runs), colour in zip(by_variant.items(), LINES[1:], strict=False):
-                for number, run in enumerate(runs):
-                    steps = [row["steps"] / 1000.0 for row in run]
-                    words = VARIANTS[variant].label if number == 0 else None
-                    axes.plot(steps, [row[name] for row in run], color=colour, lw=1.2, label=words)
-            axes.set_title(label, loc="left", fontsize=9, color=INK)
-            axes.set_xlabel("actual simulator steps [thousands]")
-        panels[1].set_yscale("log")  # from 2 to 500
-        figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper left", ncols=5)
-        return figure
+    figure = new_figure(3.4)
+    panels = figure.subplots(1, 2)
+    labels = {"eps_m": "model error eps_m (unexplained)", "k_star": "rollout length k* [decisions]"}
+    for (name, label), axes in zip(labels.items(), panels, strict=True):
+        for (variant, runs), colour in zip(by_variant.items(), LINES[1:], strict=False):
+            for number, run in enumerate(runs):
+                steps = [row["steps"] / 1000.0 for row in run]
+                words = VARIANTS[variant].label if number == 0 else None
+                axes.plot(steps, [row[name] for row in run], color=colour, lw=1.2, label=words)
+        axes.set_title(label)
+        axes.set_xlabel("actual simulator steps [thousands]")
+    panels[1].set_yscale("log")  # from 2 to 500
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper left", ncols=5)
+    return figure
 
 
-def _write(studies: StudyFolder, seeds: int, folder: Path, workers: int) -> None:
+def _write_theory(studies: StudyFolder, seeds: int, folder: Path, workers: int) -> None:
     found = {
         "untrained": untrained(processes=workers),
         "convergence": convergence(studies, seeds),
@@ -137,9 +154,74 @@ def _write(studies: StudyFolder, seeds: int, folder: Path, workers: int) -> None
     draw(found["model"]).savefig(folder / "model.png")
 
 
+def measured_seconds(steps: int = STEPS, rounds: int = ROUNDS) -> dict[str, list[dict[str, float]]]:
+    """Return the wall time of the parts of training per 1,000 actual steps [s], by variant and round.
+
+    The variants take turns, so that what else the machine does meets all of them alike.
+    """
+    torch.set_num_threads(1)
+    found: dict[str, list[dict[str, float]]] = {variant: [] for variant in MEASURED}
+    with Workers(1) as workers, tempfile.TemporaryDirectory() as place:
+        for turn in range(rounds):
+            for variant in MEASURED:
+                config = PlannedRun(ROAD, variant, turn).config
+                config = replace(config, steps=steps, evaluation=replace(config.evaluation, every=0))
+                # Or sac would measure hardly more than its start.
+                config = replace(config, sac=replace(config.sac, start_steps=START_STEPS))
+                folder = Path(place) / f"{variant}-{turn}"
+                start_folder(folder, config)
+                Trainer(folder, config, workers).train()
+                rows = read_progress(folder)
+                thousands, parts = rows[-1]["actual_steps"] / 1000.0, seconds_by_part(rows)
+                parts.pop(NOT_MEASURED, None)
+                found[variant].append({part: seconds / thousands for part, seconds in parts.items()})
+    return found
+
+
+def _write_time(studies: StudyFolder, seeds: int, folder: Path, workers: int) -> None:
+    found = measured_seconds()
+    # A turn that something else on the machine slowed down does not count.
+    medians = {
+        variant: sorted(turns, key=lambda parts: sum(parts.values()))[len(turns) // 2]
+        for variant, turns in found.items()
+    }
+    of_trpo = sum(medians["trpo"].values())
+    over_trpo = {variant: sum(parts.values()) / of_trpo for variant, parts in medians.items()}
+    numbers = {"turns": found, "median": medians, "over_trpo": over_trpo}
+    write_whole(folder / "time.json", to_json(numbers, indent=1))
+    draw_time(medians).savefig(folder / "time.png")
+
+
+def draw_time(seconds: dict[str, dict[str, float]]) -> Figure:
+    """Draw the parts of training, a bar per variant."""
+    bars = {VARIANTS[variant].label: parts for variant, parts in seconds.items()}
+    figure = stacked_bars(bars, "wall time per 1,000 actual steps [s]", height=0.4 * len(bars) + 1.2)
+    figure.axes[0].invert_yaxis()
+    figure.axes[0].grid(axis="y", visible=False)
+    return figure
+
+
+def _time_table(folder: Path) -> pd.DataFrame:
+    """Return the wall time per 1,000 actual steps by variant and part, and how many times TRPO's it is."""
+    found = json.loads((folder / "time.json").read_text())
+    table = []
+    for variant, parts in found["median"].items():
+        cells = {"": VARIANTS[variant].label}
+        cells |= {f"{part} [s]": f"{seconds:.2f}" for part, seconds in parts.items()}
+        table.append({**cells, "times TRPO's": f"{found['over_trpo'][variant]:.2f}"})
+    return pd.DataFrame(table).fillna("")
+
+
 THEORY = Study(
     "what can be measured of the theorems A1, A2 and A3",
     lambda seeds: planned([ROAD], tuple(dict.fromkeys((*COMPARED, *WITH_MODEL))), seeds),
-    _write,
+    _write_theory,
     minutes=8.0,
+)
+FIGURE_8 = Study(
+    "training time, measured side by side",
+    lambda seeds: [],
+    _write_time,
+    minutes=12.0,
+    tables={"training time": _time_table},
 )
