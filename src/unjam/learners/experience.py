@@ -1,7 +1,7 @@
 """From trajectories to experience, the form in which learners take it, and into SB3's buffers."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -48,9 +48,7 @@ class Experience:
         return after
 
 
-def experience_of(
-    trajectories: Sequence[Trajectory], critic_inputs: Sequence[tuple[float, ...]]
-) -> Experience:
+def experience_of(trajectories: Sequence[Trajectory], critic_inputs: Sequence[Any] | Float64) -> Experience:
     """Return the experience of trajectories; `critic_inputs` has, for each, what the critic alone sees."""
     choices = [trajectory.choices for trajectory in trajectories]
     seen = [
@@ -70,15 +68,12 @@ def experience_of(
 
 def join(parts: Sequence[Experience]) -> Experience:
     """Return the experience of all parts, one behind the other: actual and virtual ones, say."""
+    joined = {
+        each.name: np.concatenate([getattr(part, each.name) for part in parts]) for each in fields(Experience)
+    }
     before = np.cumsum([0, *(len(part.rewards) for part in parts[:-1])])
-    return Experience(
-        observations=np.concatenate([part.observations for part in parts]),
-        actions=np.concatenate([part.actions for part in parts]),
-        rewards=np.concatenate([part.rewards for part in parts]),
-        starts=np.concatenate([part.starts + rows for part, rows in zip(parts, before, strict=True)]),
-        last_observations=np.concatenate([part.last_observations for part in parts]),
-        terminated=np.concatenate([part.terminated for part in parts]),
-    )
+    joined["starts"] += np.repeat(before, [len(part.starts) for part in parts])
+    return Experience(**joined)
 
 
 def fill_rollout_buffer(buffer: RolloutBuffer, policy: ActorCriticPolicy, rows: Experience) -> None:

@@ -112,14 +112,18 @@ class ActualData:
             return [np.arange(length) >= max(1, (1 - holdout) * length) for length in lengths]
         return held_out
 
-    def looks(self, ahead: int = 1) -> NDArray[np.int64]:
-        """Return where a residual was due and at least `ahead` decisions follow.
+    def looks(self, ahead: int = 1, since: int = 0) -> NDArray[np.int64]:
+        """Return where a residual was due and at least `ahead` decisions follow, rows (recording, decision).
 
-        Rows (recording, decision).
+        Only of the episodes from number `since` on.
         """
-        due = [np.arange(0, len(r.reward) - ahead + 1, r.hold) for r in self.recordings]
-        places = np.repeat(np.arange(len(due)), [len(decisions) for decisions in due])
-        return np.column_stack([places, np.concatenate([[], *due]).astype(np.int64)])
+        due = {
+            place: np.arange(0, len(recording.reward) - ahead + 1, recording.hold)
+            for place, recording in enumerate(self.recordings)
+            if recording.episode >= since
+        }
+        places = np.repeat(np.array(list(due), np.int64), [len(decisions) for decisions in due.values()])
+        return np.column_stack([places, np.concatenate([[], *due.values()]).astype(np.int64)])
 
     def states_at(self, looks: NDArray[np.int64]) -> LocalState:
         """Return the states at `looks`, rows (recording, decision), arrays of shape (rows,)."""

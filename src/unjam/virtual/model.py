@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from torch.nn.functional import pad
 
 from unjam.drivers.local_state import LocalState
+from unjam.physics.arrays import Array, namespace
 from unjam.virtual.settings import BaseName, VirtualSettings
 
 SPEEDS = ("speed", "leader_speed", "follower_speed")
@@ -33,13 +34,14 @@ def torch_generator(seed: Sequence[int], device: torch.device | str) -> torch.Ge
     return torch.Generator(device).manual_seed(int(state >> np.uint64(1)))
 
 
-def model_inputs(state: LocalState, applied: Tensor, drawn: Tensor) -> Tensor:
+def model_inputs(state: LocalState, applied: Array, drawn: Array) -> Array:
     """Return what the networks see, SI units, shape (n, 6 + m).
 
     The five numbers of the state, the applied acceleration, and what the episode has drawn, scaled.
     """
+    xp = namespace(applied)
     numbers = [getattr(state, name) for name in NUMBERS]
-    return torch.cat([torch.stack([*numbers, applied], 1), drawn], 1)
+    return xp.concatenate([xp.stack([*numbers, applied], 1), drawn], 1)
 
 
 class EnvironmentModel(nn.Module):
@@ -87,9 +89,14 @@ class EnvironmentModel(nn.Module):
     def forward(self, inputs: Tensor) -> Tensor:
         """Return each member's answers, (members, n, 6), to inputs of its own, (members, n, 6 + m).
 
-        Both are normalised: in units of their scale, from their mean.
+        Or to the same, (n, 6 + m). Both are normalised: in units of their scale, from their mean.
         """
-        return _through(list(zip(self.weights, self.biases, strict=True)), inputs)
+        layers = list(zip(self.weights, self.biases, strict=True))
+        return _through(layers, inputs.expand(self.members, -1, -1))
+
+    def seen(self, inputs: Tensor) -> Tensor:
+        """Return inputs in SI units as the networks take them."""
+        return (inputs.float() - self.input_mean) / self.input_scale
 
     @torch.no_grad()
     def normalise(self, inputs: Tensor, targets: Tensor, smallest: float) -> None:

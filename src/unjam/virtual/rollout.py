@@ -85,14 +85,16 @@ class Rollouts:
     """share of the decisions in which each of BOUNDS had to be enforced"""
 
 
-def draw_starts(data: ActualData, rows: int, ahead: int, seed: Sequence[int]) -> NDArray[np.int64]:
+def draw_starts(
+    data: ActualData, rows: int, ahead: int, seed: Sequence[int], since: int = 0
+) -> NDArray[np.int64]:
     """Return random decisions at which a residual was due, rows (recording, decision), shape (rows, 2).
 
-    At least `ahead` recorded decisions follow each; shape (0, 2) where there are none such.
+    At least `ahead` recorded decisions follow each, and its episode is number `since` or a later one; shape
+    (0, 2) where there are none such.
     """
-    looks = data.looks(ahead)
-    generator = np.random.default_rng(np.random.SeedSequence(list(seed)))
-    return looks[generator.integers(len(looks), size=rows)] if len(looks) else looks
+    looks = data.looks(ahead, since)
+    return looks[np.random.default_rng(list(seed)).integers(len(looks), size=rows)] if len(looks) else looks
 
 
 def begin(data: ActualData, looks: NDArray[np.int64], expert: Driver, device: torch.device | str) -> Starts:
