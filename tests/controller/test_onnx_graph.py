@@ -32,7 +32,7 @@ from unjam.drivers.observation import observation_size
 from unjam.drivers.registry import named_driver
 from unjam.drivers.wrappers import Mixed
 from unjam.errors import InputError, MissingPartError
-from unjam.learners.sac import SquashedResidualPolicy
+from unjam.learners.sac_td3 import SquashedResidualPolicy
 from unjam.learners.settings import PolicySettings
 from unjam.learners.trpo_ppo import ResidualPolicy
 from unjam.scenarios import Ring

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from tests.learners.task import INPUTS, Toy
 from tests.learners.test_trpo_ppo import random_rows, shake
 from unjam.learners.learner import policy_spaces
-from unjam.learners.sac import SquashedResidualPolicy, uniform_network
+from unjam.learners.sac_td3 import SquashedResidualPolicy, uniform_network
 from unjam.learners.settings import PolicySettings, SACSettings
 
 torch.set_num_threads(1)  # more would fight for the cores over matrices of this size

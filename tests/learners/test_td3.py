@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from tests.learners.task import INPUTS, Toy
 from tests.learners.test_trpo_ppo import random_rows, shake
 from unjam.learners.learner import policy_spaces
+from unjam.learners.sac_td3 import DeterministicResidualPolicy
 from unjam.learners.settings import PolicySettings, TD3Settings
-from unjam.learners.td3 import DeterministicResidualPolicy
 
 torch.set_num_threads(1)  # more would fight for the cores over matrices of this size
 

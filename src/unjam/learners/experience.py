@@ -48,7 +48,9 @@ class Experience:
         return after
 
 
-def experience_of(trajectories: Sequence[Trajectory], critic_inputs: Sequence[Any] | Float64) -> Experience:
+def experience_of(
+    trajectories: Sequence[Trajectory], critic_inputs: Sequence[Sequence[float]] | Float64
+) -> Experience:
     """Return the experience of trajectories; `critic_inputs` has, for each, what the critic alone sees."""
     choices = [trajectory.choices for trajectory in trajectories]
     seen = [
@@ -76,6 +78,7 @@ def join(parts: Sequence[Experience]) -> Experience:
     return Experience(**joined)
 
 
+@torch.no_grad()
 def fill_rollout_buffer(buffer: RolloutBuffer, policy: ActorCriticPolicy, rows: Experience) -> None:
     """Fill `buffer` with rows and compute their advantages.
 
@@ -84,12 +87,9 @@ def fill_rollout_buffer(buffer: RolloutBuffer, policy: ActorCriticPolicy, rows: 
     rollout) is bootstrapped: gamma V of where it ended is folded into its last reward. One that ended in a
     collision is not.
     """
-    actions = rows.actions[:, None]
-    with torch.no_grad():
-        values, log_probs, _ = policy.evaluate_actions(
-            torch.as_tensor(rows.observations), torch.as_tensor(actions)
-        )
-        last_values = policy.predict_values(torch.as_tensor(rows.last_observations)).numpy().ravel()
+    actions, seen = rows.actions[:, None], torch.as_tensor(rows.observations)
+    values, log_probs, _ = policy.evaluate_actions(seen, torch.as_tensor(actions))
+    last_values = policy.predict_values(torch.as_tensor(rows.last_observations)).numpy().ravel()
     rewards = rows.rewards.astype(np.float32)
     rewards[rows.lasts] += buffer.gamma * np.where(rows.terminated, 0.0, last_values).astype(np.float32)
 
@@ -135,13 +135,8 @@ class MixedReplayBuffer(ReplayBuffer):
 
     def begin_virtual(self, rows: int) -> ReplayBuffer:
         """Return an empty buffer for so many virtual rows, in place of the one before."""
-        self._virtual = ReplayBuffer(
-            rows,
-            self.observation_space,
-            self.action_space,
-            device=self.device,
-            handle_timeout_termination=False,
-        )
+        spaces = self.observation_space, self.action_space
+        self._virtual = ReplayBuffer(rows, *spaces, self.device, handle_timeout_termination=False)
         return self._virtual
 
     def forget_virtual(self) -> None:

@@ -81,14 +81,8 @@ class Imagination:
         if settings.calibrate and first == 0:
             states = (kept.states for kept in self.data.recordings)
             self.scenario = replace(self.scenario, humans=calibrated_people(states, self.scenario))
-        found = fit(
-            self.model,
-            self.data.transitions(settings.holdout),
-            settings,
-            self.scenario,
-            self._task.reward,
-            self._seed(iteration, FIT),
-        )
+        actual, seed = self.data.transitions(settings.holdout), self._seed(iteration, FIT)
+        found = fit(self.model, actual, settings, self.scenario, self._task.reward, seed)
         eps_m = found.errors[settings.error]
         self.k_star = rollout_length(eps_m, settings)
         self.facts = {

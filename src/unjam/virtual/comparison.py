@@ -9,15 +9,14 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from unjam.drivers.constant import Constant
 from unjam.drivers.driver import Driver, Memory
 from unjam.drivers.local_state import LocalState
 from unjam.scenarios.scenario import Scenario
 from unjam.virtual.data import ActualData, Transitions
 from unjam.virtual.fitting import OneStepErrors, answers_of, targets_of
 from unjam.virtual.model import NUMBERS, EnvironmentModel, model_inputs, torch_generator
-from unjam.virtual.rollout import ImaginedWorld, Rollouts, Starts, begin
-from unjam.virtual.world import VirtualDynamics
+from unjam.virtual.rollout import ImaginedWorld, Rollouts, Starts
+from unjam.virtual.world import VirtualDynamics, on_device
 from unjam.worlds.drive import Drive
 from unjam.worlds.record import Floats
 
@@ -84,21 +83,20 @@ def replay(
         By number of the state [m/s, m], shape (members, rows, H).
     """
     device = model.input_mean.device
-    starts = begin(data, looks, Constant(), device)
-    members = torch.arange(model.members, device=device)
+    each_member = np.tile(looks, (model.members, 1))
+    states = data.states_at(each_member).each(lambda values: on_device(values, device))
+    drawn = np.stack([data.recordings[place].drawn for place in each_member[:, 0]])
+    applied = np.stack([data.recordings[place].applied[at : at + decisions] for place, at in each_member], 1)
+    starts = Starts(states, {}, on_device(drawn, device), each_member)
     generator = torch_generator((0,), device)  # nothing is drawn from it
+    members = torch.arange(model.members, device=device)
     dynamics = VirtualDynamics(model, scenario, "", generator, noise=False, members=members)
-    applied = np.stack([data.recordings[place].applied[at : at + decisions] for place, at in looks])
-    columns = torch.as_tensor(applied.T, dtype=torch.float32, device=device).repeat(1, model.members)
-    drawn, state = starts.drawn.repeat(model.members, 1), starts.state.each(lambda v: v.repeat(model.members))
-    world = ImaginedWorld(dynamics, Starts(state, {}, drawn, looks), decisions, scenario.limits, None)
-    for _ in Drive(world, Replayed(columns), memory={"decision": 0}):
+    world = ImaginedWorld(dynamics, starts, decisions, scenario.limits, None)
+    for _ in Drive(world, Replayed(on_device(applied, device)), memory={"decision": 0}):
         pass
-    found = {
-        name: [getattr(each, name).view(model.members, -1).cpu().numpy() for each in world.states[1:]]
-        for name in NUMBERS
-    }
-    return {name: np.stack(values, -1) for name, values in found.items()}
+    shape = model.members, len(looks), decisions
+    found = {name: torch.stack([getattr(state, name) for state in world.states[1:]], 1) for name in NUMBERS}
+    return {name: numbers.view(shape).cpu().numpy() for name, numbers in found.items()}
 
 
 def one_step_errors(

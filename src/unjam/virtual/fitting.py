@@ -13,9 +13,16 @@ from torch import Tensor
 
 from unjam.errors import UnjamError
 from unjam.scenarios.scenario import Scenario
-from unjam.virtual.base import base_reward, base_step
 from unjam.virtual.data import Transitions
-from unjam.virtual.model import NOISE_ROWS, NUMBERS, TARGETS, EnvironmentModel, model_inputs
+from unjam.virtual.model import (
+    NOISE_ROWS,
+    NUMBERS,
+    TARGETS,
+    EnvironmentModel,
+    base_reward,
+    base_step,
+    model_inputs,
+)
 from unjam.virtual.settings import VirtualSettings
 from unjam.worlds.record import Floats
 from unjam.worlds.reward import make_reward

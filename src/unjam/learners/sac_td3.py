@@ -1,4 +1,4 @@
-"""SAC, and what it shares with TD3: learners from earlier iterations too, by a pair of critics."""
+"""SAC and TD3: learners from earlier iterations too, by a pair of critics, and their policies."""
 
 import math
 from typing import Any, cast
@@ -10,19 +10,26 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.policies import BasePolicy, ContinuousCritic
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.sac.policies import Actor, SACPolicy
+from stable_baselines3.td3.policies import Actor as DeterministicActor
+from stable_baselines3.td3.policies import TD3Policy
 from torch import Tensor, nn
 from torch.distributions import Normal
 
 from unjam.drivers.network import Network
 from unjam.learners.experience import Experience, MixedReplayBuffer, add_to_replay_buffer, shifted_rewards
 from unjam.learners.learner import AgentSpec, Learner, Tensors, Update, network_layers
-from unjam.learners.settings import OffPolicySettings, PolicySettings, SACSettings
+from unjam.learners.settings import OffPolicySettings, PolicySettings, SACSettings, TD3Settings
 
 UNIFORM_STD = 0.85
 """standard deviation of normal noise whose tanh is uniform in [-1, 1] to one per cent"""
 REPLAY = ("observations", "next_observations", "actions", "rewards", "dones")
 REPLAY_PLACE = ("pos", "full")
 """where the next row goes, and whether the buffer is full"""
+
+
+def uniform_network(inputs: int, authority: float) -> Network:
+    """Return a network whose residuals, exploring, are uniform over its authority [m/s2]."""
+    return Network(((np.zeros((inputs, 2)), np.array([0.0, math.log(UNIFORM_STD)])),), authority)
 
 
 class ActorView(BaseFeaturesExtractor):
@@ -92,9 +99,25 @@ class SquashedResidualPolicy(OffPolicyResidual, SACPolicy):
         return Network((*hidden, last), self.authority)
 
 
-def uniform_network(inputs: int, authority: float) -> Network:
-    """Return a network whose residuals, exploring, are uniform over its authority [m/s2]."""
-    return Network(((np.zeros((inputs, 2)), np.array([0.0, math.log(UNIFORM_STD)])),), authority)
+class DeterministicResidualPolicy(OffPolicyResidual, TD3Policy):
+    """SB3's policy of TD3 with a residual that is zero at the start: the actor's last layer is."""
+
+    def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> DeterministicActor:
+        """Return the actor, which sees the first `inputs` numbers."""
+        actor = super().make_actor(ActorView(self.observation_space, self.inputs))
+        last = cast(nn.Linear, actor.mu[-2])  # before the tanh
+        nn.init.zeros_(last.weight)
+        nn.init.zeros_(last.bias)
+        return actor
+
+    @property
+    def exploration_std(self) -> float:
+        """Standard deviation of the exploration noise [m/s2]."""
+        return self.settings.exploration_std * self.authority / self.settings.authority
+
+    def network(self) -> Network:
+        """Return the NumPy twin: the same residual to 1e-6, with the exploration noise beside it."""
+        return Network(network_layers(self.actor.mu), self.authority, self.exploration_std)
 
 
 class OffPolicy(Learner):
@@ -196,13 +219,38 @@ class SAC(OffPolicy):
             target_entropy=settings.target_entropy,
         )
 
+    @torch.no_grad()
     def gaussians(self, observations: Tensor) -> Normal:
         """Return mean and standard deviation of the residual before the tanh."""
-        with torch.no_grad():
-            mean, log_std, _ = self.sb3.actor.get_action_dist_params(observations)
+        mean, log_std, _ = self.sb3.actor.get_action_dist_params(observations)
         return Normal(mean.squeeze(1), log_std.squeeze(1).exp())
 
     def _tensors_in_place(self) -> Tensors:
         """Return the filled part of the replay buffer and, where it is learned, the temperature."""
         learned = {} if self.sb3.log_ent_coef is None else {"log_ent_coef": self.sb3.log_ent_coef}
         return super()._tensors_in_place() | learned
+
+
+class TD3(OffPolicy):
+    """Twin delayed deep deterministic policy gradient from whole episodes.
+
+    Source: Fujimoto et al. 2018, Addressing function approximation error in actor-critic methods.
+    """
+
+    def __init__(self, spec: AgentSpec, settings: TD3Settings) -> None:
+        super().__init__(
+            spec,
+            settings,
+            stable_baselines3.TD3,
+            DeterministicResidualPolicy,
+            policy_delay=settings.policy_delay,
+            target_policy_noise=settings.target_noise,
+            target_noise_clip=settings.target_noise_clip,
+        )
+
+    @torch.no_grad()
+    def gaussians(self, observations: Tensor) -> Normal:
+        """Return the residual and the standard deviation of its exploration noise [m/s2]."""
+        policy = self.sb3.policy
+        mean = policy.authority * policy.actor(observations).squeeze(1)
+        return Normal(mean, torch.full_like(mean, policy.exploration_std))
