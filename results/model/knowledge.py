@@ -30,9 +30,8 @@ from unjam.training.config import RunConfig, load_config
 from unjam.training.evaluate import raise_failure
 from unjam.virtual.comparison import one_step_errors, open_loop
 from unjam.virtual.data import ActualData
-from unjam.virtual.fitting import fit
+from unjam.virtual.fitting import fit, unexplained
 from unjam.virtual.model import NUMBERS, EnvironmentModel
-from unjam.virtual.model_error import unexplained
 from unjam.virtual.rollout import draw_starts
 from unjam.virtual.settings import BaseName, VirtualSettings
 from unjam.worlds.record import Episode

@@ -14,7 +14,7 @@ from unjam.drivers.network import Network
 from unjam.drivers.observation import observation_size
 from unjam.drivers.residual import ResidualDriver
 from unjam.learners.algorithm_1 import Driven, Iteration, algorithm_1, begin
-from unjam.learners.experience import Experience, join
+from unjam.learners.experience import join
 from unjam.learners.imagination import Imagination, rollout_experience
 from unjam.learners.learner import Update
 from unjam.learners.settings import (
@@ -164,7 +164,7 @@ def rollouts_of(rewards: np.ndarray, made: list[int], terminated: list[bool]) ->
 
 def test_rows_of_a_rollout_end_where_it_crashed() -> None:
     rollouts = rollouts_of(np.arange(6.0).reshape(2, 3), [3, 2], [False, True])
-    rows = rollout_experience(rollouts, critic_sees_road=True)
+    rows = rollout_experience(rollouts, rollouts.drawn.numpy())
     assert rows.rewards.tolist() == [0, 1, 2, 3, 4]
     assert rows.starts.tolist() == [0, 3]
     assert rows.terminated.tolist() == [False, True]
@@ -175,7 +175,8 @@ def test_rows_of_a_rollout_end_where_it_crashed() -> None:
 
 def test_the_advantage_at_the_cut_goes_on_with_the_value_of_where_it_ended(shared: Simulation) -> None:
     learner = Trained(shared, "trpo", None).learner
-    rows = rollout_experience(rollouts_of(np.array([[1.0, 2.0], [3.0, 4.0]]), [2, 2], [False, True]), True)
+    rollouts = rollouts_of(np.array([[1.0, 2.0], [3.0, 4.0]]), [2, 2], [False, True])
+    rows = rollout_experience(rollouts, rollouts.drawn.numpy())
     learner.fill(rows)
     with torch.no_grad():
         values, ends = (
@@ -198,10 +199,10 @@ def test_rollouts_begin_in_the_newest_episodes_and_are_as_many_as_asked(
             run_episode(RING, driver, (9, iteration, n), explore=True, simulation=shared) for n in (0, 1)
         ]
         imagination.learn(episodes, iteration)
-    rows = cast(Experience, imagination.imagine(network, 2))
+    rollouts = cast(Rollouts, imagination.imagine(network, 2))
     assert imagination.k_star == 30
-    assert len(rows.rewards) == 3 * 240 / 10
-    assert set(imagination._choices()[:, 0]) == {2, 3}
+    assert rollouts.rewards.numel() == 3 * 240 / 10
+    assert set(rollouts.start[:, 0]) == {2, 3}
 
 
 def test_a_model_that_is_not_trusted_adds_nothing(shared: Simulation) -> None:
@@ -213,8 +214,10 @@ def test_a_model_that_is_not_trusted_adds_nothing(shared: Simulation) -> None:
 def test_without_the_ratio_actual_rows_alone_fill_a_batch_and_with_it_both_do() -> None:
     sac: Any = begin([TASK], POLICY, SETTINGS["sac"], FREE, 0).learner
     buffer = sac.buffer
-    actual = rollout_experience(rollouts_of(np.full((4, 3), 1.0), [3] * 4, [False] * 4), True)
-    virtual = rollout_experience(rollouts_of(np.full((4, 3), 2.0), [3] * 4, [False] * 4), True)
+    actual, virtual = (
+        rollout_experience(rollouts, rollouts.drawn.numpy())
+        for rollouts in (rollouts_of(np.full((4, 3), reward), [3] * 4, [False] * 4) for reward in (1.0, 2.0))
+    )
     sac.fill(buffer, actual)
     assert set(buffer.sample(8).rewards.numpy().ravel()) == {np.float32(0.1)}
     sac.fill(buffer.begin_virtual(12), virtual)

@@ -15,7 +15,7 @@ from unjam.physics import IDMParameters
 from unjam.scenarios import Ring
 from unjam.scenarios.population import Population, write_population
 from unjam.scenarios.registry import make_scenario
-from unjam.virtual.base import BASES, absent, base_reward, base_step
+from unjam.virtual.model import BASES, absent, base_reward, base_step
 from unjam.worlds.reward import make_reward
 
 MERGE_LIKE = Ring(simulation_step=0.2, steps_per_decision=5, humans=IDMParameters(time_headway=1.4))

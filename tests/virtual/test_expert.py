@@ -13,8 +13,8 @@ from unjam.drivers.from_file import FileDriver
 from unjam.errors import InputError
 from unjam.scenarios import Ring
 from unjam.tree import leaves, mapped
-from unjam.virtual.data import ActualData
-from unjam.virtual.expert import ThroughNumPy, memory_on, on_tensors, remembered
+from unjam.virtual.data import ActualData, remembered
+from unjam.virtual.world import ThroughNumPy, memory_on, on_tensors
 from unjam.worlds.episode import run_episode
 from unjam.worlds.sumo.simulation import Simulation
 

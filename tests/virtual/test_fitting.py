@@ -9,8 +9,8 @@ from tests.virtual.little_world import RING, LittleWorld, actual_data
 from unjam.drivers import IDM, ResidualDriver
 from unjam.errors import UnjamError
 from unjam.virtual.data import ActualData, Transitions
-from unjam.virtual.fitting import Fit, fit, inputs_of, targets_of
-from unjam.virtual.model import NOISE_ROWS, TARGETS, EnvironmentModel, predict
+from unjam.virtual.fitting import Fit, fit, targets_of
+from unjam.virtual.model import NOISE_ROWS, TARGETS, EnvironmentModel, model_inputs, predict
 from unjam.virtual.settings import VirtualSettings
 
 SETTINGS = VirtualSettings(members=3, hidden=(32,), epochs=25, patience=6, batch=128, rate=1e-2)
@@ -25,6 +25,10 @@ def data() -> ActualData:
 @pytest.fixture(scope="module")
 def actual(data: ActualData) -> Transitions:
     return data.transitions(0.2)
+
+
+def inputs_of(actual: Transitions) -> np.ndarray:
+    return model_inputs(actual.states, actual.applied, actual.drawn)
 
 
 def fitted(actual: Transitions, settings: VirtualSettings = SETTINGS) -> tuple[EnvironmentModel, Fit]:

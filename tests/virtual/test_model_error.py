@@ -3,13 +3,15 @@ import math
 import numpy as np
 import pytest
 
-from unjam.virtual.model_error import OneStep, one_step, total_variation, unexplained
+from unjam.virtual.fitting import OneStep, OneStepErrors, total_variation, unexplained
+from unjam.virtual.model import TARGETS
 
 
 def test_errors_one_step_ahead_are_root_mean_squares() -> None:
-    wanted = np.array([3.0, -4.0])
-    predicted = np.array([[3.0, -4.0], [3.0, -2.0]])
-    assert one_step(wanted, predicted, np.array([1.0, 3.0])) == OneStep(math.sqrt(12.5), 1.0, 1.0)
+    wanted, predicted = np.array([3.0, -4.0]), np.array([[3.0, -4.0], [3.0, -2.0]])
+    columns = (np.repeat(each[..., None], 6, -1) for each in (wanted, predicted, np.array([1.0, 3.0])))
+    found = OneStepErrors(*columns).by_number()
+    assert found == dict.fromkeys(TARGETS, OneStep(math.sqrt(12.5), 1.0, 1.0))
 
 
 def test_unexplained_is_the_mean_share_of_the_variance() -> None:

@@ -4,7 +4,7 @@ import pytest
 
 from unjam.errors import InputError
 from unjam.parameters import build
-from unjam.virtual.base import BASES
+from unjam.virtual.model import BASES
 from unjam.virtual.settings import BaseName, VirtualSettings
 
 

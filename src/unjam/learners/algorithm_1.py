@@ -7,7 +7,7 @@ D_a actual experience and D_v virtual experience, k* the rollout length of Eq. 1
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -16,12 +16,12 @@ import torch
 from unjam.drivers.network import Network
 from unjam.drivers.observation import observation_size
 from unjam.errors import UnjamError
-from unjam.learners.experience import Experience, Float32, experience_of, join
-from unjam.learners.imagination import Imagination
+from unjam.learners.experience import Experience, experience_of, join
+from unjam.learners.imagination import Imagination, rollout_experience
 from unjam.learners.learner import AgentSpec, Learner, Tensors, Update, make_learner, policy_distance, under
 from unjam.learners.settings import LearnerSettings, PolicySettings
 from unjam.virtual.settings import VirtualSettings
-from unjam.worlds.record import Episode
+from unjam.worlds.record import Episode, Floats
 from unjam.worlds.task import Task
 
 COMPARED_ROWS = 2000
@@ -97,10 +97,8 @@ def begin(
     if virtual.virtual_ratio > 0:
         imaginations = [Imagination(virtual, task, policy, seed, index) for index, task in enumerate(tasks)]
     inputs = observation_size(policy.observe, tasks[0].expert)
-    critic_inputs = 0
-    if policy.critic_sees_road:  # and, of several, which it is: see for_critic
-        critic_inputs = sum(len(task.scenario.drawn_ranges) for task in tasks)
-        critic_inputs += len(tasks) if len(tasks) > 1 else 0
+    drawn = np.zeros((1, len(tasks[0].scenario.drawn_ranges)))
+    critic_inputs = seen_by_critic(tasks, policy, 0, drawn).shape[1]
     spec = AgentSpec(inputs, critic_inputs, tasks[0].scenario.action_limit, policy, seed)
     return Training(tasks, policy, seed, make_learner(learner, spec), imaginations)
 
@@ -199,14 +197,14 @@ def actual_experience(training: Training, episodes: Driven) -> Experience:
     """Return what was driven as experience; raise `UnjamError` where some of it is not finite."""
     found = []
     for index, (task, driven) in enumerate(zip(training.tasks, episodes, strict=True)):
-        sees_road = training.policy.critic_sees_road
         pairs = [
-            (trajectory, task.scenario.drawn_scaled(episode.drawn) if sees_road else ())
+            (trajectory, task.scenario.drawn_scaled(episode.drawn))
             for episode in driven
             for trajectory in episode.trajectories
         ]
-        of_task = experience_of([trajectory for trajectory, _ in pairs], [extra for _, extra in pairs])
-        found.append(for_critic(training, of_task, index))
+        drawn = np.array([scaled for _, scaled in pairs])
+        extra = seen_by_critic(training.tasks, training.policy, index, drawn)
+        found.append(experience_of([trajectory for trajectory, _ in pairs], extra))
     joined = join(found)
     for name in ("observations", "rewards"):
         if not np.isfinite(getattr(joined, name)).all():
@@ -218,30 +216,27 @@ def virtual_experience(training: Training, part: int, parts: int) -> Experience 
     """Return one of `parts` of what the policy as it is now does in the virtual environments, if anything."""
     network, found = training.learner.network(), []
     for index, imagination in enumerate(training.imaginations):
-        of_task = imagination.imagine(network, training.iteration, part, parts)
-        if of_task is not None:
-            found.append(for_critic(training, of_task, index))
+        rollouts = imagination.imagine(network, training.iteration, part, parts)
+        if rollouts is not None:
+            drawn = rollouts.drawn.cpu().numpy()
+            extra = seen_by_critic(training.tasks, training.policy, index, drawn)
+            found.append(rollout_experience(rollouts, extra))
     return join(found) if found else None
 
 
-def for_critic(training: Training, found: Experience, index: int) -> Experience:
-    """Return experience of task `index` with all that the critic sees where there are several tasks.
+def seen_by_critic(tasks: Sequence[Task], policy: PolicySettings, index: int, drawn: Floats) -> Floats:
+    """Return what the critic alone sees in rows of task `index` whose episodes drew `drawn`, shape (rows, m).
 
-    That is: what each task draws, zeros for the other tasks', and a number per task that says which it is.
+    Of several tasks that is what each draws, zeros for the other tasks', and a number per task that says
+    which it is.
     """
-    if len(training.tasks) == 1 or not training.policy.critic_sees_road:
-        return found
-    drawn = [len(task.scenario.drawn_ranges) for task in training.tasks]
-    inputs, which = training.learner.spec.inputs, np.eye(len(drawn))[index]
-
-    def wide(seen: Float32) -> Float32:
-        before, after = (np.zeros((len(seen), sum(part))) for part in (drawn[:index], drawn[index + 1 :]))
-        parts = [seen[:, :inputs], before, seen[:, inputs:], after, np.tile(which, (len(seen), 1))]
-        return np.hstack(parts).astype(np.float32)
-
-    return replace(
-        found, observations=wide(found.observations), last_observations=wide(found.last_observations)
-    )
+    if not policy.critic_sees_road:
+        return drawn[:, :0]
+    if len(tasks) == 1:
+        return drawn
+    columns = [np.zeros((len(drawn), len(task.scenario.drawn_ranges))) for task in tasks]
+    columns[index] = drawn
+    return np.hstack([*columns, np.tile(np.eye(len(tasks))[index], (len(drawn), 1))])
 
 
 def seed_iteration(run_seed: int, iteration: int) -> None:

@@ -1,7 +1,7 @@
 """From trajectories to experience, the form in which learners take it, and into SB3's buffers."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -49,7 +49,7 @@ class Experience:
 
 
 def experience_of(
-    trajectories: Sequence[Trajectory], critic_inputs: Sequence[tuple[float, ...]]
+    trajectories: Sequence[Trajectory], critic_inputs: Sequence[Sequence[float]] | Float64
 ) -> Experience:
     """Return the experience of trajectories; `critic_inputs` has, for each, what the critic alone sees."""
     choices = [trajectory.choices for trajectory in trajectories]
@@ -70,17 +70,15 @@ def experience_of(
 
 def join(parts: Sequence[Experience]) -> Experience:
     """Return the experience of all parts, one behind the other: actual and virtual ones, say."""
+    joined = {
+        each.name: np.concatenate([getattr(part, each.name) for part in parts]) for each in fields(Experience)
+    }
     before = np.cumsum([0, *(len(part.rewards) for part in parts[:-1])])
-    return Experience(
-        observations=np.concatenate([part.observations for part in parts]),
-        actions=np.concatenate([part.actions for part in parts]),
-        rewards=np.concatenate([part.rewards for part in parts]),
-        starts=np.concatenate([part.starts + rows for part, rows in zip(parts, before, strict=True)]),
-        last_observations=np.concatenate([part.last_observations for part in parts]),
-        terminated=np.concatenate([part.terminated for part in parts]),
-    )
+    joined["starts"] += np.repeat(before, [len(part.starts) for part in parts])
+    return Experience(**joined)
 
 
+@torch.no_grad()
 def fill_rollout_buffer(buffer: RolloutBuffer, policy: ActorCriticPolicy, rows: Experience) -> None:
     """Fill `buffer` with rows and compute their advantages.
 
@@ -89,12 +87,9 @@ def fill_rollout_buffer(buffer: RolloutBuffer, policy: ActorCriticPolicy, rows: 
     rollout) is bootstrapped: gamma V of where it ended is folded into its last reward. One that ended in a
     collision is not.
     """
-    actions = rows.actions[:, None]
-    with torch.no_grad():
-        values, log_probs, _ = policy.evaluate_actions(
-            torch.as_tensor(rows.observations), torch.as_tensor(actions)
-        )
-        last_values = policy.predict_values(torch.as_tensor(rows.last_observations)).numpy().ravel()
+    actions, seen = rows.actions[:, None], torch.as_tensor(rows.observations)
+    values, log_probs, _ = policy.evaluate_actions(seen, torch.as_tensor(actions))
+    last_values = policy.predict_values(torch.as_tensor(rows.last_observations)).numpy().ravel()
     rewards = rows.rewards.astype(np.float32)
     rewards[rows.lasts] += buffer.gamma * np.where(rows.terminated, 0.0, last_values).astype(np.float32)
 
@@ -140,13 +135,8 @@ class MixedReplayBuffer(ReplayBuffer):
 
     def begin_virtual(self, rows: int) -> ReplayBuffer:
         """Return an empty buffer for so many virtual rows, in place of the one before."""
-        self._virtual = ReplayBuffer(
-            rows,
-            self.observation_space,
-            self.action_space,
-            device=self.device,
-            handle_timeout_termination=False,
-        )
+        spaces = self.observation_space, self.action_space
+        self._virtual = ReplayBuffer(rows, *spaces, self.device, handle_timeout_termination=False)
         return self._virtual
 
     def forget_virtual(self) -> None:

@@ -16,10 +16,11 @@ from unjam.following.calibration import calibrated_people
 from unjam.learners.experience import Experience
 from unjam.learners.settings import PolicySettings
 from unjam.physics.idm import IDMParameters
+from unjam.virtual.comparison import return_gap
 from unjam.virtual.data import ActualData, pack_data, unpack_data
 from unjam.virtual.fitting import fit
 from unjam.virtual.model import EnvironmentModel, torch_generator
-from unjam.virtual.rollout import Rollouts, begin, imagine, return_bound, rollout_length
+from unjam.virtual.rollout import Rollouts, begin, draw_starts, imagine, return_bound, rollout_length
 from unjam.virtual.settings import VirtualSettings
 from unjam.virtual.world import VirtualDynamics
 from unjam.worlds.record import Episode
@@ -74,20 +75,14 @@ class Imagination:
         """Add actual episodes to D_a, fit the model to it, and find the rollout length of Eq. 15."""
         first = self.data.episodes
         self.data.add(episodes, self.scenario)
-        self._newest = [n for n, kept in enumerate(self.data.recordings) if kept.episode >= first]
-        self._actual = sum(len(self.data.recordings[place].reward) for place in self._newest)
+        newest = [kept for kept in self.data.recordings if kept.episode >= first]
+        self._first, self._actual = first, sum(len(kept.reward) for kept in newest)
         settings = self.settings
         if settings.calibrate and first == 0:
             states = (kept.states for kept in self.data.recordings)
             self.scenario = replace(self.scenario, humans=calibrated_people(states, self.scenario))
-        found = fit(
-            self.model,
-            self.data.transitions(settings.holdout),
-            settings,
-            self.scenario,
-            self._task.reward,
-            self._seed(iteration, FIT),
-        )
+        actual, seed = self.data.transitions(settings.holdout), self._seed(iteration, FIT)
+        found = fit(self.model, actual, settings, self.scenario, self._task.reward, seed)
         eps_m = found.errors[settings.error]
         self.k_star = rollout_length(eps_m, settings)
         self.facts = {
@@ -99,35 +94,35 @@ class Imagination:
             "epochs": found.epochs,
         }
 
-    def imagine(self, network: Network, iteration: int, part: int = 0, parts: int = 1) -> Experience | None:
-        """Return the experience of virtual rollouts with the policy `network`; None where there are none.
+    def imagine(self, network: Network, iteration: int, part: int = 0, parts: int = 1) -> Rollouts | None:
+        """Return virtual rollouts with the policy `network`; None where there are none.
 
         They begin at random decisions of the newest actual episodes at which a residual was due. In all
         `parts` of an iteration together they make `virtual_ratio` times as many decisions as those have.
         """
         driver = full_policy(self._task, self._policy, network)
         driven = self.k_star // driver.hold * driver.hold
-        choices = self._choices()
-        if driven == 0 or len(choices) == 0:
+        if driven == 0:
             return None
         count = ceil(self.settings.virtual_ratio * self._actual / parts / driven)
         seeds = [self._seed(iteration, purpose, part) for purpose in (STARTS, NOISE, EXPLORATION)]
-        generator = np.random.default_rng(np.random.SeedSequence(list(seeds[0])))
-        choices = choices[generator.integers(len(choices), size=count)]
-        device = self.settings.device
-        world = VirtualDynamics(
-            self.model,
-            self.scenario,
-            self._task.reward,
-            torch_generator(seeds[1], device),
-            self.settings.noise,
-        )
-        starts = begin(self.data, choices, self._task.expert, device)
-        rollouts = imagine(driver, world, starts, driven, torch_generator(seeds[2], device))
+        looks = draw_starts(self.data, count, 1, seeds[0], self._first)
+        if len(looks) == 0:
+            return None
+        noise, exploration = (torch_generator(seed, self.settings.device) for seed in seeds[1:])
+        world = VirtualDynamics(self.model, self.scenario, self._task.reward, noise, self.settings.noise)
+        starts = begin(self.data, looks, self._task.expert, self.settings.device)
+        rollouts = imagine(driver, world, starts, driven, exploration)
         self.steps += rollouts.decisions
         if part == 0:  # the policy that drove the actual episodes: returns can be compared
-            self.facts |= self._compared(rollouts, driven)
-        return rollout_experience(rollouts, self._policy.critic_sees_road)
+            gap = return_gap(rollouts, self.data, driven)
+            self.facts |= {
+                "return_virtual": gap and gap.virtual,
+                "return_actual": gap and gap.actual,
+                "crash_share": float(rollouts.terminated.double().mean()),
+                "bounded": rollouts.bounded,
+            }
+        return rollouts
 
     def bound(self, eps_pi: float, gamma: float) -> float:
         """Return the bound C for this iteration; `gamma` is that from choice to choice."""
@@ -161,33 +156,16 @@ class Imagination:
         self.scenario = replace(self.scenario, humans=IDMParameters(**facts["people"]))
         self.model.load_state_dict({n: t for n, t in tensors.items() if not n.startswith(DATA)})
 
-    def _choices(self) -> NDArray[np.int64]:
-        choices = self.data.looks()
-        return choices[np.isin(choices[:, 0], self._newest)]
 
-    def _compared(self, rollouts: Rollouts, driven: int) -> dict[str, Any]:
-        """Return how virtual returns compare with what was earned from the same rows, and what went wrong."""
-        virtual, actual = [], []
-        for earned, (place, at) in zip(rollouts.rewards.sum(1).tolist(), rollouts.start, strict=True):
-            reward = self.data.recordings[place].reward
-            if at + driven <= len(reward):
-                virtual.append(earned)
-                actual.append(float(reward[at : at + driven].sum()))
-        return {
-            "return_virtual": float(np.mean(virtual)) if virtual else None,
-            "return_actual": float(np.mean(actual)) if actual else None,
-            "crash_share": float(rollouts.terminated.double().mean()),
-            "bounded": rollouts.bounded,
-        }
+def rollout_experience(rollouts: Rollouts, critic_inputs: NDArray[np.floating]) -> Experience:
+    """Return virtual rollouts in the form in which learners take them; the cut at k* is no termination.
 
-
-def rollout_experience(rollouts: Rollouts, critic_sees_road: bool) -> Experience:
-    """Return virtual rollouts in the form in which learners take them; the cut at k* is no termination."""
+    `critic_inputs`, shape (n, m), is what the critic alone sees in each row.
+    """
     made = rollouts.made.cpu().numpy()
     seen = rollouts.observations.cpu().numpy()
-    if critic_sees_road:
-        drawn = rollouts.drawn.cpu().numpy()[:, None, :]
-        seen = np.concatenate([seen, np.broadcast_to(drawn, (*seen.shape[:2], drawn.shape[2]))], axis=2)
+    extra = np.broadcast_to(critic_inputs[:, None], (*seen.shape[:2], critic_inputs.shape[1]))
+    seen = np.concatenate([seen, extra], axis=2)
     counted = np.arange(seen.shape[1] - 1) < made[:, None]
     return Experience(
         observations=seen[:, :-1][counted].astype(np.float32),

@@ -1,4 +1,4 @@
-"""SAC, and what it shares with TD3: learners from earlier iterations too, by a pair of critics."""
+"""SAC, and what learners share that learn from earlier iterations too, by a pair of critics."""
 
 import math
 from typing import Any, cast
@@ -23,6 +23,11 @@ UNIFORM_STD = 0.85
 REPLAY = ("observations", "next_observations", "actions", "rewards", "dones")
 REPLAY_PLACE = ("pos", "full")
 """where the next row goes, and whether the buffer is full"""
+
+
+def uniform_network(inputs: int, authority: float) -> Network:
+    """Return a network whose residuals, exploring, are uniform over its authority [m/s2]."""
+    return Network(((np.zeros((inputs, 2)), np.array([0.0, math.log(UNIFORM_STD)])),), authority)
 
 
 class ActorView(BaseFeaturesExtractor):
@@ -90,11 +95,6 @@ class SquashedResidualPolicy(OffPolicyResidual, SACPolicy):
         *hidden, (mean, mean_bias), (log_std, log_std_bias) = layers
         last = np.hstack([mean, log_std]), np.hstack([mean_bias, log_std_bias])
         return Network((*hidden, last), self.authority)
-
-
-def uniform_network(inputs: int, authority: float) -> Network:
-    """Return a network whose residuals, exploring, are uniform over its authority [m/s2]."""
-    return Network(((np.zeros((inputs, 2)), np.array([0.0, math.log(UNIFORM_STD)])),), authority)
 
 
 class OffPolicy(Learner):
@@ -196,10 +196,10 @@ class SAC(OffPolicy):
             target_entropy=settings.target_entropy,
         )
 
+    @torch.no_grad()
     def gaussians(self, observations: Tensor) -> Normal:
         """Return mean and standard deviation of the residual before the tanh."""
-        with torch.no_grad():
-            mean, log_std, _ = self.sb3.actor.get_action_dist_params(observations)
+        mean, log_std, _ = self.sb3.actor.get_action_dist_params(observations)
         return Normal(mean.squeeze(1), log_std.squeeze(1).exp())
 
     def _tensors_in_place(self) -> Tensors:

@@ -40,7 +40,10 @@ class DeterministicResidualPolicy(OffPolicyResidual, TD3Policy):
 
 
 class TD3(OffPolicy):
-    """Twin delayed deep deterministic policy gradient from whole episodes."""
+    """Twin delayed deep deterministic policy gradient from whole episodes.
+
+    Source: Fujimoto et al. 2018, Addressing function approximation error in actor-critic methods.
+    """
 
     def __init__(self, spec: AgentSpec, settings: TD3Settings) -> None:
         super().__init__(
@@ -53,9 +56,9 @@ class TD3(OffPolicy):
             target_noise_clip=settings.target_noise_clip,
         )
 
+    @torch.no_grad()
     def gaussians(self, observations: Tensor) -> Normal:
         """Return the residual and the standard deviation of its exploration noise [m/s2]."""
         policy = self.sb3.policy
-        with torch.no_grad():
-            mean = policy.authority * policy.actor(observations).squeeze(1)
+        mean = policy.authority * policy.actor(observations).squeeze(1)
         return Normal(mean, torch.full_like(mean, policy.exploration_std))

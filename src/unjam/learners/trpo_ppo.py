@@ -136,10 +136,10 @@ class OnPolicy(Learner):
             returns = discounted_returns(actual, self.gamma)
             self.sb3.policy.scale_value(float(returns.mean()), float(max(returns.std(), 1e-3)))
 
+    @torch.no_grad()
     def gaussians(self, observations: Tensor) -> Normal:
         """Return mean and standard deviation of the residual."""
-        with torch.no_grad():
-            normal = cast(Normal, self.sb3.policy.get_distribution(observations).distribution)
+        normal = cast(Normal, self.sb3.policy.get_distribution(observations).distribution)
         return Normal(normal.mean.squeeze(1), normal.stddev.squeeze(1))
 
     def learn(self, update: Update) -> None:

@@ -19,9 +19,9 @@ from unjam.reports.results import MODEL_FILE, read_model, read_progress
 from unjam.scenarios.scenario import Scenario
 from unjam.training.config import RunConfig
 from unjam.training.folder import load_checkpoint
-from unjam.virtual.comparison import OneStepErrors, one_step_errors, open_loop, recorded, replay
+from unjam.virtual.comparison import one_step_errors, open_loop, recorded, replay
+from unjam.virtual.fitting import OneStepErrors, root_mean_square
 from unjam.virtual.model import NUMBERS, TARGETS, EnvironmentModel
-from unjam.virtual.model_error import root_mean_square
 from unjam.worlds.record import Floats
 
 LONGEST = 500

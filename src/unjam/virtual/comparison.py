@@ -1,6 +1,6 @@
 """Virtual beside actual: the same accelerations from the same start, and the same policy in the loop."""
 
-from collections.abc import Sequence
+import itertools
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -9,17 +9,14 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from unjam.drivers.car_following import Constant
 from unjam.drivers.driver import Driver, Memory
 from unjam.drivers.local_state import LocalState
-from unjam.drivers.residual import ResidualDriver
 from unjam.scenarios.scenario import Scenario
 from unjam.virtual.data import ActualData, Transitions
-from unjam.virtual.fitting import answers_of, changes_of, inputs_of, targets_of
-from unjam.virtual.model import NUMBERS, EnvironmentModel, torch_generator
-from unjam.virtual.model_error import OneStepErrors
-from unjam.virtual.rollout import ImaginedWorld, Starts, begin, imagine
-from unjam.virtual.world import Dynamics, VirtualDynamics
+from unjam.virtual.fitting import OneStepErrors, answers_of, targets_of
+from unjam.virtual.model import NUMBERS, EnvironmentModel, model_inputs, torch_generator
+from unjam.virtual.rollout import ImaginedWorld, Rollouts, Starts
+from unjam.virtual.world import VirtualDynamics, on_device
 from unjam.worlds.drive import Drive
 from unjam.worlds.record import Floats
 
@@ -86,31 +83,30 @@ def replay(
         By number of the state [m/s, m], shape (members, rows, H).
     """
     device = model.input_mean.device
-    starts = begin(data, looks, Constant(), device)
-    members = torch.arange(model.members, device=device)
+    each_member = np.tile(looks, (model.members, 1))
+    states = data.states_at(each_member).each(lambda values: on_device(values, device))
+    drawn = np.stack([data.recordings[place].drawn for place in each_member[:, 0]])
+    applied = np.stack([data.recordings[place].applied[at : at + decisions] for place, at in each_member], 1)
+    starts = Starts(states, {}, on_device(drawn, device), each_member)
     generator = torch_generator((0,), device)  # nothing is drawn from it
+    members = torch.arange(model.members, device=device)
     dynamics = VirtualDynamics(model, scenario, "", generator, noise=False, members=members)
-    applied = np.stack([data.recordings[place].applied[at : at + decisions] for place, at in looks])
-    columns = torch.as_tensor(applied.T, dtype=torch.float32, device=device).repeat(1, model.members)
-    drawn, state = starts.drawn.repeat(model.members, 1), starts.state.each(lambda v: v.repeat(model.members))
-    world = ImaginedWorld(dynamics, Starts(state, {}, drawn, looks), decisions, scenario.limits, None)
-    for _ in Drive(world, Replayed(columns), memory={"decision": 0}):
+    world = ImaginedWorld(dynamics, starts, decisions, scenario.limits, None)
+    for _ in Drive(world, Replayed(on_device(applied, device)), memory={"decision": 0}):
         pass
-    found = {
-        name: [getattr(each, name).view(model.members, -1).cpu().numpy() for each in world.states[1:]]
-        for name in NUMBERS
-    }
-    return {name: np.stack(values, -1) for name, values in found.items()}
+    shape = model.members, len(looks), decisions
+    found = {name: torch.stack([getattr(state, name) for state in world.states[1:]], 1) for name in NUMBERS}
+    return {name: numbers.view(shape).cpu().numpy() for name, numbers in found.items()}
 
 
 def one_step_errors(
     model: EnvironmentModel, actual: Transitions, scenario: Scenario, reward: str
 ) -> OneStepErrors:
     """Return the errors of base and model in predicting each of the actual decisions."""
-    wanted = targets_of(actual, model.base, scenario, reward)
-    inputs = torch.as_tensor(inputs_of(actual)).to(model.input_mean.device)
-    answers = answers_of(model, inputs) * model.learned.cpu().numpy()  # where the base is better, it is used
-    return OneStepErrors(wanted, answers, changes_of(actual))
+    wanted, changed = (targets_of(actual, base, scenario, reward) for base in (model.base, "none"))
+    inputs = torch.as_tensor(model_inputs(actual.states, actual.applied, actual.drawn))
+    answers = answers_of(model, inputs.to(model.input_mean.device))
+    return OneStepErrors(wanted, answers * model.learned.cpu().numpy(), changed)  # elsewhere the base is used
 
 
 class ReturnGap(NamedTuple):
@@ -118,46 +114,23 @@ class ReturnGap(NamedTuple):
 
     virtual: float
     actual: float
-    difference: float
-    """virtual less actual"""
     standard_error: float
-    """of the difference, rows taken as independent"""
-    decisions: int
+    """of their difference, rows taken as independent"""
 
 
-def return_gap(
-    driver: ResidualDriver,
-    dynamics: Dynamics,
-    data: ActualData,
-    looks: NDArray[np.int64],
-    decisions: int,
-    seed: Sequence[int],
-    device: torch.device | str = "cpu",
-) -> ReturnGap:
-    """Drive from actual rows in the virtual environment, and compare with what was earned there.
+def return_gap(rollouts: Rollouts, data: ActualData, decisions: int) -> ReturnGap | None:
+    """Compare what rollouts of so many decisions earned with what was earned from the same actual rows.
 
-    The comparison is fair where `driver` is who drove the recordings, with exploration. Returns are sums of
-    the rewards, not discounted, until the last decision or a crash.
-
-    Args:
-        driver: the full policy.
-        dynamics: of the virtual environment.
-        data: actual data.
-        looks: where to begin, rows (recording, decision); at least `decisions` recorded ones must follow.
-        decisions: rounded down to whole looks of the policy.
-        seed: of the exploration noise.
-        device: where the world is.
+    The comparison is fair where the same policy drove both, with exploration. Returns are sums of the
+    rewards, not discounted, until the last decision or a crash. Rows that fewer recorded decisions follow are
+    left out; None where nothing is left.
     """
-    starts = begin(data, looks, driver.expert, device)
-    rollouts = imagine(driver, dynamics, starts, decisions, torch_generator(seed, device))
-    driven = decisions // driver.hold * driver.hold
-    virtual = rollouts.rewards.sum(1).double().cpu().numpy()
-    actual = np.array([data.recordings[place].reward[at : at + driven].sum() for place, at in looks])
-    difference = virtual - actual
-    return ReturnGap(
-        virtual=float(virtual.mean()),
-        actual=float(actual.mean()),
-        difference=float(difference.mean()),
-        standard_error=float(difference.std() / np.sqrt(len(difference))),
-        decisions=driven,
-    )
+    earned = rollouts.rewards.sum(1).double().cpu().numpy()
+    actually = [data.recordings[place].reward[at : at + decisions] for place, at in rollouts.start]
+    whole = [len(rewards) == decisions for rewards in actually]
+    if not any(whole):
+        return None
+    virtual = earned[whole]
+    actual = np.array([rewards.sum() for rewards in itertools.compress(actually, whole)])
+    error = (virtual - actual).std() / np.sqrt(len(actual))
+    return ReturnGap(float(virtual.mean()), float(actual.mean()), float(error))

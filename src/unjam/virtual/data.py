@@ -2,16 +2,21 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
+from math import inf
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from unjam.drivers.command import Limits
+from unjam.drivers.driver import Driver, Memory
 from unjam.drivers.local_state import LocalState
 from unjam.errors import InputError
 from unjam.scenarios.scenario import Scenario
-from unjam.tree import Arrays, pack, unpack
+from unjam.tree import Arrays, mapped, pack, unpack
+from unjam.worlds.drive import Drive
 from unjam.worlds.record import Episode, Floats, Trajectory
+from unjam.worlds.world import RecordedWorld
 
 GOLDEN_RATIO = (5**0.5 - 1) / 2
 """multiples of it, modulo 1, cover the unit interval evenly from the first on, and have no period"""
@@ -112,23 +117,24 @@ class ActualData:
             return [np.arange(length) >= max(1, (1 - holdout) * length) for length in lengths]
         return held_out
 
-    def looks(self, ahead: int = 1) -> NDArray[np.int64]:
-        """Return where a residual was due and at least `ahead` decisions follow.
+    def looks(self, ahead: int = 1, since: int = 0) -> NDArray[np.int64]:
+        """Return where a residual was due and at least `ahead` decisions follow, rows (recording, decision).
 
-        Rows (recording, decision).
+        Only of the episodes from number `since` on.
         """
-        due = [np.arange(0, len(r.reward) - ahead + 1, r.hold) for r in self.recordings]
-        places = np.repeat(np.arange(len(due)), [len(decisions) for decisions in due])
-        return np.column_stack([places, np.concatenate([[], *due]).astype(np.int64)])
+        due = {
+            place: np.arange(0, len(recording.reward) - ahead + 1, recording.hold)
+            for place, recording in enumerate(self.recordings)
+            if recording.episode >= since
+        }
+        places = np.repeat(np.array(list(due), np.int64), [len(decisions) for decisions in due.values()])
+        return np.column_stack([places, np.concatenate([[], *due.values()]).astype(np.int64)])
 
     def states_at(self, looks: NDArray[np.int64]) -> LocalState:
         """Return the states at `looks`, rows (recording, decision), arrays of shape (rows,)."""
-        found = LocalState(*(np.empty(len(looks)) for _ in LocalState._fields))
-        for place in np.unique(looks[:, 0]):
-            rows = np.flatnonzero(looks[:, 0] == place)
-            for into, values in zip(found, self.recordings[place].states, strict=True):
-                into[rows] = values[looks[rows, 1]]
-        return found
+        first = np.cumsum([0, *(len(recording.states.speed) for recording in self.recordings)])
+        rows = first[looks[:, 0]] + looks[:, 1]
+        return _joined([recording.states for recording in self.recordings]).each(lambda values: values[rows])
 
 
 def is_held_out(episode: int, share: float) -> bool:
@@ -145,6 +151,39 @@ def _crashes(recording: Recording) -> NDArray[np.bool_]:
 def _joined(parts: Sequence[LocalState]) -> LocalState:
     first, *others = parts
     return first.each(lambda *values: np.concatenate(values), *others)
+
+
+def remembered(expert: Driver, recordings: Sequence[Recording], looks: NDArray[np.int64]) -> Memory:
+    """Return what the expert remembered before each of the decisions `looks`, rows (recording, decision).
+
+    It is driven once more over the recorded states, from the memory with which the recording began: that is
+    exact for every driver, since a driver's memory depends on what it has seen alone.
+
+    Returns:
+        NumPy arrays with a row for each look.
+    """
+    places, rows = np.unique(looks[:, 0], return_inverse=True)
+    used = [recordings[place] for place in places]
+    memory = mapped(lambda *each: np.stack(each), *(recording.memory for recording in used))
+    found = mapped(lambda values: np.empty((len(looks), *values.shape[1:])), memory)
+    if not found:
+        return found
+    last = int(looks[:, 1].max())
+    steps = [np.arange(last).clip(0, len(recording.applied)) for recording in used]
+    states = [kept.states.each(lambda values: values[at]) for kept, at in zip(used, steps, strict=True)]  # noqa: B023
+    order = np.argsort(looks[:, 1], kind="stable")
+    bounds = np.searchsorted(looks[order, 1], np.arange(last + 2))
+
+    def note(decision: int, memory: Memory) -> None:
+        here = order[bounds[decision] : bounds[decision + 1]]
+        if len(here):
+            mapped(lambda into, values: into.__setitem__(here, values[rows[here]]), found, memory)
+
+    note(0, memory)
+    world = RecordedWorld(states[0].each(lambda *each: np.stack(each, 1), *states[1:]), Limits(-inf, inf))
+    for decision, done in enumerate(Drive(world, expert, memory=memory), start=1):
+        note(decision, done.memory if done else memory)
+    return found
 
 
 def pack_data(data: ActualData) -> tuple[dict[str, Any], Arrays]:

@@ -3,6 +3,8 @@
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
+from math import sqrt
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -11,13 +13,57 @@ from torch import Tensor
 
 from unjam.errors import UnjamError
 from unjam.scenarios.scenario import Scenario
-from unjam.virtual.base import base_reward, base_step
 from unjam.virtual.data import Transitions
-from unjam.virtual.model import NOISE_ROWS, NUMBERS, TARGETS, EnvironmentModel
-from unjam.virtual.model_error import SMALLEST_CHANGE, OneStep, OneStepErrors, total_variation, unexplained
+from unjam.virtual.model import (
+    NOISE_ROWS,
+    NUMBERS,
+    TARGETS,
+    EnvironmentModel,
+    base_reward,
+    base_step,
+    model_inputs,
+)
 from unjam.virtual.settings import VirtualSettings
 from unjam.worlds.record import Floats
 from unjam.worlds.reward import make_reward
+
+SMALLEST_CHANGE = 1e-4
+"""what varies by less than this is as good as constant [m/s, m, reward]"""
+
+
+class OneStep(NamedTuple):
+    """Root mean squares on the holdout, one step ahead [m/s, m, reward]."""
+
+    base: float
+    """error of the base alone"""
+    model: float
+    """error of a member of the ensemble, the base where it is better"""
+    change: float
+    """of what there was to predict, about its mean: the change in the step, or the reward"""
+
+
+class OneStepErrors(NamedTuple):
+    """By how much a decision was predicted wrongly [m/s, m, reward]; R rows, columns as TARGETS."""
+
+    base: Floats
+    """of the base alone, shape (R, 6)"""
+    predicted: Floats
+    """of these, by each member of the ensemble, shape (members, R, 6)"""
+    change: Floats
+    """what there was to predict: the change in the decision, and the reward, shape (R, 6)"""
+
+    @property
+    def model(self) -> Floats:
+        """Of each member of the ensemble, shape (members, R, 6)."""
+        return self.base - self.predicted
+
+    def by_number(self) -> dict[str, OneStep]:
+        """Return the root mean squares, by name of TARGETS."""
+        found = {}
+        for column, name in enumerate(TARGETS):
+            base, model, change = (each[..., column] for each in (self.base, self.model, self.change))
+            found[name] = OneStep(root_mean_square(base), root_mean_square(model), float(change.std()))
+        return found
 
 
 @dataclass(frozen=True)
@@ -64,7 +110,7 @@ def fit(
     """
     generator = np.random.default_rng(np.random.SeedSequence(list(seed)))
     device = model.input_mean.device
-    inputs = torch.as_tensor(inputs_of(actual)).to(device)
+    inputs = torch.as_tensor(model_inputs(actual.states, actual.applied, actual.drawn)).to(device)
     targets = torch.as_tensor(targets_of(actual, model.base, scenario, reward)).to(device)
     training = _some(~actual.held_out, settings.fit_rows, generator)
     holdout = _some(actual.held_out, max(1, round(settings.fit_rows * settings.holdout)), generator)
@@ -72,13 +118,9 @@ def fit(
     model.reward_range.copy_(torch.stack([targets[:, -1].min(), targets[:, -1].max()]))
 
     bootstrap = training[generator.integers(len(training), size=(model.members, len(training)))]
-    last_loss, epochs = _descend(
-        model,
-        (_seen(model, inputs[bootstrap]), _wanted(model, targets[bootstrap])),
-        (_seen(model, inputs[holdout]), _wanted(model, targets[holdout])),
-        settings,
-        generator,
-    )
+    seen, normalised = model.seen(inputs), ((targets - model.target_mean) / model.target_scale).float()
+    learned_from, judged_by = ((seen[rows], normalised[rows]) for rows in (bootstrap, holdout))
+    last_loss, epochs = _descend(model, learned_from, judged_by, settings, generator)
 
     wanted, predicted = targets[holdout].cpu().numpy(), answers_of(model, inputs[holdout])
     learned = np.square(wanted - predicted).mean((0, 1)) < np.square(wanted).mean(0)
@@ -88,7 +130,9 @@ def fit(
     model.learned.copy_(torch.as_tensor(learned))
     model.noise.copy_(torch.as_tensor(noise))
 
-    steps = OneStepErrors(wanted, predicted, changes_of(actual)[holdout]).by_number()
+    steps = OneStepErrors(
+        wanted, predicted, targets_of(actual, "none", scenario, reward)[holdout]
+    ).by_number()
     errors = {
         "unexplained": unexplained([steps[name] for name in NUMBERS]),
         "total_variation": total_variation(predicted[:, :, :-1], left[:, :-1].std(0)),
@@ -98,25 +142,16 @@ def fit(
     return Fit(errors, steps, names, len(training), len(holdout), epochs)
 
 
-def inputs_of(actual: Transitions) -> Floats:
-    """Return what the networks see of actual decisions, as `model_inputs` does of virtual ones."""
-    numbers = [getattr(actual.states, name) for name in NUMBERS]
-    return np.column_stack([*numbers, actual.applied, actual.drawn])
-
-
 def targets_of(actual: Transitions, base: str, scenario: Scenario, reward: str) -> Floats:
-    """Return by how much what happened differs from what the base says, shape (rows, 6), SI units."""
+    """Return by how much what happened differs from what `base` says, shape (rows, 6), SI units.
+
+    Of the base `none`, that is all there was to predict: by how much the state changed, and the reward.
+    """
     known = base_step(base, scenario, actual.states, actual.applied)
     earned = make_reward(reward or scenario.reward)
     known_reward = base_reward(base, earned, actual.following, actual.applied, actual.crashed)
     left = [getattr(actual.following, name) - getattr(known, name) for name in NUMBERS]
     return np.column_stack([*left, actual.reward - known_reward])
-
-
-def changes_of(actual: Transitions) -> Floats:
-    """Return what there was to predict: by how much the state changed, and the reward, shape (rows, 6)."""
-    changed = [getattr(actual.following, name) - getattr(actual.states, name) for name in NUMBERS]
-    return np.column_stack([*changed, actual.reward])
 
 
 @torch.no_grad()
@@ -125,24 +160,47 @@ def answers_of(model: EnvironmentModel, inputs: Tensor) -> Floats:
 
     Also where the base is better.
     """
-    answers = _answers(model, _seen(model, inputs)) * model.target_scale + model.target_mean
+    answers = model(model.seen(inputs)) * model.target_scale + model.target_mean
     return answers.double().cpu().numpy()
+
+
+def root_mean_square(values: Floats) -> float:
+    """Return the root of the mean square of all values."""
+    return float(np.sqrt(np.square(values).mean()))
+
+
+def unexplained(numbers: Sequence[OneStep]) -> float:
+    """Return the model's squared error over the variance of the change, mean of the numbers of a state.
+
+    A number that never changes is not wrong.
+    """
+    shares = [(step.model / step.change) ** 2 if step.change > SMALLEST_CHANGE else 0.0 for step in numbers]
+    return sum(shares) / len(shares)
+
+
+def total_variation(predicted: Floats, noise: Floats) -> float:
+    """Return the mean total variation between Gaussians about a member's answer and about the mean of all.
+
+    Source: TV(N(m1, s), N(m2, s)) = erf(|m1 - m2| / (2 sqrt 2 s)).
+
+    Args:
+        predicted: by each member, shape (members, rows, numbers).
+        noise: standard deviation of the noise that both have, shape (numbers,).
+
+    Returns:
+        In [0, 1]; NaN for a single member, of which nobody can tell how wrong it is.
+    """
+    if len(predicted) == 1:
+        return float("nan")
+    variance = predicted.var(0, ddof=1) / np.square(noise.clip(SMALLEST_CHANGE))
+    distance = torch.as_tensor(np.sqrt(variance.sum(-1)))
+    return float(torch.erf(distance / (2.0 * sqrt(2.0))).mean())
 
 
 def _some(chosen: NDArray[np.bool_], most: int, generator: np.random.Generator) -> NDArray[np.int64]:
     """Return the indices of at most so many of the chosen rows."""
     rows = np.flatnonzero(chosen)
     return generator.permutation(rows)[:most]
-
-
-def _seen(model: EnvironmentModel, inputs: Tensor) -> Tensor:
-    """Return inputs in SI units as the networks take them."""
-    return (inputs.float() - model.input_mean) / model.input_scale
-
-
-def _wanted(model: EnvironmentModel, targets: Tensor) -> Tensor:
-    """Return targets in SI units as the networks are to answer them."""
-    return ((targets - model.target_mean) / model.target_scale).float()
 
 
 def _descend(
@@ -187,10 +245,4 @@ def _descend(
 @torch.no_grad()
 def _losses(model: EnvironmentModel, seen: Tensor, wanted: Tensor) -> Tensor:
     """Return each member's mean squared error, shape (members,)."""
-    return (_answers(model, seen) - wanted).square().mean((1, 2))
-
-
-@torch.no_grad()
-def _answers(model: EnvironmentModel, seen: Tensor) -> Tensor:
-    """Return what every member answers to the same rows, shape (members, rows, 6)."""
-    return model(seen.expand(model.members, -1, -1))
+    return (model(seen) - wanted).square().mean((1, 2))

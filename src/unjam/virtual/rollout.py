@@ -15,12 +15,10 @@ from unjam.drivers.driver import Driver, Memory
 from unjam.drivers.local_state import LocalState
 from unjam.drivers.residual import AGE, EXPERT, RESIDUAL, ResidualDriver
 from unjam.errors import UnjamError
-from unjam.virtual.data import ActualData
-from unjam.virtual.expert import memory_on, on_tensors, remembered
+from unjam.virtual.data import ActualData, remembered
 from unjam.virtual.settings import VirtualSettings
-from unjam.virtual.world import BOUNDS, Dynamics
+from unjam.virtual.world import BOUNDS, Dynamics, memory_on, on_device, on_tensors
 from unjam.worlds.drive import drive
-from unjam.worlds.record import Floats
 from unjam.worlds.world import Driven, OnProgress
 
 
@@ -85,14 +83,16 @@ class Rollouts:
     """share of the decisions in which each of BOUNDS had to be enforced"""
 
 
-def draw_starts(data: ActualData, rows: int, ahead: int, seed: Sequence[int]) -> NDArray[np.int64]:
+def draw_starts(
+    data: ActualData, rows: int, ahead: int, seed: Sequence[int], since: int = 0
+) -> NDArray[np.int64]:
     """Return random decisions at which a residual was due, rows (recording, decision), shape (rows, 2).
 
-    At least `ahead` recorded decisions follow each; shape (0, 2) where there are none such.
+    At least `ahead` recorded decisions follow each, and its episode is number `since` or a later one; shape
+    (0, 2) where there are none such.
     """
-    looks = data.looks(ahead)
-    generator = np.random.default_rng(np.random.SeedSequence(list(seed)))
-    return looks[generator.integers(len(looks), size=rows)] if len(looks) else looks
+    looks = data.looks(ahead, since)
+    return looks[np.random.default_rng(list(seed)).integers(len(looks), size=rows)] if len(looks) else looks
 
 
 def begin(data: ActualData, looks: NDArray[np.int64], expert: Driver, device: torch.device | str) -> Starts:
@@ -100,15 +100,11 @@ def begin(data: ActualData, looks: NDArray[np.int64], expert: Driver, device: to
     drawn = np.stack([data.recordings[place].drawn for place in looks[:, 0]])
     memory = remembered(expert, data.recordings, looks)
     return Starts(
-        state=data.states_at(looks).each(lambda values: _tensor(values, device)),
+        state=data.states_at(looks).each(lambda values: on_device(values, device)),
         memory=memory_on(on_tensors(expert, device), memory, device),
-        drawn=_tensor(drawn, device),
+        drawn=on_device(drawn, device),
         looks=looks,
     )
-
-
-def _tensor(values: Floats, device: torch.device | str) -> Tensor:
-    return torch.as_tensor(values, dtype=torch.float32, device=device)
 
 
 class ImaginedWorld:
@@ -131,12 +127,8 @@ class ImaginedWorld:
         self.limits, self.rows = limits, len(starts.state.speed)
         self.states = [starts.state]
         """one after the other, the last being the present one"""
-        self._dynamics, self._starts, self._decisions, self._generator = (
-            dynamics,
-            starts,
-            decisions,
-            generator,
-        )
+        self._dynamics, self._starts = dynamics, starts
+        self._decisions, self._generator = decisions, generator
         like = starts.state.speed
         self._running, self._ran, self._rewards = torch.ones_like(like), [], []
         # Single precision counts to 2^24 only.
@@ -181,13 +173,9 @@ class ImaginedWorld:
         hold, nothing = driven.hold, self.states[0].speed.new_zeros((self.rows, 0))
         looks = range(0, len(self._rewards), hold)
         actions = [driven.decisions[look][1] for look in looks]
-        rewards, made = [], torch.zeros_like(self._running)
-        for look in looks:
-            earned = torch.zeros_like(self._running)
-            for reward in self._rewards[look : look + hold]:
-                earned += reward
-            rewards.append(earned)
-            made += self._ran[look]
+        none = torch.zeros_like(self._running)
+        rewards = [sum(self._rewards[look : look + hold], none) for look in looks]
+        made = sum((self._ran[look] for look in looks), none)
         seen = [*(driven.decisions[look][2] for look in looks), driven.last_observation]
         rollouts = Rollouts(
             observations=torch.stack(seen, 1),

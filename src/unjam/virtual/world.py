@@ -1,21 +1,28 @@
-"""The virtual environment itself: thousands of rows stepped at once, free of the simulator."""
+"""The virtual environment itself: thousands of rows stepped at once as tensors, free of the simulator."""
 
-from typing import NamedTuple, Protocol
+from dataclasses import dataclass
+from typing import Any, ClassVar, NamedTuple, Protocol
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
+from unjam.drivers.check import check_acceleration
+from unjam.drivers.driver import Driver, Memory
 from unjam.drivers.from_file import is_file_reference
 from unjam.drivers.local_state import LocalState
 from unjam.physics.kinematics import distance_driven
 from unjam.scenarios.scenario import Scenario
-from unjam.virtual.base import base_reward, base_step, largest_gap
+from unjam.tree import mapped
 from unjam.virtual.model import (
     NOISE_ROWS,
     NUMBERS,
     SPEEDS,
     EnvironmentModel,
+    base_reward,
+    base_step,
+    largest_gap,
     model_inputs,
     predict,
     random_members,
@@ -26,6 +33,65 @@ GAP_ROWS = slice(len(SPEEDS), len(NUMBERS))
 """where the gaps are among NUMBERS"""
 BOUNDS = ("speed", "gap", "reward")
 """what is kept within physical bounds"""
+
+
+def on_device(values: NDArray[Any], device: torch.device | str) -> Tensor:
+    """Return numbers in single precision on `device`, as the virtual environment has them."""
+    return torch.as_tensor(values, dtype=torch.float32, device=device)
+
+
+def reward_on_tensors(text: str) -> Reward:
+    """Return the reward for a name or for `path.py:name`; a user's function is asked through NumPy."""
+    reward = make_reward(text)
+    if not is_file_reference(text):
+        return reward
+
+    def asked(outcome: Outcome) -> dict[str, Tensor]:
+        terms = reward(Outcome(*(values.cpu().numpy() for values in outcome)))
+        return {name: on_device(np.asarray(term), outcome.speeds.device) for name, term in terms.items()}
+
+    return asked
+
+
+def on_tensors(driver: Driver, device: torch.device | str) -> Driver:
+    """Return a driver that takes tensors on `device`: the same, or the same through NumPy."""
+    return driver if driver.tensors else ThroughNumPy(driver, torch.device(device))
+
+
+def memory_on(driver: Driver, memory: Memory, device: torch.device | str) -> Memory:
+    """Return NumPy `memory` as a driver of `on_tensors` takes it, in single precision on `device`."""
+    return memory if isinstance(driver, ThroughNumPy) else mapped(lambda v: on_device(v, device), memory)
+
+
+@dataclass(frozen=True)
+class ThroughNumPy(Driver):
+    """A driver that knows nothing of tensors, asked through NumPy; its memory stays NumPy's."""
+
+    tensors: ClassVar[bool] = True
+
+    driver: Driver
+    device: torch.device
+    """where the world is"""
+
+    def initial_memory(self, n: int) -> Memory:
+        """Return the driver's."""
+        return self.driver.initial_memory(n)
+
+    def act(self, state: LocalState, memory: Memory) -> tuple[Tensor, Memory]:
+        """Return the driver's acceleration as a tensor, and its memory.
+
+        Raises:
+            InputError: the acceleration is not finite or of a wrong shape.
+        """
+        numbers = state.each(lambda values: values.double().cpu().numpy())
+        answer, memory = self.driver.act(numbers, memory)
+        acceleration = check_acceleration(answer, len(state.speed), "virtual environment")
+        return on_device(acceleration, self.device), memory
+
+    def memory_features(self, memory: Memory) -> Tensor | None:
+        """Return the driver's features as a tensor."""
+        features = self.driver.memory_features(memory)
+        return None if features is None else on_device(np.asarray(features), self.device)
 
 
 class Outcomes(NamedTuple):
@@ -45,23 +111,6 @@ class Dynamics(Protocol):
     def step(self, state: LocalState, applied: Tensor, drawn: Tensor) -> Outcomes:
         """Return what `applied` [m/s2], shape (n,), leads to; `drawn`, (n, m), is what the episode drew."""
         ...
-
-
-def reward_on_tensors(text: str) -> Reward:
-    """Return the reward for a name or for `path.py:name`; a user's function is asked through NumPy."""
-    reward = make_reward(text)
-    if not is_file_reference(text):
-        return reward
-
-    def asked(outcome: Outcome) -> dict[str, Tensor]:
-        terms = reward(Outcome(*(values.cpu().numpy() for values in outcome)))
-        like = outcome.speeds
-        return {
-            name: torch.as_tensor(np.asarray(term), dtype=like.dtype, device=like.device)
-            for name, term in terms.items()
-        }
-
-    return asked
 
 
 class VirtualDynamics:
@@ -85,20 +134,14 @@ class VirtualDynamics:
 
         With `members`, those answer in every step, each for an equal share of the rows in turn.
         """
-        self._base = model.base
-        self._members = model.members
-        self._layers = model.layers()
-        self._noise = model.noise if noise else None
-        self._lowest, self._highest = model.reward_range
-        self._scenario = scenario
+        self._model, self._layers, self._fixed_members = model, model.layers(), members
+        self._scenario, self._generator, self._noisy = scenario, generator, noise
         self._reward = reward_on_tensors(reward or scenario.reward)
-        self._generator = generator
-        self._fixed_members = members
 
     def step(self, state: LocalState, applied: Tensor, drawn: Tensor) -> Outcomes:
         """Return what `applied` leads to: next state, reward, and whether that is a crash."""
         scenario = self._scenario
-        known = base_step(self._base, scenario, state, applied)
+        known = base_step(self._model.base, scenario, state, applied)
         expected = torch.stack([getattr(known, name) for name in NUMBERS])
         left = self._left(state, applied, drawn, expected[GAP_ROWS]).T
         numbers = expected + left[: len(NUMBERS)]
@@ -107,7 +150,7 @@ class VirtualDynamics:
         largest = largest_gap(state)
         speeds = wanted_speeds.clip(0.0, scenario.top_speed)
         gaps = wanted_gaps.clip(0.0).minimum(largest)
-        left_of_reward = left[-1].clip(self._lowest, self._highest)
+        left_of_reward = left[-1].clip(*self._model.reward_range)
         nobody = gaps >= largest
         speed = speeds[0]
         position = state.route_position + distance_driven(
@@ -122,7 +165,7 @@ class VirtualDynamics:
             route_position=torch.where(state.loop_length.isnan(), position, position % state.loop_length),
             loop_length=state.loop_length,
         )
-        earned = base_reward(self._base, self._reward, following, applied, crashed)
+        earned = base_reward(self._model.base, self._reward, following, applied, crashed)
         bounded = torch.stack(
             [(speeds != wanted_speeds).any(0), (gaps != wanted_gaps).any(0), left_of_reward != left[-1]]
         )
@@ -135,13 +178,12 @@ class VirtualDynamics:
         """
         rows, members = len(applied), self._fixed_members
         if members is None:
-            members = random_members(self._members, rows, self._generator)
+            members = random_members(self._model.members, rows, self._generator)
         left = predict(self._layers, model_inputs(state, applied, drawn), members)
-        if self._noise is not None:
-            chosen = torch.randint(
-                NOISE_ROWS, (rows,), generator=self._generator, device=self._generator.device
-            )
-            noisy = left + self._noise.index_select(0, chosen)
+        if self._noisy:
+            generator = self._generator
+            chosen = torch.randint(NOISE_ROWS, (rows,), generator=generator, device=generator.device)
+            noisy = left + self._model.noise.index_select(0, chosen)
             # A vehicle that changes lanes or merges makes a gap jump: it does so only where it fits.
             closes = (expected_gaps + noisy.T[GAP_ROWS] <= 0.0).any(0)
             left = torch.where(closes[:, None], left, noisy)
