@@ -13,8 +13,7 @@ from unjam.errors import EpisodeError, UnjamError
 from unjam.scenarios import Ring, make_scenario
 from unjam.worlds.episode import run_episode
 from unjam.worlds.sumo import make_traffic
-from unjam.worlds.sumo.files import Files, files_of_built
-from unjam.worlds.sumo.network_files import network_file
+from unjam.worlds.sumo.files import Files, files_of_built, network_file
 from unjam.worlds.sumo.simulation import Backend, Simulation
 
 RING = Ring(horizon=100, length=(230, 230))

@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 
 from unjam.errors import EpisodeError, MissingPartError, UnjamError
 from unjam.scenarios.scenario import Actuation
-from unjam.worlds.sumo.files import Files
-from unjam.worlds.sumo.network_files import sumo_program
+from unjam.worlds.sumo.files import Files, sumo_program
 
 Backend = Literal["libsumo", "traci", "gui"]
 """`libsumo`: in this process; `traci`: SUMO as a child process; `gui`: the same, with its window."""
@@ -28,6 +27,8 @@ SPEED_MODES = {"shielded": 31, "raw": 30, "flow": 25}
 WITHOUT_RIGHT_OF_WAY = 1
 """the bit that stays where vehicles need not obey the right of way: who is surprised on a junction then stops
 as fast as it must, and so must who follows"""
+LEAVE_TO_SUMO = -1.0
+"""the commanded speed that stands for none"""
 
 _exhaust = deque(maxlen=0).extend
 """runs through an iterator, in C: a loop would cost as much as the calls"""
