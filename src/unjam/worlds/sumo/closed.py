@@ -113,22 +113,16 @@ class ClosedTraffic(Traffic[ClosedRoad]):
 
     def advance(self, command: Command | None) -> None:
         """Simulate one decision, held over its simulation steps; None: the CAVs stay human."""
-        scenario, places = self.scenario, self._places
-        if not self._controlled:
-            for _ in range(scenario.steps_per_decision):
-                self._simulate()
-        else:
-            step, applied = scenario.simulation_step, self._told(command)
-            self._log_applied.fromlist(applied)
-            for _ in range(scenario.steps_per_decision):
-                speeds = self.speeds
-                commanded = [
-                    next_speed(speeds[place], wanted, step)
-                    for place, wanted in zip(places, applied, strict=True)
-                ]
+        scenario, step = self.scenario, self.scenario.simulation_step
+        applied = self._told(command) if self._controlled else []
+        self._log_applied.fromlist(applied)
+        for _ in range(scenario.steps_per_decision):
+            if self._controlled:
+                told = zip(self._places, applied, strict=True)
+                commanded = [next_speed(self.speeds[place], wanted, step) for place, wanted in told]
                 self._log_commanded.fromlist(commanded)
                 self._simulation.command_speeds(self.cavs, commanded)
-                self._simulate()
+            self._simulate()
         self.decisions += 1
         if self.full:
             self.log_fuel.append(self._simulation.fuel(self.road.vehicle_ids))

@@ -6,6 +6,7 @@ import shutil
 import subprocess
 import tempfile
 from collections.abc import Iterable
+from contextlib import suppress
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -53,26 +54,16 @@ class Files(NamedTuple):
 
 
 def files_of(scenario: Scenario, road: Road) -> Files:
-    """Return what SUMO reads of a road: one that is built for the episode, or the user's own."""
-    if isinstance(road, OwnRoad):
-        return files_of_own(scenario, road)
+    """Return what SUMO reads of a road: one that is built for the episode, or the user's own network."""
+    if isinstance(road, OwnRoad):  # its own files say all that is not named here
+        options = ("--configuration-file", str(road.files.path), "--verbose", "false")
+        traffic = _own_types_xml(scenario, road)
+        return Files(options, traffic, "--additional-files", road.files.additional_files)
     assert isinstance(road, BuiltRoad)
-    return files_of_built(scenario, road)
-
-
-def files_of_built(scenario: Scenario, road: BuiltRoad) -> Files:
-    """Return what SUMO reads of a road that is built for the episode."""
     # Vehicles neither vanish from a jam nor give up waiting to enter.
     patience = ("--time-to-teleport", "-1", "--max-depart-delay", "-1")
     options = ("--net-file", str(network_file(road.network)), *patience)
     return Files(options, _traffic_xml(scenario, road), "--route-files")
-
-
-def files_of_own(scenario: Scenario, road: OwnRoad) -> Files:
-    """Return what SUMO reads of the user's own network: its own words about all that is not named here."""
-    options = ("--configuration-file", str(road.files.path), "--verbose", "false")
-    traffic = _own_types_xml(scenario, road)
-    return Files(options, traffic, "--additional-files", road.files.additional_files)
 
 
 def _traffic_xml(scenario: Scenario, road: BuiltRoad) -> str:
@@ -82,15 +73,21 @@ def _traffic_xml(scenario: Scenario, road: BuiltRoad) -> str:
     lines = [_vehicle_type(name, scenario, **_human_layer(scenario, one)) for name, one in humans.items()]
     lines.append(_cav_type(scenario))
     for route in road.routes:
-        laps = {"repeat": route.laps} if route.laps > 1 else {}
-        lines.append(_element("route", {"id": route.name, "edges": " ".join(route.edges), **laps}))
+        laps = route.laps if route.laps > 1 else None
+        lines.append(_element("route", id=route.name, edges=" ".join(route.edges), repeat=laps))
     for entry in road.entries:
-        kind = {"type": "human"}
-        if entry.name in own:  # SUMO would not let a driver who keeps a large distance begin closer than that
-            kind = {"type": f"of_{entry.name}", "insertionChecks": "none"}
-        start = {"route": entry.route, "depart": f"{entry.time:.2f}", "departPos": repr(entry.position)}
-        moving = {"departSpeed": entry.speed, "departLane": 0}
-        lines.append(_element("vehicle", {"id": entry.name, **kind, **start, **moving}))
+        attributes = {
+            "id": entry.name,
+            "type": f"of_{entry.name}" if entry.name in own else "human",
+            # SUMO would not let a driver who keeps a large distance begin closer than that.
+            "insertionChecks": "none" if entry.name in own else None,
+            "route": entry.route,
+            "depart": f"{entry.time:.2f}",
+            "departPos": repr(entry.position),
+            "departSpeed": entry.speed,
+            "departLane": 0,
+        }
+        lines.append(_element("vehicle", **attributes))
     return "\n".join(["<routes>", *lines, "</routes>"])
 
 
@@ -115,7 +112,7 @@ def _vehicle_type(name: str, scenario: Scenario, **attributes: Any) -> str:
         "impatience": scenario.impatience,
         "emissionClass": scenario.emission_class,
     }
-    return _element("vType", {**common, **attributes})
+    return _element("vType", **{**common, **attributes})
 
 
 def _human_layer(scenario: Scenario, humans: IDMParameters) -> Attributes:
@@ -161,10 +158,7 @@ def _obedient_layer(simulation_step: float) -> Attributes:
     return {
         "color": CAV_COLOUR,
         "carFollowModel": "Krauss",
-        "accel": OBEDIENT,
-        "decel": OBEDIENT,
-        "emergencyDecel": OBEDIENT,
-        "apparentDecel": OBEDIENT,
+        **dict.fromkeys(("accel", "decel", "emergencyDecel", "apparentDecel"), OBEDIENT),
         "tau": simulation_step,
         "minGap": SMALLEST_CAV_GAP,
     }
@@ -183,14 +177,12 @@ def sumo_program(name: str) -> str:
     Raises:
         MissingPartError: neither has it.
     """
-    try:
+    with suppress(ImportError, AttributeError):
         import sumo
 
         bundled = Path(sumo.SUMO_HOME) / "bin" / name
         if bundled.exists():
             return str(bundled)
-    except (ImportError, AttributeError):
-        pass
     found = shutil.which(name)
     if found is None:
         raise MissingPartError(f"SUMO's {name} is not there; install it: pip install eclipse-sumo==1.28.0")
@@ -204,6 +196,11 @@ def sumo_version() -> str:
         return version("libsumo")
     except PackageNotFoundError:
         raise MissingPartError("libsumo is not installed; install it: pip install libsumo==1.28.0") from None
+
+
+def sumo_words(lines: Iterable[str]) -> str:
+    """Return what one of SUMO's programs says of an error, as one line."""
+    return "; ".join(said for line in lines if (said := line.strip()) and said != "Quitting (on error).")
 
 
 def network_file(network: Network) -> Path:
@@ -255,26 +252,25 @@ def edge_lengths(path: Path) -> dict[str, float]:
 
 
 def _node(node: Node) -> Attributes:
-    kind = {"type": "priority"} if node.priority else {}
-    radius = {} if node.radius is None else {"radius": node.radius}
-    return {"id": node.name, "x": f"{node.x:.6f}", "y": f"{node.y:.6f}", **kind, **radius}
+    kind = "priority" if node.priority else None
+    return {"id": node.name, "x": f"{node.x:.6f}", "y": f"{node.y:.6f}", "type": kind, "radius": node.radius}
 
 
 def _edge(edge: Edge, speed: float) -> Attributes:
     ends = {"id": edge.name, "from": edge.begin, "to": edge.end}
-    priority = {} if edge.priority is None else {"priority": edge.priority}
-    shape = {"shape": " ".join(f"{x:.6f},{y:.6f}" for x, y in edge.shape)} if edge.shape else {}
-    return {**ends, "numLanes": 1, "speed": speed, "length": repr(edge.length), **priority, **shape}
+    shape = " ".join(f"{x:.6f},{y:.6f}" for x, y in edge.shape) or None
+    lane = {"numLanes": 1, "speed": speed, "length": repr(edge.length)}
+    return {**ends, **lane, "priority": edge.priority, "shape": shape}
 
 
 def _document(root: str, tag: str, elements: Iterable[Attributes]) -> str:
-    return "\n".join([f"<{root}>", *(_element(tag, each) for each in elements), f"</{root}>"])
+    return "\n".join([f"<{root}>", *(_element(tag, **each) for each in elements), f"</{root}>"])
 
 
-def _element(tag: str, attributes: Attributes) -> str:
-    """Return an XML element without content."""
-    pairs = " ".join(f"{key}={quoteattr(str(value))}" for key, value in attributes.items())
-    return f"<{tag} {pairs}/>"
+def _element(tag: str, /, **attributes: Any) -> str:
+    """Return an XML element without content, and without the attributes that are None."""
+    pairs = [f"{key}={quoteattr(str(value))}" for key, value in attributes.items() if value is not None]
+    return f"<{tag} {' '.join(pairs)}/>"
 
 
 def _netconvert(files: dict[tuple[str, str], str], options: list[str], folder: Path) -> Path:
@@ -291,7 +287,6 @@ def _netconvert(files: dict[tuple[str, str], str], options: list[str], folder: P
     ]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode != 0 or not made.exists():
-        lines = (line.strip() for line in (done.stderr or done.stdout).splitlines())
-        words = "; ".join(line for line in lines if line and line != "Quitting (on error).")
+        words = sumo_words((done.stderr or done.stdout).splitlines())
         raise EpisodeError(f"netconvert cannot make the road: {words}")
     return made

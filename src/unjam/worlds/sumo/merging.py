@@ -102,8 +102,9 @@ class Streams:
     def states(self) -> LocalState:
         """Return what all vehicles perceive; who is farther than `LARGEST_GAP` is not there."""
         leaders = self.leaders()
-        followers = self._followers(leaders)
-        gaps, gaps_behind = self.gaps(leaders), self._gaps_behind(followers)
+        followers, gaps = self._followers(leaders), self.gaps(leaders)
+        behind = self.positions - self.positions[followers] - VEHICLE_LENGTH
+        gaps_behind = np.where(followers < 0, FAR, behind)
         return LocalState(
             speed=self.speeds,
             leader_speed=np.where(gaps < LARGEST_GAP, self.speeds[leaders], self.speeds),
@@ -121,10 +122,6 @@ class Streams:
         order = followed[np.argsort(self.positions[followed], kind="stable")]
         behind[leaders[order]] = order  # of several the last one written counts: the nearest
         return behind
-
-    def _gaps_behind(self, followers: NDArray[np.intp]) -> Floats:
-        gaps = self.positions - self.positions[followers] - VEHICLE_LENGTH
-        return np.where(followers < 0, FAR, gaps)
 
 
 class MergingTraffic(OpenTraffic[MergingRoad]):

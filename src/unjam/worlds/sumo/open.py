@@ -94,11 +94,6 @@ class OpenTraffic(Traffic[RoadKind]):
         self._arrived = 0
         self._look()
 
-    @property
-    def kept(self) -> Sequence[int] | None:
-        """Rows of the CAVs before the last decision that are on the road after it; None: the same ones."""
-        return self._kept
-
     def perceive(self) -> LocalState:
         """Return what the CAVs perceive now: arrays of shape (CAVs,)."""
         return self._log_states[-1]

@@ -54,6 +54,7 @@ class Traffic(World[Episode], Generic[RoadKind]):
     """the CAVs on the road now, in order of entry: the rows of what drivers are given and answer"""
     speeds: Sequence[float]
     """of all vehicles on the road now [m/s]"""
+    _kept: Sequence[int] | None = None
 
     def __init__(
         self, scenario: Scenario, road: RoadKind, seed: Seed, simulation: Simulation, full: bool
@@ -104,7 +105,7 @@ class Traffic(World[Episode], Generic[RoadKind]):
     @property
     def kept(self) -> Sequence[int] | None:
         """Rows of the CAVs before the last decision that are on the road after it; None: the same ones."""
-        return None
+        return self._kept
 
     @property
     def ended(self) -> bool:
