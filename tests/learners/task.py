@@ -19,8 +19,8 @@ from unjam.learners.settings import (
     TRPOSettings,
 )
 from unjam.scenarios import Ring
+from unjam.worlds.episode import Task
 from unjam.worlds.record import Episode, Trajectory
-from unjam.worlds.task import Task
 
 INPUTS, DECISIONS = 2, 100
 LENGTHS = (220.0, 270.0)

@@ -29,9 +29,8 @@ from unjam.physics.idm import IDMParameters
 from unjam.scenarios import Ring
 from unjam.virtual.rollout import Rollouts
 from unjam.virtual.settings import VirtualSettings
-from unjam.worlds.episode import run_episode
+from unjam.worlds.episode import Task, run_episode
 from unjam.worlds.sumo.simulation import Simulation
-from unjam.worlds.task import Task
 
 torch.set_num_threads(1)
 

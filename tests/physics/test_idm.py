@@ -15,7 +15,7 @@ from unjam.physics import (
     next_speed,
 )
 from unjam.scenarios import Ring
-from unjam.worlds.sumo.files import files_of_built
+from unjam.worlds.sumo.files import files_of
 from unjam.worlds.sumo.simulation import Simulation
 
 speeds = st.floats(0.0, 29.0)
@@ -98,7 +98,7 @@ def test_equals_sumos_own_idm_in_every_step(simulation: Simulation) -> None:
     """All-human traffic without noise, with a start-up and its shock wave; one step ahead, to 1e-12."""
     ring = Ring(length=(230, 230))
     road = ring.draw(np.random.default_rng(0))
-    simulation.load(files_of_built(ring, road), 0.1, seed=1)
+    simulation.load(files_of(ring, road), 0.1, seed=1)
     positions = road.start_positions.copy()
     speeds = np.zeros(22)
     generator = np.random.default_rng(1)

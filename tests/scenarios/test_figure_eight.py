@@ -9,7 +9,7 @@ from unjam.scenarios import SCENARIOS, FigureEight, make_scenario
 from unjam.scenarios.figure_eight import loop_length
 from unjam.scenarios.registry import scenario_from_recipe, scenario_recipe
 from unjam.scenarios.road import ClosedRoad
-from unjam.worlds.sumo.network_files import network_file
+from unjam.worlds.sumo.files import network_file
 
 ORDER = ["bottom", "top", "upper_ring", "right", "left", "lower_ring"]
 

@@ -12,8 +12,7 @@ from unjam.scenarios import Merge, make_scenario
 from unjam.scenarios.merge import ENTRANCE_WAY, JUNCTION_WAYS
 from unjam.scenarios.registry import scenario_from_recipe, scenario_recipe
 from unjam.scenarios.road import MergingRoad
-from unjam.worlds.sumo.files import files_of_built
-from unjam.worlds.sumo.network_files import network_file
+from unjam.worlds.sumo.files import files_of, network_file
 
 
 def drawn(seed: int = 0, **changes: Any) -> MergingRoad:
@@ -22,7 +21,7 @@ def drawn(seed: int = 0, **changes: Any) -> MergingRoad:
 
 def entries(road: MergingRoad) -> list[dict[str, str]]:
     """Attributes of the vehicles in SUMO's file, in their order."""
-    written = ElementTree.fromstring(files_of_built(Merge(), road).traffic)
+    written = ElementTree.fromstring(files_of(Merge(), road).traffic)
     return [vehicle.attrib for vehicle in written.iter("vehicle")]
 
 

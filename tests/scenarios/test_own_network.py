@@ -12,7 +12,7 @@ from unjam.scenarios import make_scenario
 from unjam.scenarios.own_network import OwnNetwork
 from unjam.scenarios.registry import scenario_from_recipe, scenario_recipe
 from unjam.scenarios.road import OwnRoad
-from unjam.worlds.sumo.files import files_of_own
+from unjam.worlds.sumo.files import files_of
 
 TYPES = """
 <routes>
@@ -61,7 +61,7 @@ def test_without_an_end_an_episode_is_an_hour(tmp_path: Path) -> None:
 
 
 def test_each_type_has_a_cav_type_as_large_and_as_fast(tmp_path: Path) -> None:
-    types = files_of_own(own(tmp_path), drawn(tmp_path)).traffic
+    types = files_of(own(tmp_path), drawn(tmp_path)).traffic
     kinds = {kind.get("id"): kind.attrib for kind in ElementTree.fromstring(types)}
     assert set(kinds) == {f"cav_of_{name}" for name in ("car", "truck", "bike", "unused", "DEFAULT_VEHTYPE")}
     car, truck = kinds["cav_of_car"], kinds["cav_of_truck"]
@@ -129,6 +129,6 @@ def test_a_type_that_sumo_has_by_itself_may_be_a_cav(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no vehicle is a car"):
         own(tmp_path, routes=routes)
     road = drawn(tmp_path, routes=routes, cav_types=["DEFAULT_BIKETYPE"])
-    types = ElementTree.fromstring(files_of_own(own(tmp_path), road).traffic)
+    types = ElementTree.fromstring(files_of(own(tmp_path), road).traffic)
     (bike,) = [kind for kind in types if kind.get("id") == "cav_of_DEFAULT_BIKETYPE"]
     assert bike.get("vClass") == "bicycle"

@@ -10,7 +10,7 @@ from unjam.physics.idm import PAPER_IDM, IDMParameters
 from unjam.scenarios.population import Population, read_population, write_population
 from unjam.scenarios.registry import make_scenario, scenario_from_recipe, scenario_recipe
 from unjam.scenarios.road import BuiltRoad
-from unjam.worlds.sumo.files import files_of_built
+from unjam.worlds.sumo.files import files_of
 
 DRIVERS = (
     IDMParameters(time_headway=0.8, desired_speed=35.0),
@@ -98,7 +98,7 @@ def test_a_road_draws_its_people_from_it(tmp_path: Path, name: str) -> None:
     assert set(roads[0].people.values()) == set(DRIVERS)
     assert roads[0].people == roads[1].people != roads[2].people
     assert isinstance(roads[0], BuiltRoad)
-    own_types = files_of_built(scenario, roads[0]).traffic.count('<vType id="of_')
+    own_types = files_of(scenario, roads[0]).traffic.count('<vType id="of_')
     assert own_types == (22 if name == "ring" else 0)
 
 
@@ -107,7 +107,7 @@ def test_without_a_population_roads_are_as_they_were() -> None:
     road = scenario.draw(np.random.default_rng(0))
     assert road.people == {}
     assert isinstance(road, BuiltRoad)
-    assert "insertionChecks" not in files_of_built(scenario, road).traffic
+    assert "insertionChecks" not in files_of(scenario, road).traffic
 
 
 def test_a_residual_is_commanded(tmp_path: Path) -> None:

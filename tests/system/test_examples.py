@@ -19,7 +19,7 @@ from unjam.controller.verify import replay, sample_bytes
 from unjam.drivers import LACC, Driver, FollowerStopper, LocalState, Pacer, PISaturation
 from unjam.drivers.local_state import LARGEST_GAP
 from unjam.drivers.registry import named_driver
-from unjam.worlds.sumo.network_files import sumo_program
+from unjam.worlds.sumo.files import sumo_program
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 

@@ -58,7 +58,7 @@ class Check:
 
 def check_health() -> list[Check]:
     """Return all checks, the costliest last: an episode in a worker process."""
-    from unjam.worlds.sumo.network_files import sumo_program
+    from unjam.worlds.sumo.files import sumo_program
 
     python, sumo = platform.python_version(), f"pip install eclipse-sumo=={RESULTS_SUMO}"
     display = bool(os.environ.get("DISPLAY")) or sys.platform in ("win32", "darwin")
@@ -108,7 +108,7 @@ def _try(name: str, run: Callable[[], str], remedy: str) -> Check:
 
 
 def _cache() -> Check:
-    from unjam.worlds.sumo.network_files import cache_folder
+    from unjam.worlds.sumo.files import cache_folder
 
     folder = cache_folder()
     try:

@@ -8,7 +8,7 @@ from gymnasium import spaces
 from pettingzoo import ParallelEnv
 
 from unjam.drivers.observation import FeatureName
-from unjam.environments.road import SteppedRoad
+from unjam.environments.single import SteppedRoad
 
 
 class ParallelRoad(ParallelEnv[str, Any, Any]):

@@ -1,21 +1,191 @@
-"""A road with one CAV as a Gymnasium environment."""
+"""A road, stepped from outside, and with one CAV as a Gymnasium environment."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import gymnasium
 import numpy as np
+from gymnasium import spaces
 from numpy.typing import NDArray
 
-from unjam.drivers.observation import FeatureName
-from unjam.environments.road import SteppedRoad
-from unjam.errors import InputError
-from unjam.reports.film import draw_road
+from unjam.controller import make_driver
+from unjam.drivers.car_following import Constant
+from unjam.drivers.command import Command, Limits
+from unjam.drivers.driver import Decision, Driver, Memory, Noise
+from unjam.drivers.local_state import LocalState
+from unjam.drivers.observation import FeatureName, Seen, observation_size, observe
+from unjam.errors import EpisodeError, InputError, UnjamError
+from unjam.scenarios.registry import make_scenario
+from unjam.worlds.drive import Drive
+from unjam.worlds.reward import Outcome, make_reward, time_headway
+from unjam.worlds.sumo import make_traffic
+from unjam.worlds.sumo.simulation import Backend, Simulation, libsumo_is_taken
+from unjam.worlds.sumo.traffic import Traffic
 
-Observation = NDArray[Any]
+Observations = NDArray[np.float32]
+
+LARGEST_OBSERVATION = 50.0
+"""bound of every number of an observation; larger ones are cut"""
 
 
-class RoadEnv(gymnasium.Env[Observation, Observation]):
+class Outside(Driver):
+    """An expert to whose accelerations somebody outside adds: `actions`, set before each decision."""
+
+    def __init__(self, expert: Driver, names: Sequence[FeatureName], limits: Limits) -> None:
+        """Let `expert` drive within `limits`; features `names` are what is shown outside."""
+        self.expert, self.names, self._within = expert, tuple(names), limits
+        self.actions: Any = np.zeros(0)
+        """[m/s2], shape (CAVs,)"""
+
+    def initial_memory(self, n: int) -> Memory:
+        """Return the expert's."""
+        return self.expert.initial_memory(n)
+
+    def recall(self, memory: Memory, history: LocalState) -> Memory:
+        """Return what the expert makes of the warm-up."""
+        return self.expert.recall(memory, history)
+
+    def observation(self, state: LocalState, memory: Memory) -> Any:
+        """Return what is shown outside now, shape (CAVs, numbers), and keep what the expert wants."""
+        wanted, self._after = self.expert.act(state, memory)
+        self._wanted = self._within.keep(wanted)
+        return observe(self.names, Seen(state, self._wanted, self.expert, self._after))
+
+    def decide(self, state: LocalState, memory: Memory, noise: Noise | None = None) -> Decision:
+        """Return the sum of what the expert wanted when it was looked at and what was added since."""
+        if not len(state.speed):
+            return Decision(Command(np.zeros(0)), np.zeros(0), np.zeros(0), None, memory)
+        command = Command(self._within.keep(self._wanted + self.actions))
+        return Decision(command, self._wanted, self.actions, None, self._after)
+
+
+@dataclass(frozen=True)
+class Step:
+    """What one decision led to."""
+
+    cavs: list[str]
+    """who is on the road now"""
+    observations: Observations
+    """theirs, shape (CAVs, numbers)"""
+    left: dict[str, Observations]
+    """who left the road in this decision, with what each saw before it"""
+    reward: float
+    terms: dict[str, float]
+    """the reward's terms by name"""
+    terminated: bool
+    """whether there was a collision"""
+    truncated: bool
+    """whether the horizon is reached, or no CAV will be on the road any more"""
+
+
+class SteppedRoad:
+    """A road whose CAVs get their accelerations from outside, one decision at a time."""
+
+    def __init__(
+        self,
+        scenario: str,
+        changes: dict[str, Any],
+        reward: str = "",
+        expert: str = "",
+        observe_parts: Sequence[FeatureName] = ("local",),
+        backend: Backend = "libsumo",
+    ) -> None:
+        """Prepare a road as `RoadEnv` says; SUMO runs as `backend`, and is opened by the first `reset`."""
+        self.scenario = make_scenario(scenario, changes)
+        self._reward = make_reward(reward or self.scenario.reward)
+        driver = make_driver(expert, self.scenario.decision_step) if expert else Constant()
+        self._driver = Outside(driver, observe_parts, self.scenario.limits)
+        self._backend: Backend = backend
+        self._simulation: Simulation | None = None
+        self._traffic: Traffic | None = None
+        bound = np.full(observation_size(self._driver.names, driver), LARGEST_OBSERVATION, np.float32)
+        self.observation_space = spaces.Box(-bound, bound, dtype=np.float32)
+        """of one CAV"""
+        low, high = (np.full(1, limit, np.float32) for limit in self.scenario.limits)
+        self.action_space = spaces.Box(low, high, dtype=np.float32)
+        """of one CAV: acceleration [m/s2]"""
+        self._seed: int | None = None
+        self._episodes = 0
+        """started since that seed was given"""
+
+    def reset(self, seed: int | None, generator: np.random.Generator) -> Observations:
+        """Start an episode, run its warm-up, and return the first observations.
+
+        It is that of `seed`; without one, the next after the last seed's, the first of all from `generator`.
+        """
+        if seed is not None:
+            self._seed, self._episodes = seed, 0
+        if self._seed is None:
+            self._seed = int(generator.integers(2**31))
+        numbers = (self._seed, self._episodes) if self._episodes else (self._seed,)
+        self._episodes += 1
+        if self._simulation is None:
+            # libsumo runs one in a process; where it is taken, over TraCI: the same, but slower.
+            taken = self._backend == "libsumo" and libsumo_is_taken()
+            self._simulation = Simulation("traci" if taken else self._backend)
+        self._traffic = traffic = make_traffic(self.scenario, numbers, self._simulation)
+        self._drive = Drive(traffic, self._driver)
+        self._decisions = iter(self._drive)
+        self._await_cav()
+        if not traffic.cavs:
+            raise EpisodeError(f"no CAV entered the road in {traffic.decisions} decisions")
+        return self._look()
+
+    def step(self, actions: Any) -> Step:
+        """Make one decision: `actions`, shape (CAVs,), added to the expert's accelerations [m/s2].
+
+        Where nobody is left, the road goes on without CAVs until the next one enters.
+        """
+        traffic, before, seen = self.traffic, list(self.traffic.cavs), self._seen
+        self._driver.actions = np.asarray(actions, np.float64)
+        done = next(self._decisions)
+        assert done is not None
+        kept = list(range(len(before)) if traffic.kept is None else traffic.kept)
+        speeds, state = np.array(traffic.speeds), traffic.perceive()
+        headways = time_headway(state.leader_gap, state.speed)[: len(kept)]
+        applied = np.asarray(done.command.acceleration)[kept]
+        outcome = Outcome(speeds[None], applied[None], headways[None], np.array([traffic.crashed]))
+        terms = {name: float(values[0]) for name, values in self._reward(outcome).items()}
+        left = {name: seen[row] for row, name in enumerate(before) if row not in kept}
+        terminated = traffic.crashed
+        self._await_cav()  # a crash of people meanwhile ends the episode, but is nobody's doing
+        truncated = not terminated and (traffic.ended or not traffic.cavs)
+        observations = self._look()
+        return Step(list(traffic.cavs), observations, left, sum(terms.values()), terms, terminated, truncated)
+
+    def _await_cav(self) -> None:
+        """Let the road go on until a CAV is on it, or none will be before the episode ends."""
+        traffic = self.traffic
+        while traffic.expects_cavs and not (traffic.cavs or traffic.ended):
+            next(self._decisions)
+
+    @property
+    def traffic(self) -> Traffic:
+        """The traffic of the running episode.
+
+        Raises:
+            UnjamError: there is none.
+        """
+        if self._traffic is None:
+            raise UnjamError("no episode is running: call reset first")
+        return self._traffic
+
+    def _look(self) -> Observations:
+        """Return what each CAV observes now."""
+        seen = self._driver.observation(self.traffic.perceive(), self._drive.memory)
+        self._seen = seen.clip(-LARGEST_OBSERVATION, LARGEST_OBSERVATION).astype(np.float32)
+        return self._seen
+
+    def close(self) -> None:
+        """End SUMO; may be called twice."""
+        self._traffic = None
+        if self._simulation is not None:
+            self._simulation.close()
+            self._simulation = None
+
+
+class RoadEnv(gymnasium.Env[Observations, NDArray[Any]]):
     """One CAV among people, on the actual simulator.
 
     ``gymnasium.make("unjam/Ring-v0")``, ``"unjam/FigureEight-v0"``, ``"unjam/Merge-v0"``; every parameter of
@@ -79,13 +249,13 @@ class RoadEnv(gymnasium.Env[Observation, Observation]):
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Observation, dict[str, Any]]:
+    ) -> tuple[Observations, dict[str, Any]]:
         """Start an episode: that of `seed`; without one, the next after the last seed's."""
         super().reset(seed=seed)
         observations = self._road.reset(seed, self.np_random)
         return observations[0], {"drawn": dict(self._road.traffic.road.drawn)}
 
-    def step(self, action: Any) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+    def step(self, action: Any) -> tuple[Observations, float, bool, bool, dict[str, Any]]:
         """Make one decision."""
         done = self._road.step(np.asarray(action, np.float64).reshape(1))
         observation = next(iter(done.left.values())) if done.left else done.observations[0]
@@ -96,6 +266,8 @@ class RoadEnv(gymnasium.Env[Observation, Observation]):
         """Return the picture of this moment, shape (640, 640, 3); SUMO's window draws itself."""
         if self.render_mode != "rgb_array":
             return None
+        from unjam.reports.film import draw_road
+
         traffic = self._road.traffic
         fastest = 2.0 * traffic.road.limit_speed
         return np.asarray(draw_road(traffic.scene(), fastest, f"mean {np.mean(traffic.speeds):.1f} m/s"))

@@ -21,8 +21,8 @@ from unjam.learners.imagination import Imagination, rollout_experience
 from unjam.learners.learner import AgentSpec, Learner, Tensors, Update, make_learner, policy_distance, under
 from unjam.learners.settings import LearnerSettings, PolicySettings
 from unjam.virtual.settings import VirtualSettings
+from unjam.worlds.episode import Task
 from unjam.worlds.record import Episode, Floats
-from unjam.worlds.task import Task
 
 COMPARED_ROWS = 2000
 """at most so many of the visited states tell how far an update has moved the policy"""

@@ -23,8 +23,8 @@ from unjam.virtual.model import EnvironmentModel, torch_generator
 from unjam.virtual.rollout import Rollouts, begin, draw_starts, imagine, return_bound, rollout_length
 from unjam.virtual.settings import VirtualSettings
 from unjam.virtual.world import VirtualDynamics
+from unjam.worlds.episode import Task
 from unjam.worlds.record import Episode
-from unjam.worlds.task import Task
 
 FIT, STARTS, NOISE, EXPLORATION = 2, 3, 4, 5
 """what the random numbers of an iteration are for, in their seeds"""

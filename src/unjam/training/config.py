@@ -19,7 +19,7 @@ from unjam.scenarios.registry import make_scenario
 from unjam.scenarios.scenario import Scenario
 from unjam.training.presets import preset_values
 from unjam.virtual.settings import VirtualSettings
-from unjam.worlds.task import Task
+from unjam.worlds.episode import Task
 
 
 def _plain(road: dict[str, Any]) -> dict[str, Any]:

@@ -1,7 +1,7 @@
 """An episode is a pure function: `run_episode(scenario, driver, seed) -> Episode`."""
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -14,6 +14,21 @@ from unjam.worlds.reward import Reward, make_reward
 from unjam.worlds.sumo import make_traffic
 from unjam.worlds.sumo.simulation import Simulation
 from unjam.worlds.world import OnProgress
+
+
+@dataclass(frozen=True)
+class Task:
+    """One road of a training; a training takes a list of them, and one road is a list of one."""
+
+    scenario: Scenario
+    expert: Driver
+    """who drives before anything is learned, and whom the residual is added to"""
+    reward: str = ""
+    """name, or `path.py:name`; empty: the scenario's own"""
+    weight: float = 1.0
+    """share of the actual steps, beside the weights of the other tasks"""
+    name: str = ""
+    """in progress, tables and folders; empty where there is one task alone"""
 
 
 def run_episode(

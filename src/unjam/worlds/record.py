@@ -90,23 +90,18 @@ def trajectory(
     if not driven.decisions:
         nothing = np.zeros((1, 0)), applied, np.zeros_like(applied)
         return Trajectory(*about, *nothing, applied, shield, {}, 1, terminated)
-    steps = range(start, start + len(applied))
-    experts, residuals = (
-        np.array(
-            [
-                driven.decisions[step][part]
-                if rows is None
-                else driven.decisions[step][part][rows[step - start]]
-                for step in steps
-            ]
+
+    def own(values: Sequence[Any], steps: Sequence[int]) -> Floats:
+        """Return this CAV's of all values at some steps."""
+        return np.array(
+            [values[step] if rows is None else values[step][rows[step - start]] for step in steps]
         )
-        for part in (0, 1)
-    )
-    seen = [decision[2] for decision in driven.decisions] + [driven.last_observation]
+
+    experts, residuals, seen = zip(*driven.decisions, strict=True)
+    steps = range(start, start + len(applied))
     looks = [*steps[:: driven.hold], steps.stop]
-    found: Any = [seen[step] if rows is None else seen[step][rows[step - start]] for step in looks]
-    observations = np.array(found, np.float64).reshape(len(looks), -1)
-    decided = observations, experts, residuals
+    observations = own([*seen, driven.last_observation], looks).astype(np.float64).reshape(len(looks), -1)
+    decided = observations, own(experts, steps), own(residuals, steps)
     return Trajectory(*about, *decided, applied, shield, driven.memories[number], driven.hold, terminated)
 
 

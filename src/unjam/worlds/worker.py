@@ -116,16 +116,9 @@ def _run(facts: dict[str, Any], arrays: Arrays, simulation: Simulation, answers:
     scenario = scenario_from_recipe(facts["scenario"])
     if isinstance(scenario, OwnNetwork):
         _limit_memory()
-    return run_episode(
-        scenario,
-        driver_from_recipe(facts["driver"], arrays),
-        facts["seed"],
-        facts["reward"],
-        facts["explore"],
-        facts["full"],
-        simulation,
-        progress,
-    )
+    driver = driver_from_recipe(facts["driver"], arrays)
+    how = {name: facts[name] for name in ("seed", "reward", "explore", "full")}
+    return run_episode(scenario, driver, **how, simulation=simulation, progress=progress)
 
 
 if __name__ == "__main__":

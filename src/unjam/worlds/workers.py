@@ -9,7 +9,6 @@ import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from types import TracebackType
 from typing import Any, Self, TypeVar
 
 from unjam.drivers.driver import Driver
@@ -44,15 +43,8 @@ class EpisodeTask:
     def message(self) -> Message:
         """Return the task as it travels to a worker."""
         recipe, arrays = recipe_of(self.driver)
-        facts = {
-            "scenario": scenario_recipe(self.scenario),
-            "driver": recipe,
-            "seed": list(self.seed),
-            "reward": self.reward,
-            "explore": self.explore,
-            "full": self.full,
-        }
-        return facts, arrays
+        how = {"seed": list(self.seed), "reward": self.reward, "explore": self.explore, "full": self.full}
+        return {"scenario": scenario_recipe(self.scenario), "driver": recipe, **how}, arrays
 
 
 class Workers:
@@ -64,23 +56,14 @@ class Workers:
 
     def __init__(self, count: int = 1, silence: float = SILENCE, attempts: int = ATTEMPTS) -> None:
         """Prepare `count` workers; nothing is started yet."""
-        self.count = count
-        self._silence = silence
-        self._attempts = attempts
+        self.count, self._attempts = count, attempts
         # Of all workers, so that nothing stays behind of one that was killed.
         self._temporary = tempfile.TemporaryDirectory(prefix="unjam-")
         self._idle: queue.SimpleQueue[_Worker] = queue.SimpleQueue()
-        self._all: list[_Worker] = []
-        self._lock = threading.Lock()
+        self._all = [_Worker(silence, self._temporary.name) for _ in range(count)]
         self._threads = ThreadPoolExecutor(count, thread_name_prefix="unjam-worker")
-        for _ in range(count):
-            self._idle.put(self._new_worker())
-
-    def _new_worker(self) -> "_Worker":
-        worker = _Worker(self._silence, self._temporary.name)
-        with self._lock:
-            self._all.append(worker)
-        return worker
+        for worker in self._all:
+            self._idle.put(worker)
 
     def run(
         self, tasks: Sequence[EpisodeTask], progress: Callable[[int, int], None] | None = None
@@ -133,18 +116,15 @@ class Workers:
 
     def close(self) -> None:
         """Stop all workers; may be called twice."""
-        with self._lock:
-            for worker in self._all:
-                worker.stop()
+        for worker in self._all:
+            worker.stop()
         self._threads.shutdown(wait=True, cancel_futures=True)
         self._temporary.cleanup()
 
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.close()
 
 
@@ -156,8 +136,7 @@ class _Worker:
     """One worker process and the pipe to it."""
 
     def __init__(self, silence: float, temporary: str) -> None:
-        self._silence = silence
-        self._temporary = temporary
+        self._silence, self._temporary = silence, temporary
         self._process: subprocess.Popen[bytes] | None = None
         self._stopped = False
         self._starting = threading.Lock()

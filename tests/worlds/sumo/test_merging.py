@@ -17,7 +17,7 @@ from unjam.scenarios import Merge
 from unjam.worlds.episode import run_episode
 from unjam.worlds.record import Episode
 from unjam.worlds.sumo import make_traffic
-from unjam.worlds.sumo.files import files_of_built
+from unjam.worlds.sumo.files import files_of
 from unjam.worlds.sumo.merging import MergingTraffic
 from unjam.worlds.sumo.simulation import Simulation
 from unjam.worlds.workers import EpisodeTask, Workers
@@ -142,7 +142,7 @@ def test_people_obey_the_right_of_way_only_where_they_shall(simulation: Simulati
 
 def test_waiting_and_arrived_are_those_of_the_timetable_and_of_sumo(simulation: Simulation) -> None:
     traffic = merging(Merge(), simulation)
-    written = ElementTree.fromstring(files_of_built(traffic.scenario, traffic.road).traffic)
+    written = ElementTree.fromstring(files_of(traffic.scenario, traffic.road).traffic)
     departs = [float(vehicle.get("depart", "nan")) for vehicle in written.iter("vehicle")]
     seen: set[str] = set(libsumo.vehicle.getIDList())
     waiting, gone = [0], []

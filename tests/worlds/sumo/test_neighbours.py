@@ -104,7 +104,8 @@ def test_leaders_and_gaps_in_running_traffic_are_sumos(
         seen.append([(leader, gap + keep) for (leader, gap), keep in zip(leaders, kept, strict=True)])
         gaps = [seen[-1][names.index(name)][1] for name in traffic.road.cav_ids]
         np.testing.assert_allclose(traffic.perceive().leader_gap, gaps, rtol=0, atol=1e-6)
-    states = traffic.states(*traffic.speeds_and_positions(), np.arange(vehicles))
+    everybody = loop_neighbours(np.arange(vehicles), vehicles)
+    states = loop_state(*traffic.speeds_and_positions(), everybody, traffic.road.loop_length)
     for place, name in enumerate(names):
         assert {leaders[place][0] for leaders in seen} == {names[(place + 1) % vehicles]}, name
         gaps = [leaders[place][1] for leaders in seen]

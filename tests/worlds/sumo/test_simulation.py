@@ -13,8 +13,7 @@ from unjam.errors import EpisodeError, UnjamError
 from unjam.scenarios import Ring, make_scenario
 from unjam.worlds.episode import run_episode
 from unjam.worlds.sumo import make_traffic
-from unjam.worlds.sumo.files import Files, files_of_built
-from unjam.worlds.sumo.network_files import network_file
+from unjam.worlds.sumo.files import Files, files_of, network_file
 from unjam.worlds.sumo.simulation import Backend, Simulation
 
 RING = Ring(horizon=100, length=(230, 230))
@@ -23,7 +22,7 @@ RING = Ring(horizon=100, length=(230, 230))
 @pytest.fixture
 def road(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Files:
     monkeypatch.setenv("UNJAM_CACHE", str(tmp_path))
-    return files_of_built(RING, RING.draw(np.random.default_rng(0)))
+    return files_of(RING, RING.draw(np.random.default_rng(0)))
 
 
 def test_a_second_simulation_in_one_process_is_refused(simulation: Simulation) -> None:

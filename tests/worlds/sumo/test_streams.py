@@ -14,9 +14,8 @@ from unjam.scenarios import Merge
 from unjam.scenarios.road import Origin
 from unjam.worlds.sumo import make_traffic
 from unjam.worlds.sumo.files import SMALLEST_CAV_GAP
-from unjam.worlds.sumo.merging import MergingTraffic
+from unjam.worlds.sumo.merging import FAR, MergingTraffic, Streams
 from unjam.worlds.sumo.simulation import Simulation
-from unjam.worlds.sumo.streams import FAR, Streams
 
 WAYS = (24.0, 23.0)
 

@@ -11,20 +11,20 @@ from operator import add
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from unjam.drivers.car_following import SMALLEST_GAP
 from unjam.drivers.command import Command
 from unjam.drivers.local_state import LocalState
 from unjam.errors import EpisodeError
-from unjam.physics.arrays import Array
-from unjam.physics.kinematics import next_position, next_speed
+from unjam.physics.arrays import Array, at_least
+from unjam.physics.idm import idm_acceleration
+from unjam.physics.kinematics import gap_on_loop, next_position, next_speed
+from unjam.scenarios.population import as_calibrated
 from unjam.scenarios.road import ClosedRoad
-from unjam.scenarios.scenario import Scenario
-from unjam.worlds.record import Episode, trajectory
-from unjam.worlds.sumo.files import Files, files_of_built
+from unjam.scenarios.scenario import VEHICLE_LENGTH, Scenario
+from unjam.worlds.record import Episode, Floats, trajectory
 from unjam.worlds.sumo.neighbours import loop_neighbours, loop_state, places_along
-from unjam.worlds.sumo.people import drivers_of, wanted_speeds
-from unjam.worlds.sumo.simulation import Simulation
+from unjam.worlds.sumo.simulation import LEAVE_TO_SUMO, Simulation
 from unjam.worlds.sumo.traffic import Scene, Seed, Traffic
 from unjam.worlds.world import Driven, OnProgress
 
@@ -32,8 +32,6 @@ HISTORY = 60.0
 """seconds of the warm-up that a driver may remember"""
 NOISE_BLOCK = 100
 """steps for which noise is drawn at once"""
-ODOMETER_TOLERANCE = 1e-6
-"""by how much positions may differ from SUMO's odometer at the end [m]"""
 
 
 class ClosedTraffic(Traffic[ClosedRoad]):
@@ -44,31 +42,23 @@ class ClosedTraffic(Traffic[ClosedRoad]):
     ) -> None:
         """Put the vehicles on the road; nothing moves yet."""
         super().__init__(scenario, road, seed, simulation, full)
-        self.entered = len(road.cav_ids)
-        self._places = {name: place for place, name in enumerate(road.vehicle_ids)}
-        cavs = [self._places[name] for name in road.cav_ids]
-        self._cavs = cavs
-        self._near = loop_neighbours(np.array(cavs), len(road.vehicle_ids))
-        self._near_single = loop_neighbours(cavs[0], len(road.vehicle_ids))
+        vehicles = len(road.vehicle_ids)
+        self.cavs, self.entered = road.cav_ids, len(road.cav_ids)
+        self._places = [road.vehicle_ids.index(name) for name in road.cav_ids]
+        """of the CAVs, in road order"""
+        self._near = loop_neighbours(np.array(self._places), vehicles)
+        self._near_single = loop_neighbours(self._places[0], vehicles)
         self._commanded = scenario.people == "commanded"
-        self._drivers = drivers_of(scenario, road, road.vehicle_ids)
-        needed = [range(len(road.vehicle_ids))] if self._commanded else self._near
-        self._near_positions: dict[int, float] = {
-            int(place): float(road.start_positions[place])
-            for places in needed
-            for place in np.atleast_1d(places)
-        }
+        self._drivers = self._drivers_of(road.vehicle_ids)
+        needed = range(vehicles) if self._commanded else np.concatenate(self._near).tolist()
+        self._near_positions = {place: float(road.start_positions[place]) for place in needed}
         self._be_human(road.vehicle_ids)
         if self._commanded:
             simulation.command_people(road.vehicle_ids, scenario.right_of_way)
         self._exploration: Any = None
-        self._speeds = simulation.speeds(road.vehicle_ids)
-        if simulation.vehicle_count() != len(road.vehicle_ids):
-            self._miss()
+        self.speeds = simulation.speeds(road.vehicle_ids)
+        self._expect_all()
         self._forget()
-
-    def _files(self) -> Files:
-        return files_of_built(self.scenario, self.road)
 
     def _be_human(self, ids: Sequence[str]) -> None:
         """Let `ids` be those whose driving has noise, from the next step on."""
@@ -80,14 +70,19 @@ class ClosedTraffic(Traffic[ClosedRoad]):
     def _forget(self) -> None:
         """Begin the log anew."""
         self._log_moved = array("d")  # speeds with which the vehicles moved, before noise; row after row
-        self._log_speeds = array("d", self._speeds)
+        self._log_speeds = array("d", self.speeds)
         self._started = self._simulation.distances(self.road.vehicle_ids)
         self.log_fuel = []
         self._log_applied = array("d")
         self._log_commanded = array("d")
 
     def start(self, controlled: bool, on_progress: OnProgress | None = None) -> LocalState | None:
-        """Run the warm-up, then hand the CAVs over."""
+        """Run the warm-up, then hand the CAVs over, unless they stay human (`controlled` false).
+
+        Returns:
+            What the CAVs perceived in the last minute of the warm-up at the times of decisions, shape
+            (CAVs, moments), oldest first; None without a warm-up that may be remembered.
+        """
         scenario, history = self.scenario, None
         self._warm_up(self._simulate, on_progress)
         if scenario.warmup and scenario.recall_warmup:
@@ -95,7 +90,7 @@ class ClosedTraffic(Traffic[ClosedRoad]):
             moments = list(range(scenario.warmup - each, -1, -each))[
                 : round(HISTORY / scenario.decision_step)
             ]
-            states = self.states(*self.speeds_and_positions(), np.array(self._cavs))
+            states = loop_state(*self.speeds_and_positions(), self._near, self.road.loop_length)
             history = states.each(lambda values: values[:, moments[::-1]])
         self._controlled = controlled
         if controlled:
@@ -104,47 +99,31 @@ class ClosedTraffic(Traffic[ClosedRoad]):
         self._forget()
         return history
 
-    @property
-    def cavs(self) -> Sequence[str]:
-        """The CAVs: the same ones all the time."""
-        return self.road.cav_ids
-
-    @property
-    def speeds(self) -> list[float]:
-        """Speeds of all vehicles now [m/s], in road order."""
-        return self._speeds
-
-    def positions(self) -> NDArray[np.float64]:
+    def positions(self) -> Floats:
         """Return where the front bumpers of all vehicles are now along the road, not wrapped [m]."""
         return self.road.start_positions + np.array(self._simulation.distances(self.road.vehicle_ids))
 
     def perceive(self) -> LocalState:
-        """Return what the CAVs perceive now."""
+        """Return what the CAVs perceive now: arrays of shape (CAVs,), or plain numbers of a single one."""
         near = self._near_positions
         if self.single:
-            return loop_state(self._speeds, near, self._near_single, self.road.loop_length)
-        positions = np.full(len(self._speeds), np.nan)
+            return loop_state(self.speeds, near, self._near_single, self.road.loop_length)
+        positions = np.full(len(self.speeds), np.nan)
         positions[list(near)] = list(near.values())
-        return loop_state(np.array(self._speeds), positions, self._near, self.road.loop_length)
+        return loop_state(np.array(self.speeds), positions, self._near, self.road.loop_length)
 
     def advance(self, command: Command | None) -> None:
-        """Simulate one decision."""
-        scenario, cavs = self.scenario, self._cavs
-        if not self._controlled:
-            for _ in range(scenario.steps_per_decision):
-                self._simulate()
-        else:
-            step, applied = scenario.simulation_step, self._told(command)
-            self._log_applied.fromlist(applied)
-            for _ in range(scenario.steps_per_decision):
-                speeds = self._speeds
-                commanded = [
-                    next_speed(speeds[place], wanted, step)
-                    for place, wanted in zip(cavs, applied, strict=True)
-                ]
+        """Simulate one decision, held over its simulation steps; None: the CAVs stay human."""
+        scenario, step = self.scenario, self.scenario.simulation_step
+        applied = self._told(command) if self._controlled else []
+        self._log_applied.fromlist(applied)
+        for _ in range(scenario.steps_per_decision):
+            if self._controlled:
+                told = zip(self._places, applied, strict=True)
+                commanded = [next_speed(self.speeds[place], wanted, step) for place, wanted in told]
                 self._log_commanded.fromlist(commanded)
-                self._simulation.command_speeds(self.road.cav_ids, commanded)
-                self._simulate()
+                self._simulation.command_speeds(self.cavs, commanded)
+            self._simulate()
         self.decisions += 1
         if self.full:
             self.log_fuel.append(self._simulation.fuel(self.road.vehicle_ids))
@@ -158,54 +137,71 @@ class ClosedTraffic(Traffic[ClosedRoad]):
         if self._commanded:
             self._command_people()
         simulation.step()
-        if simulation.vehicle_count() != len(self.road.vehicle_ids):
-            self._miss()
-        moved = simulation.speeds(self.road.vehicle_ids)
-        self._log_moved.fromlist(moved)
+        self._expect_all()
+        speeds = simulation.speeds(self.road.vehicle_ids)
+        self._log_moved.fromlist(speeds)
         for place in near:
-            near[place] += moved[place] * step
-        self._speeds = moved
+            near[place] += speeds[place] * step
         if self.scenario.noise > 0 and not self._commanded:
-            noise = self._next_noise()
-            self._speeds = [speed if speed > 0.0 else 0.0 for speed in map(add, moved, noise)]
-            simulation.replace_speeds(self._human_ids, compress(self._speeds, self._human_mask))
-        self._log_speeds.fromlist(self._speeds)
+            noisy = map(add, speeds, self._next_noise())
+            speeds = [speed if speed > 0.0 else 0.0 for speed in noisy]
+            simulation.replace_speeds(self._human_ids, compress(speeds, self._human_mask))
+        self.speeds = speeds
+        self._log_speeds.fromlist(speeds)
         self.collisions = max(self.collisions, simulation.colliding_count())  # SUMO tells of each only once
         self.crashed = self.collisions > 0
 
+    def _expect_all(self) -> None:
+        """Raise `EpisodeError` where not all vehicles are on the road."""
+        present, wanted = self._simulation.vehicle_count(), len(self.road.vehicle_ids)
+        if present != wanted:
+            raise EpisodeError(f"{present} vehicles on the road where {wanted} should be")
+
     def _command_people(self) -> None:
-        """Ask for the speeds that people want."""
-        noise = self._next_noise() if self.scenario.noise > 0 else [0.0] * len(self._speeds)
-        wanted = wanted_speeds(
-            self.scenario,
-            self.road,
-            self._drivers,
-            self._human_places,
-            self._speeds,
-            self._near_positions,
-            noise,
-        )
-        self._simulation.command_speeds(self._human_ids, wanted)
+        """Ask for the speeds that people want: IDM with noise, as Flow does it; on a crossing SUMO drives."""
+        scenario, road, speeds, positions = self.scenario, self.road, self.speeds, self._near_positions
+        noise = self._next_noise() if scenario.noise > 0 else [0.0] * len(speeds)
+        step, loop, crossings = scenario.simulation_step, road.loop_length, road.crossings
+        population = scenario.calibrated
+        wanted = dict.fromkeys(self._human_places, LEAVE_TO_SUMO)
+        seen: list[tuple[int, float, float, float, float]] = []
+        for place in self._human_places:
+            position = positions[place]
+            on_road = position % loop
+            for start, end in crossings:  # any() would cost as much as the rest
+                if start <= on_road < end:
+                    break
+            else:
+                speed, ahead = speeds[place], place + 1 if place + 1 < len(speeds) else 0
+                gap = at_least(gap_on_loop(position, positions[ahead], loop, VEHICLE_LENGTH), SMALLEST_GAP)
+                acceleration = idm_acceleration(speed, speeds[ahead], gap, self._drivers[place])
+                if population is None:
+                    wanted[place] = at_least(speed + acceleration * step + noise[place], 0.0)
+                else:
+                    seen.append((place, acceleration, speed, speeds[ahead], gap))
+        if seen:  # a population's network is asked once for all
+            _, *columns = (np.array(column, np.float64) for column in zip(*seen, strict=True))
+            accelerations = as_calibrated(population, *columns).tolist()
+            for (place, _, speed, *_), acceleration in zip(seen, accelerations, strict=True):
+                wanted[place] = at_least(speed + acceleration * step + noise[place], 0.0)
+        self._simulation.command_speeds(self._human_ids, wanted.values())
 
     def noise(self) -> Array:
         """Return standard normal noise of this decision, drawn for the whole episode at once."""
         if self._exploration is None:
-            drawn = self._exploration_generator.standard_normal((self.scenario.horizon, len(self._cavs)))
+            drawn = self._exploration_generator.standard_normal((self.scenario.horizon, len(self.cavs)))
             self._exploration = drawn[:, 0].tolist() if self.single else drawn
         return self._exploration[self.decisions]
 
     def _next_noise(self) -> list[float]:
         """Return by how much noise changes each speed in this step, not at all for CAVs [m/s]."""
         if not self._noise_rows:
-            self._draw_noise()
+            draws = self._noise_generator.standard_normal((NOISE_BLOCK, len(self._human_mask)))
+            scale = self.scenario.noise_per_step * self.scenario.simulation_step
+            self._noise_rows = (draws * np.where(self._human_mask, scale, 0.0)).tolist()[::-1]
         return self._noise_rows.pop()
 
-    def _draw_noise(self) -> None:
-        draws = self._noise_generator.standard_normal((NOISE_BLOCK, len(self._human_mask)))
-        scale = self.scenario.noise_per_step * self.scenario.simulation_step
-        self._noise_rows = (draws * np.where(self._human_mask, scale, 0.0)).tolist()[::-1]
-
-    def speeds_and_positions(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def speeds_and_positions(self) -> tuple[Floats, Floats]:
         """Return speeds [m/s] and positions [m] in every simulation step since the log began.
 
         Shape (vehicles, moments), the first moment being the start.
@@ -217,23 +213,15 @@ class ClosedTraffic(Traffic[ClosedRoad]):
         moved = np.array(self._log_moved).reshape(-1, len(start)).T
         speeds = np.array(self._log_speeds).reshape(-1, len(start)).T
         positions = np.column_stack([start, next_position(start[:, None], moved.cumsum(1), step)])
-        error = float(np.abs(positions[:, -1] - self.positions()).max())
-        if error > ODOMETER_TOLERANCE:
-            raise EpisodeError(f"positions differ from SUMO's odometer by {error:.2g} m")
+        self._check_odometer(road.vehicle_ids, road.start_positions, positions[:, -1])
         return speeds, positions
-
-    def states(
-        self, speeds: NDArray[np.float64], positions: NDArray[np.float64], places: NDArray[np.intp]
-    ) -> LocalState:
-        """Return what the vehicles at `places` perceived, shape (places, moments)."""
-        near = loop_neighbours(places, len(self.road.vehicle_ids))
-        return loop_state(speeds, positions, near, self.road.loop_length)
 
     def record(self, driven: Driven) -> Episode:
         """Return what happened since the start."""
         road, each = self.road, self.scenario.steps_per_decision
         speeds, positions = (values[:, ::each] for values in self.speeds_and_positions())
-        states = self.states(speeds, positions, np.arange(len(road.vehicle_ids)))
+        everybody = loop_neighbours(np.arange(len(road.vehicle_ids)), len(road.vehicle_ids))
+        states = loop_state(speeds, positions, everybody, road.loop_length)
         applied, shield = self._applied(), self._shield()
         trajectories = tuple(
             trajectory(
@@ -247,7 +235,7 @@ class ClosedTraffic(Traffic[ClosedRoad]):
                 terminated=self.crashed,
                 driven=driven,
             )
-            for row, (name, place) in enumerate(zip(road.cav_ids, self._cavs, strict=True))
+            for row, (name, place) in enumerate(zip(road.cav_ids, self._places, strict=True))
         )
         return Episode(
             **self._facts(),
@@ -265,27 +253,26 @@ class ClosedTraffic(Traffic[ClosedRoad]):
 
     def scene(self) -> Scene:
         """Return this moment as pictures show it."""
-        cavs = np.isin(np.arange(len(self._speeds)), self._cavs)
         outline, loop = self.road.outline, self.road.loop_length
-        places = places_along(outline, self.positions(), loop)
-        return Scene(outline[:, 1:], places, np.array(self._speeds), cavs)
+        driven = self.road.start_positions + np.array(self._simulation.distances(self.road.vehicle_ids))
+        cavs = np.isin(np.arange(len(self.speeds)), self._places)
+        return Scene(outline[:, 1:], places_along(outline, driven, loop), np.array(self.speeds), cavs)
 
-    def _applied(self) -> NDArray[np.float64]:
+    def _applied(self) -> Floats:
         """Return the CAVs' commands within the action limit, of humans what they did [m/s2], (T, CAVs)."""
         if self._log_applied:
-            return np.array(self._log_applied).reshape(-1, len(self._cavs))
-        speeds = np.array(self._log_speeds).reshape(-1, len(self._human_mask))[:, self._cavs]
+            return np.array(self._log_applied).reshape(-1, len(self.cavs))
+        speeds = self._of_cavs(self._log_speeds)
         return np.diff(speeds[:: self.scenario.steps_per_decision], axis=0) / self.scenario.decision_step
 
-    def _shield(self) -> NDArray[np.float64]:
+    def _shield(self) -> Floats:
         """Return the hardest braking that SUMO added to each command, zero if it let it pass, (T, CAVs)."""
         if not self._log_commanded:
-            return np.zeros((self.decisions, len(self._cavs)))
-        commanded = np.array(self._log_commanded).reshape(-1, len(self._cavs))
-        moved = np.array(self._log_moved).reshape(-1, len(self._human_mask))[:, self._cavs]
-        added = (commanded - moved) / self.scenario.simulation_step
-        return added.reshape(-1, self.scenario.steps_per_decision, len(self._cavs)).max(1).clip(0.0, None)
+            return np.zeros((self.decisions, len(self.cavs)))
+        commanded = np.array(self._log_commanded).reshape(-1, len(self.cavs))
+        added = (commanded - self._of_cavs(self._log_moved)) / self.scenario.simulation_step
+        return added.reshape(-1, self.scenario.steps_per_decision, len(self.cavs)).max(1).clip(0.0, None)
 
-    def _miss(self) -> None:
-        present, wanted = self._simulation.vehicle_count(), len(self.road.vehicle_ids)
-        raise EpisodeError(f"{present} vehicles on the road where {wanted} should be")
+    def _of_cavs(self, log: "array[float]") -> Floats:
+        """Return what was logged of the CAVs, shape (rows, CAVs)."""
+        return np.array(log).reshape(-1, len(self._human_mask))[:, self._places]

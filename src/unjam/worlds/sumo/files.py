@@ -1,13 +1,30 @@
-"""What SUMO reads of an episode: who drives how as vehicle types, routes, and who enters."""
+"""What SUMO reads of an episode: the network, made once for each content, who drives how, and who enters."""
 
+import hashlib
+import os
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Iterable
+from contextlib import suppress
+from functools import cache
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, NamedTuple
+from xml.sax.saxutils import quoteattr
 
+import numpy as np
+import platformdirs
+
+from unjam.errors import DISK_ERRNOS, EpisodeError, MissingPartError, disk_error
 from unjam.physics.idm import IDMParameters
-from unjam.scenarios.road import BuiltRoad, OwnRoad
+from unjam.scenarios.road import BuiltRoad, Edge, Network, Node, OwnRoad, Road
 from unjam.scenarios.scenario import VEHICLE_LENGTH, Scenario
-from unjam.worlds.sumo.network_files import Attributes, element_xml, network_file
+from unjam.sumo_files import read_lanes
+from unjam.worlds.record import Floats
 
+Attributes = dict[str, Any]
+"""of an XML element"""
 SMALLEST_CAV_GAP = 0.5
 """gap that SUMO keeps for a CAV [m]"""
 CAV_COLOUR = "215,38,61"
@@ -16,8 +33,11 @@ OBEDIENT = 20.0
 """accelerations of an obedient CAV's type [m/s2]: far beyond what it asks for, so that only safety clips"""
 CAV_TYPES = "cav_of_{}"
 """the type of a CAV whose own type is `{}`"""
-KEPT = ("vClass", "length", "width", "height", "maxSpeed", "speedFactor", "guiShape", "emissionClass")
-"""attributes of a vehicle type that a CAV takes over, beside those of changing lanes"""
+KEPT = (
+    *("vClass", "length", "width", "height", "maxSpeed", "speedFactor", "guiShape", "emissionClass"),
+    "laneChangeModel",
+)
+"""attributes of a vehicle type that a CAV takes over, beside those of changing lanes: `lc...`"""
 
 
 class Files(NamedTuple):
@@ -33,60 +53,52 @@ class Files(NamedTuple):
     """files that the same option must name too"""
 
 
-def files_of_built(scenario: Scenario, road: BuiltRoad) -> Files:
-    """Return what SUMO reads of a road that is built for the episode."""
+def files_of(scenario: Scenario, road: Road) -> Files:
+    """Return what SUMO reads of a road: one that is built for the episode, or the user's own network."""
+    if isinstance(road, OwnRoad):  # its own files say all that is not named here
+        options = ("--configuration-file", str(road.files.path), "--verbose", "false")
+        traffic = _own_types_xml(scenario, road)
+        return Files(options, traffic, "--additional-files", road.files.additional_files)
+    assert isinstance(road, BuiltRoad)
     # Vehicles neither vanish from a jam nor give up waiting to enter.
     patience = ("--time-to-teleport", "-1", "--max-depart-delay", "-1")
     options = ("--net-file", str(network_file(road.network)), *patience)
     return Files(options, _traffic_xml(scenario, road), "--route-files")
 
 
-def files_of_own(scenario: Scenario, road: OwnRoad) -> Files:
-    """Return what SUMO reads of the user's own network: its own words about all that is not named here."""
-    options = ("--configuration-file", str(road.files.path), "--verbose", "false")
-    traffic = _own_types_xml(scenario, road)
-    return Files(options, traffic, "--additional-files", road.files.additional_files)
-
-
 def _traffic_xml(scenario: Scenario, road: BuiltRoad) -> str:
     """Return the XML of types, routes and vehicles of an episode."""
     own = road.people if scenario.people == "native" else {}
-    types = [
-        _vehicle_type("human", scenario, **_human_layer(scenario, scenario.humans)),
-        *(_vehicle_type(f"of_{name}", scenario, **_human_layer(scenario, one)) for name, one in own.items()),
-        _cav_type(scenario),
-    ]
-    routes = [
-        element_xml("route", {"id": route.name, "edges": " ".join(route.edges), "repeat": route.laps})
-        if route.laps > 1
-        else element_xml("route", {"id": route.name, "edges": " ".join(route.edges)})
-        for route in road.routes
-    ]
-    vehicles = []
+    humans = {"human": scenario.humans, **{f"of_{name}": one for name, one in own.items()}}
+    lines = [_vehicle_type(name, scenario, **_human_layer(scenario, one)) for name, one in humans.items()]
+    lines.append(_cav_type(scenario))
+    for route in road.routes:
+        laps = route.laps if route.laps > 1 else None
+        lines.append(_element("route", id=route.name, edges=" ".join(route.edges), repeat=laps))
     for entry in road.entries:
-        attributes: Attributes = {
+        attributes = {
             "id": entry.name,
             "type": f"of_{entry.name}" if entry.name in own else "human",
+            # SUMO would not let a driver who keeps a large distance begin closer than that.
+            "insertionChecks": "none" if entry.name in own else None,
+            "route": entry.route,
+            "depart": f"{entry.time:.2f}",
+            "departPos": repr(entry.position),
+            "departSpeed": entry.speed,
+            "departLane": 0,
         }
-        if entry.name in own:  # SUMO would not let a driver who keeps a large distance begin closer than that
-            attributes["insertionChecks"] = "none"
-        attributes |= {"route": entry.route, "depart": f"{entry.time:.2f}", "departPos": repr(entry.position)}
-        vehicles.append(element_xml("vehicle", {**attributes, "departSpeed": entry.speed, "departLane": 0}))
-    return "\n".join(["<routes>", *types, *routes, *vehicles, "</routes>"])
+        lines.append(_element("vehicle", **attributes))
+    return "\n".join(["<routes>", *lines, "</routes>"])
 
 
 def _own_types_xml(scenario: Scenario, road: OwnRoad) -> str:
     """Return the XML of a CAV type beside each of the user's types: as large, but driven by commands."""
-    lines = ["<additional>"]
+    types = []
     for name, attributes in road.files.types.items():
-        kept = {
-            key: value
-            for key, value in attributes.items()
-            if key in KEPT or key.startswith("lc") or key == "laneChangeModel"
-        }
+        kept = {key: value for key, value in attributes.items() if key in KEPT or key.startswith("lc")}
         calm = {"id": CAV_TYPES.format(name), "sigma": 0.0, "speedDev": 0.0}
-        lines.append(element_xml("vType", {**kept, **calm, **_obedient_layer(scenario.simulation_step)}))
-    return "\n".join([*lines, "</additional>"])
+        types.append({**kept, **calm, **_obedient_layer(scenario.simulation_step)})
+    return _document("additional", "vType", types)
 
 
 def _vehicle_type(name: str, scenario: Scenario, **attributes: Any) -> str:
@@ -100,7 +112,7 @@ def _vehicle_type(name: str, scenario: Scenario, **attributes: Any) -> str:
         "impatience": scenario.impatience,
         "emissionClass": scenario.emission_class,
     }
-    return element_xml("vType", {**common, **attributes})
+    return _element("vType", **{**common, **attributes})
 
 
 def _human_layer(scenario: Scenario, humans: IDMParameters) -> Attributes:
@@ -146,10 +158,135 @@ def _obedient_layer(simulation_step: float) -> Attributes:
     return {
         "color": CAV_COLOUR,
         "carFollowModel": "Krauss",
-        "accel": OBEDIENT,
-        "decel": OBEDIENT,
-        "emergencyDecel": OBEDIENT,
-        "apparentDecel": OBEDIENT,
+        **dict.fromkeys(("accel", "decel", "emergencyDecel", "apparentDecel"), OBEDIENT),
         "tau": simulation_step,
         "minGap": SMALLEST_CAV_GAP,
     }
+
+
+def cache_folder() -> Path:
+    """Return where networks are kept: `$UNJAM_CACHE`, or the user's cache folder."""
+    chosen = os.environ.get("UNJAM_CACHE")
+    return Path(chosen) if chosen else Path(platformdirs.user_cache_dir("unjam"))
+
+
+@cache
+def sumo_program(name: str) -> str:
+    """Return the path of one of SUMO's programs: the installed package's, else the one on the PATH.
+
+    Raises:
+        MissingPartError: neither has it.
+    """
+    with suppress(ImportError, AttributeError):
+        import sumo
+
+        bundled = Path(sumo.SUMO_HOME) / "bin" / name
+        if bundled.exists():
+            return str(bundled)
+    found = shutil.which(name)
+    if found is None:
+        raise MissingPartError(f"SUMO's {name} is not there; install it: pip install eclipse-sumo==1.28.0")
+    return found
+
+
+@cache
+def sumo_version() -> str:
+    """Return the installed version of libsumo; `MissingPartError` where there is none."""
+    try:
+        return version("libsumo")
+    except PackageNotFoundError:
+        raise MissingPartError("libsumo is not installed; install it: pip install libsumo==1.28.0") from None
+
+
+def sumo_words(lines: Iterable[str]) -> str:
+    """Return what one of SUMO's programs says of an error, as one line."""
+    return "; ".join(said for line in lines if (said := line.strip()) and said != "Quitting (on error).")
+
+
+def network_file(network: Network) -> Path:
+    """Return SUMO's network file, made with netconvert if this content was never made before.
+
+    Raises:
+        MissingPartError: netconvert is missing.
+        DiskError: the cache cannot be written.
+    """
+    edges = (_edge(edge, network.speed) for edge in network.edges)
+    files = {
+        ("--node-files", "road.nod.xml"): _document("nodes", "node", map(_node, network.nodes)),
+        ("--edge-files", "road.edg.xml"): _document("edges", "edge", edges),
+    }
+    if network.connections:
+        pairs = ({"from": before, "to": after} for before, after in network.connections)
+        files["--connection-files", "road.con.xml"] = _document("connections", "connection", pairs)
+    options = ["--no-turnarounds", "true", *([] if network.links else ["--no-internal-links", "true"])]
+    content = "\n".join([sumo_version(), *options, *files.values()])
+    name = hashlib.sha256(content.encode()).hexdigest()[:24]
+    target = cache_folder() / "networks" / f"{name}.net.xml"
+    if target.exists():
+        return target
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=target.parent) as folder:
+            made = _netconvert(files, options, Path(folder))
+            os.replace(made, target)  # whole or not at all, also with several workers at it
+    except OSError as error:
+        if error.errno in DISK_ERRNOS:
+            raise disk_error(error, target.parent) from None
+        raise
+    return target
+
+
+@cache
+def network_lines(path: Path) -> Floats:
+    """Return the centre lines of all lanes: rows (x, y) [m], a row of NaN between two lines."""
+    rows: list[tuple[float, float]] = []
+    for _, _, points in read_lanes(path):
+        rows += [*points, (float("nan"), float("nan"))]
+    return np.array(rows, np.float64).reshape(-1, 2)
+
+
+@cache
+def edge_lengths(path: Path) -> dict[str, float]:
+    """Return the length of each edge [m]."""
+    return {edge: length for edge, length, _ in read_lanes(path)}
+
+
+def _node(node: Node) -> Attributes:
+    kind = "priority" if node.priority else None
+    return {"id": node.name, "x": f"{node.x:.6f}", "y": f"{node.y:.6f}", "type": kind, "radius": node.radius}
+
+
+def _edge(edge: Edge, speed: float) -> Attributes:
+    ends = {"id": edge.name, "from": edge.begin, "to": edge.end}
+    shape = " ".join(f"{x:.6f},{y:.6f}" for x, y in edge.shape) or None
+    lane = {"numLanes": 1, "speed": speed, "length": repr(edge.length)}
+    return {**ends, **lane, "priority": edge.priority, "shape": shape}
+
+
+def _document(root: str, tag: str, elements: Iterable[Attributes]) -> str:
+    return "\n".join([f"<{root}>", *(_element(tag, **each) for each in elements), f"</{root}>"])
+
+
+def _element(tag: str, /, **attributes: Any) -> str:
+    """Return an XML element without content, and without the attributes that are None."""
+    pairs = [f"{key}={quoteattr(str(value))}" for key, value in attributes.items() if value is not None]
+    return f"<{tag} {' '.join(pairs)}/>"
+
+
+def _netconvert(files: dict[tuple[str, str], str], options: list[str], folder: Path) -> Path:
+    made = folder / "road.net.xml"
+    for (_, name), content in files.items():
+        (folder / name).write_text(content)
+    command = [
+        sumo_program("netconvert"),
+        *(f"{option}={folder / name}" for option, name in files),
+        f"--output-file={made}",
+        "--offset.disable-normalization=true",
+        "--precision=6",
+        *options,
+    ]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode != 0 or not made.exists():
+        words = sumo_words((done.stderr or done.stdout).splitlines())
+        raise EpisodeError(f"netconvert cannot make the road: {words}")
+    return made

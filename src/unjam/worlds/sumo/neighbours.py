@@ -3,13 +3,11 @@
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from unjam.drivers.local_state import LocalState
 from unjam.physics.kinematics import gap_on_loop
 from unjam.scenarios.scenario import VEHICLE_LENGTH
-
-Floats = NDArray[np.float64]
+from unjam.worlds.record import Floats
 
 
 class Neighbours(NamedTuple):
@@ -61,12 +59,8 @@ def places_along(outline: Floats, positions: Floats, loop_length: float) -> Floa
     Returns:
         Shape (..., 3): [m], and [rad] against the x axis; a vehicle lies between the places of its bumpers.
     """
-    front = _on_line(outline, positions % loop_length)
-    rear = _on_line(outline, (positions - VEHICLE_LENGTH) % loop_length)
-    heading = np.arctan2(front[..., 1] - rear[..., 1], front[..., 0] - rear[..., 0])
-    return np.concatenate([front, heading[..., None]], axis=-1)
-
-
-def _on_line(outline: Floats, coordinates: Floats) -> Floats:
-    columns = [np.interp(coordinates, outline[:, 0], outline[:, axis]) for axis in (1, 2)]
-    return np.stack(columns, axis=-1)
+    (x, y), (rear_x, rear_y) = (
+        [np.interp(along % loop_length, outline[:, 0], outline[:, axis]) for axis in (1, 2)]
+        for along in (positions, positions - VEHICLE_LENGTH)
+    )
+    return np.stack([x, y, np.arctan2(y - rear_y, x - rear_x)], axis=-1)

@@ -1,18 +1,29 @@
 """Traffic on roads with ends: vehicles come and go, and each stay of a CAV is a trajectory of its own."""
 
+from collections import defaultdict
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from unjam.drivers.command import Command
 from unjam.drivers.local_state import LocalState
 from unjam.physics.kinematics import next_speed
-from unjam.scenarios.scenario import Scenario
-from unjam.worlds.record import Episode, Trajectory, trajectory
-from unjam.worlds.sumo.simulation import Simulation
-from unjam.worlds.sumo.traffic import Floats, RoadKind, Scene, Seed, Traffic
+from unjam.worlds.record import Episode, Floats, Trajectory, trajectory
+from unjam.worlds.sumo.traffic import RoadKind, Scene, Traffic
 from unjam.worlds.world import Driven, OnProgress
+
+
+class Moment(NamedTuple):
+    """All vehicles that are on the road at one moment, in the same order."""
+
+    names: Sequence[str]
+    speeds: Sequence[float]
+    """[m/s]"""
+    positions: Sequence[float]
+    """[m]"""
+    gaps: Sequence[float]
+    """to the vehicle ahead [m]"""
 
 
 class OpenTraffic(Traffic[RoadKind]):
@@ -21,17 +32,6 @@ class OpenTraffic(Traffic[RoadKind]):
     A vehicle becomes a CAV at the first decision after it entered; until then it drives as people do. Its
     stay ends with the last decision after which it is still on the road.
     """
-
-    def __init__(
-        self, scenario: Scenario, road: RoadKind, seed: Seed, simulation: Simulation, full: bool
-    ) -> None:
-        """Put the vehicles on the road; nothing moves yet."""
-        super().__init__(scenario, road, seed, simulation, full)
-        self._on_road: dict[str, bool] = {}
-        """who is there, in order of entry; true: to be driven by the driver"""
-        self._cavs: list[str] = []
-        self._waiting: list[int] = []
-        self._arrived = 0
 
     # What each kind of road does in its own way.
 
@@ -45,51 +45,62 @@ class OpenTraffic(Traffic[RoadKind]):
     def _command_people(self) -> None:
         """Ask for the speeds that people want, where SUMO does not drive them."""
 
-    def _moment(self) -> tuple[Sequence[str], Sequence[float], Sequence[float], Sequence[float]]:
-        """Return names, speeds, positions and gaps of all vehicles on the road now."""
+    def _moment(self) -> Moment:
+        """Return all vehicles on the road now."""
         raise NotImplementedError
 
     def _states(self, names: Sequence[str]) -> LocalState:
         """Return what CAVs perceive now."""
         raise NotImplementedError
 
-    def _pictured(self, vehicles: Sequence[str]) -> dict[str, Any]:
-        """Return what the record says of the road itself."""
+    def _lines(self) -> Floats:
+        """Return the road's lines as `Scene` has them."""
         raise NotImplementedError
+
+    def _pictured(self, vehicles: Sequence[str]) -> dict[str, Any]:
+        """Return what else the record says of the road."""
+        raise NotImplementedError
+
+    @property
+    def _cav_type(self) -> str:
+        """What the type of a vehicle becomes with which it is a CAV; `{}` stands for the type it had."""
+        return "cav"
+
+    def _legal(self, speeds: dict[str, float]) -> dict[str, float]:
+        """Return wanted speeds of CAVs, none above what the road allows [m/s]."""
+        return speeds
+
+    def _ends_with(self, colliding: Sequence[str]) -> bool:
+        """Whether a collision of these vehicles ends the episode."""
+        return True
 
     # What all of them do alike.
 
     def start(self, controlled: bool, on_progress: OnProgress | None = None) -> None:
         """Run the warm-up, then hand the CAVs over; drivers remember nothing of it."""
+        self._on_road: dict[str, bool] = {}
+        """who is there, in order of entry; true: to be driven by the driver"""
+        self.cavs, self._arrived = [], 0
         self._follow()
         self._warm_up(lambda: self._simulate({}), on_progress)
         self._controlled = controlled
-        self._log_moments: list[tuple[Sequence[str], Sequence[float], Sequence[float], Sequence[float]]] = []
-        self._log_cavs: list[list[str]] = []
+        self._log_moments: list[Moment] = []
+        self._log_cavs: list[Sequence[str]] = []
         self._log_states: list[LocalState] = []
         self._log_applied: list[list[float]] = []
         self._log_shield: list[list[float]] = []
         self._log_places: list[Floats] = []
-        self._waiting, self._arrived = [], 0
+        self._waiting: list[int] = []
+        self._arrived = 0
         self._look()
-
-    @property
-    def cavs(self) -> Sequence[str]:
-        """The CAVs on the road now, in order of entry."""
-        return self._cavs
-
-    @property
-    def kept(self) -> Sequence[int] | None:
-        """Rows of the CAVs before the last decision that are on the road after it; None: the same ones."""
-        return None if len(self._kept) == self._before == len(self._cavs) else self._kept
 
     def perceive(self) -> LocalState:
         """Return what the CAVs perceive now: arrays of shape (CAVs,)."""
         return self._log_states[-1]
 
     def advance(self, command: Command | None) -> None:
-        """Simulate one decision of the CAVs that are on the road, as `Traffic` says."""
-        scenario, names = self.scenario, self._cavs
+        """Simulate one decision, held over its simulation steps; None: the CAVs stay human."""
+        scenario, names = self.scenario, self.cavs
         step = scenario.simulation_step
         applied = self._told(command) if self._controlled else []
         before = self._log_states[-1].speed
@@ -111,13 +122,13 @@ class OpenTraffic(Traffic[RoadKind]):
         self.decisions += 1
         self._look()
         if not self._controlled:
-            after = dict(zip(self._log_moments[-1][0], self._log_moments[-1][1], strict=True))
+            after = dict(zip(self._log_moments[-1].names, self.speeds, strict=True))
             changes = (after.get(name, speed) - speed for name, speed in zip(names, before, strict=True))
             applied = [change / scenario.decision_step for change in changes]
         self._log_applied.append(applied)
         self._log_shield.append(list(shield.values()))
         if self.full:
-            self.log_fuel.append(self._simulation.fuel(self._log_moments[-1][0]))
+            self.log_fuel.append(self._simulation.fuel(self._log_moments[-1].names))
 
     def _simulate(self, commanded: dict[str, float]) -> None:
         """Simulate one step after which these CAVs shall have these speeds [m/s]."""
@@ -129,14 +140,6 @@ class OpenTraffic(Traffic[RoadKind]):
         if colliding:
             self.collisions = max(self.collisions, len(colliding))
             self.crashed = self.crashed or self._ends_with(colliding)
-
-    def _legal(self, speeds: dict[str, float]) -> dict[str, float]:
-        """Return wanted speeds of CAVs, none above what the road allows [m/s]."""
-        return speeds
-
-    def _ends_with(self, colliding: Sequence[str]) -> bool:
-        """Whether a collision of these vehicles ends the episode."""
-        return True
 
     def _follow(self) -> None:
         """Keep up with who is on the road."""
@@ -150,33 +153,26 @@ class OpenTraffic(Traffic[RoadKind]):
 
     def _look(self) -> None:
         """Note who is where after a decision, and take control of the CAVs that have entered."""
-        known = set(self._cavs)
-        self._before = len(self._cavs)
-        self._kept = [row for row, name in enumerate(self._cavs) if name in self._on_road]
+        scenario, simulation, known = self.scenario, self._simulation, set(self.cavs)
+        rows = [row for row, name in enumerate(self.cavs) if name in self._on_road]
         new = [name for name, chosen in self._on_road.items() if chosen and name not in known]
-        self._cavs = [*(self._cavs[row] for row in self._kept), *new]
+        self._kept = rows if new or len(rows) < len(known) else None
+        self.cavs = [*(self.cavs[row] for row in rows), *new]
         self.entered += len(new)
-        if self._controlled and new:
-            self._take_control(new)
-        self._log_moments.append(self._moment())
-        self._log_cavs.append(self._cavs)
-        self._log_states.append(self._states(self._cavs))
-        self._waiting.append(len(self._simulation.waiting()))
+        if self._controlled:
+            simulation.take_control(new, scenario.actuation, scenario.right_of_way, self._cav_type)
+        moment = self._moment()
+        self.speeds = moment.speeds
+        self._log_moments.append(moment)
+        self._log_cavs.append(self.cavs)
+        self._log_states.append(self._states(self.cavs))
+        self._waiting.append(len(simulation.waiting()))
         if self.full:
-            self._log_places.append(self._simulation.places(self._log_moments[-1][0]))
-
-    def _take_control(self, names: Sequence[str]) -> None:
-        scenario = self.scenario
-        self._simulation.take_control(names, scenario.actuation, scenario.right_of_way)
-
-    @property
-    def speeds(self) -> Sequence[float]:
-        """Speeds of all vehicles on the road now [m/s]."""
-        return self._log_moments[-1][1]
+            self._log_places.append(simulation.places(moment.names))
 
     def record(self, driven: Driven) -> Episode:
         """Return what happened since the start."""
-        names = list(dict.fromkeys(name for moment in self._log_moments for name in moment[0]))
+        names = list(dict.fromkeys(name for moment in self._log_moments for name in moment.names))
         column = {name: index for index, name in enumerate(names)}
         shape = (self.decisions + 1, len(names))
         speeds, positions, gaps = (np.full(shape, np.nan) for _ in range(3))
@@ -191,9 +187,8 @@ class OpenTraffic(Traffic[RoadKind]):
                 if time:
                     fuel[time - 1, columns] = self.log_fuel[time - 1]
         trajectories = self._trajectories(driven)
-        facts = {**self._facts(), **self._pictured(names)}
         return Episode(
-            **facts,
+            **{**self._facts(), **self._pictured(names)},
             vehicle_ids=tuple(names),
             cav_ids=tuple(dict.fromkeys(each.vehicle for each in trajectories)),
             speeds=speeds,
@@ -202,36 +197,35 @@ class OpenTraffic(Traffic[RoadKind]):
             fuel=fuel,
             arrived=self._arrived,
             waiting=np.array(self._waiting, np.float64),
+            lines=self._lines() if self.full else np.zeros((0, 2)),
             places=places,
             trajectories=trajectories,
         )
 
     def _trajectories(self, driven: Driven) -> tuple[Trajectory, ...]:
         """Return the stays of at least one decision, in order of entry."""
-        rows: dict[str, list[int]] = {}
-        first: dict[str, int] = {}
+        stays: defaultdict[str, list[tuple[int, int]]] = defaultdict(list)
+        """moment and row of each CAV"""
         for time, names in enumerate(self._log_cavs):
             for row, name in enumerate(names):
-                first.setdefault(name, time)
-                rows.setdefault(name, []).append(row)
+                stays[name].append((time, row))
+        states = list(zip(*self._log_states, strict=True))
         found = []
-        for number, (name, places) in enumerate(rows.items()):
-            start, steps = first[name], len(places) - 1
+        for number, (name, places) in enumerate(stays.items()):
+            start, steps = places[0][0], len(places) - 1
             if steps == 0:
                 continue
-            moments = list(enumerate(places, start))
-            states = zip(*self._log_states, strict=True)
             found.append(
                 trajectory(
                     vehicle=name,
                     number=number,
                     start=start,
-                    rows=np.array(places),
+                    rows=np.array([row for _, row in places]),
                     states=LocalState(
-                        *(np.array([values[time][row] for time, row in moments]) for values in states)
+                        *(np.array([values[time][row] for time, row in places]) for values in states)
                     ),
-                    applied=np.array([self._log_applied[time][row] for time, row in moments[:-1]]),
-                    shield=np.array([self._log_shield[time][row] for time, row in moments[:-1]]),
+                    applied=np.array([self._log_applied[time][row] for time, row in places[:-1]]),
+                    shield=np.array([self._log_shield[time][row] for time, row in places[:-1]]),
                     terminated=self.crashed and start + steps == self.decisions,
                     driven=driven,
                 )
@@ -240,15 +234,6 @@ class OpenTraffic(Traffic[RoadKind]):
 
     def scene(self) -> Scene:
         """Return this moment as pictures show it."""
-        names, speeds, *_ = self._log_moments[-1]
-        cavs = set(self._cavs)
-        return Scene(
-            self._lines(),
-            self._simulation.places(names),
-            np.array(speeds),
-            np.array([name in cavs for name in names], bool),
-        )
-
-    def _lines(self) -> Floats:
-        """Return the road's lines as `Scene` has them."""
-        raise NotImplementedError
+        names, speeds = self._log_moments[-1].names, np.array(self.speeds)
+        cavs = np.array([name in self.cavs for name in names], bool)
+        return Scene(self._lines(), self._simulation.places(names), speeds, cavs)

@@ -11,31 +11,21 @@ import numpy as np
 
 from unjam.drivers.local_state import LARGEST_GAP, LocalState
 from unjam.scenarios.road import OwnRoad
-from unjam.scenarios.scenario import Scenario
-from unjam.worlds.record import Episode
-from unjam.worlds.sumo.files import CAV_TYPES, Files, files_of_own
-from unjam.worlds.sumo.network_files import edge_lengths, network_lines
-from unjam.worlds.sumo.open import OpenTraffic
-from unjam.worlds.sumo.simulation import Simulation
-from unjam.worlds.sumo.traffic import Floats, Seed
-from unjam.worlds.world import Driven
+from unjam.worlds.record import Episode, Floats
+from unjam.worlds.sumo.files import CAV_TYPES, edge_lengths, network_lines
+from unjam.worlds.sumo.open import Moment, OpenTraffic
+from unjam.worlds.world import Driven, OnProgress
 
 
 class OwnTraffic(OpenTraffic[OwnRoad]):
     """The actual environment of a network of the user's own."""
 
-    def __init__(
-        self, scenario: Scenario, road: OwnRoad, seed: Seed, simulation: Simulation, full: bool
-    ) -> None:
-        """Put the first vehicles on the road; nothing moves yet."""
-        super().__init__(scenario, road, seed, simulation, full)
-        self._network = road.files.network
+    def start(self, controlled: bool, on_progress: OnProgress | None = None) -> None:
+        """Run the warm-up, then hand the CAVs over; drivers remember nothing of it."""
         self._routes: Counter[tuple[str, ...]] = Counter()
         self._log_edges: list[list[tuple[str, float]]] = []
         self._allowed: list[float] = []
-
-    def _files(self) -> Files:
-        return files_of_own(self.scenario, self.road)
+        super().start(controlled, on_progress)
 
     @property
     def expects_cavs(self) -> bool:
@@ -60,25 +50,24 @@ class OwnTraffic(OpenTraffic[OwnRoad]):
         if self.full:
             self._routes.update(self._simulation.route_of(name) for name in entered)
 
-    def _take_control(self, names: Sequence[str]) -> None:
-        scenario = self.scenario
-        types = "{}" if scenario.actuation == "flow" else CAV_TYPES
-        self._simulation.take_control(names, scenario.actuation, scenario.right_of_way, types)
+    @property
+    def _cav_type(self) -> str:
+        return "{}" if self.scenario.actuation == "flow" else CAV_TYPES
 
     def _legal(self, speeds: dict[str, float]) -> dict[str, float]:
         allowed = self._simulation.allowed_speeds(list(speeds))
         return {name: min(speed, most) for (name, speed), most in zip(speeds.items(), allowed, strict=True)}
 
     def _ends_with(self, colliding: Sequence[str]) -> bool:
-        return any(name in self._cavs for name in colliding)
+        return any(name in self.cavs for name in colliding)
 
-    def _moment(self) -> tuple[Sequence[str], Sequence[float], Sequence[float], Sequence[float]]:
+    def _moment(self) -> Moment:
         names = list(self._on_road)
         if self.full:
             self._log_edges.append(self._simulation.edge_places(names))
             self._allowed += self._simulation.allowed_speeds(names)
         unknown = [float("nan")] * len(names)
-        return names, self._simulation.speeds(names), unknown, unknown
+        return Moment(names, self._simulation.speeds(names), unknown, unknown)
 
     def _states(self, names: Sequence[str]) -> LocalState:
         found = [self._simulation.neighbours(name, LARGEST_GAP) for name in names]
@@ -92,7 +81,7 @@ class OwnTraffic(OpenTraffic[OwnRoad]):
         found = super().record(driven)
         if not self.full or not self._routes:
             return found
-        lengths = edge_lengths(self._network)
+        lengths = edge_lengths(self.road.files.network)
         planned: Counter[str] = Counter()  # not where they were: all drivers' pictures show the same route
         for edges, count in self._routes.items():
             planned.update(dict.fromkeys(edges, count))
@@ -107,10 +96,9 @@ class OwnTraffic(OpenTraffic[OwnRoad]):
         return replace(found, positions=positions)
 
     def _lines(self) -> Floats:
-        return network_lines(self._network)
+        return network_lines(self.road.files.network)
 
     def _pictured(self, vehicles: Sequence[str]) -> dict[str, Any]:
         if not self.full:
             return {}
-        allowed = float(np.mean(self._allowed)) if self._allowed else float("nan")
-        return {"lines": self._lines(), "limit_speed": allowed}
+        return {"limit_speed": float(np.mean(self._allowed)) if self._allowed else float("nan")}

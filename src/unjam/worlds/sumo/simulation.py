@@ -9,7 +9,7 @@ from contextlib import redirect_stdout, suppress
 from functools import partial
 from itertools import count, dropwhile, starmap
 from pathlib import Path
-from types import ModuleType, TracebackType
+from types import ModuleType
 from typing import Any, Literal, Self
 
 import numpy as np
@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 
 from unjam.errors import EpisodeError, MissingPartError, UnjamError
 from unjam.scenarios.scenario import Actuation
-from unjam.worlds.sumo.files import Files
-from unjam.worlds.sumo.network_files import sumo_program
+from unjam.worlds.sumo.files import Files, sumo_program, sumo_words
 
 Backend = Literal["libsumo", "traci", "gui"]
 """`libsumo`: in this process; `traci`: SUMO as a child process; `gui`: the same, with its window."""
@@ -28,6 +27,8 @@ SPEED_MODES = {"shielded": 31, "raw": 30, "flow": 25}
 WITHOUT_RIGHT_OF_WAY = 1
 """the bit that stays where vehicles need not obey the right of way: who is surprised on a junction then stops
 as fast as it must, and so must who follows"""
+LEAVE_TO_SUMO = -1.0
+"""the commanded speed that stands for none"""
 
 _exhaust = deque(maxlen=0).extend
 """runs through an iterator, in C: a loop would cost as much as the calls"""
@@ -58,6 +59,7 @@ class Simulation:
         self._gui_options = gui_options
         self._sumo: Any = _import(backend)
         self._folder = tempfile.TemporaryDirectory(prefix="unjam-")
+        self._error_log = Path(self._folder.name) / "error.log"
         self._running = False
         if backend == "libsumo":
             self._bind()
@@ -129,18 +131,13 @@ class Simulation:
             *("--collision.check-junctions", "true"),
         ]
 
-    @property
-    def _error_log(self) -> Path:
-        return Path(self._folder.name) / "error.log"
-
     def _reason(self) -> str:
-        """Return SUMO's own words about its last error: they are in its log, not in its exception."""
+        """Return SUMO's own words about its last error: they are in its log, behind warnings."""
         try:
-            lines = [line.strip() for line in self._error_log.read_text().splitlines() if line.strip()]
+            lines = self._error_log.read_text().splitlines()
         except OSError:
             return ""
-        errors = dropwhile(lambda line: not line.startswith("Error"), lines)  # warnings may come before
-        return "; ".join(line for line in errors if line != "Quitting (on error).")
+        return sumo_words(dropwhile(lambda line: not line.lstrip().startswith("Error"), lines))
 
     def speeds(self, ids: Sequence[str]) -> list[float]:
         """Return the speeds of `ids` [m/s]."""
@@ -179,25 +176,22 @@ class Simulation:
         """Return how fast each of `ids` may drive where it is [m/s]."""
         return [self._sumo.vehicle.getAllowedSpeed(name) for name in ids]
 
-    def neighbours(self, name: str, farthest: float) -> tuple[float, float, float, float] | None:
+    def neighbours(self, name: str, farthest: float) -> list[float]:
         """Return speed and gap of the vehicle ahead and of the one behind, as SUMO sees them [m/s, m].
 
         The gap is bumper to bumper. Who is farther than `farthest` is not there: as fast, and that far away.
         """
         vehicle = self._sumo.vehicle
         speed = self._get_speed(name)
+        leader, ahead = vehicle.getLeader(name, farthest) or ("", 0.0)
+        follower, behind = vehicle.getFollower(name, farthest)
         found = []
-        for other, gap, keeper in (
-            (*(vehicle.getLeader(name, farthest) or ("", 0.0)), name),
-            (*(follower := vehicle.getFollower(name, farthest)), follower[0]),
-        ):
-            if not other:
-                found += [speed, farthest]
-                continue
-            true_gap = gap + vehicle.getMinGap(keeper)  # SUMO's lacks the gap that the one behind keeps
+        for other, gap, keeper in ((leader, ahead, name), (follower, behind, follower)):
+            # SUMO's gap lacks the one that the vehicle behind keeps.
+            true_gap = gap + vehicle.getMinGap(keeper) if other else farthest
             there = true_gap < farthest
             found += [self._get_speed(other) if there else speed, min(max(true_gap, 0.0), farthest)]
-        return tuple(found)
+        return found
 
     def distances(self, ids: Sequence[str]) -> list[float]:
         """Return how far each of `ids` has driven since it entered [m]."""
@@ -251,9 +245,7 @@ class Simulation:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.close()
 
 

@@ -7,19 +7,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from unjam.drivers.command import Command, accelerations
-from unjam.drivers.local_state import LocalState
 from unjam.errors import EpisodeError
 from unjam.physics.arrays import Array
+from unjam.physics.idm import IDMParameters
 from unjam.scenarios.road import Road
 from unjam.scenarios.scenario import Scenario
-from unjam.worlds.record import Episode
-from unjam.worlds.sumo.files import Files
+from unjam.worlds.record import Episode, Floats
+from unjam.worlds.sumo.files import files_of
 from unjam.worlds.sumo.simulation import Simulation
-from unjam.worlds.world import Driven, OnProgress
+from unjam.worlds.world import OnProgress, World
 
-Floats = NDArray[np.float64]
-
-
+ODOMETER_TOLERANCE = 1e-6
+"""by how much positions may differ from SUMO's odometer at the end [m]"""
 WARMUP_PROGRESS_STEPS = 500
 
 
@@ -47,14 +46,15 @@ class Scene(NamedTuple):
 RoadKind = TypeVar("RoadKind", bound=Road)
 
 
-class Traffic(Generic[RoadKind]):
-    """Start, perceive, advance by one decision, and the log of all of it.
-
-    What roads with and without ends have in common; a `World`.
-    """
+class Traffic(World[Episode], Generic[RoadKind]):
+    """The world of a road in SUMO: what roads with and without ends have in common."""
 
     single = False
-    """whether its only CAV perceives and is driven in plain numbers instead of arrays of one row"""
+    cavs: Sequence[str]
+    """the CAVs on the road now, in order of entry: the rows of what drivers are given and answer"""
+    speeds: Sequence[float]
+    """of all vehicles on the road now [m/s]"""
+    _kept: Sequence[int] | None = None
 
     def __init__(
         self, scenario: Scenario, road: RoadKind, seed: Seed, simulation: Simulation, full: bool
@@ -73,7 +73,6 @@ class Traffic(Generic[RoadKind]):
         self.decisions = 0
         """made since the log began"""
         self.entered = 0
-        """CAVs that the driver was given so far"""
         self.full = full
         """whether fuel and, on roads with ends, places are recorded"""
         self.log_fuel: list[list[float]] = []
@@ -82,22 +81,7 @@ class Traffic(Generic[RoadKind]):
         self._exploration_generator = np.random.default_rng(exploration_seed)
         self._simulation = simulation
         sumo = int(sumo_seed.generate_state(1)[0]) % 2**31
-        simulation.load(self._files(), scenario.simulation_step, sumo)
-
-    def _files(self) -> Files:
-        """Return what SUMO reads of this episode."""
-        raise NotImplementedError
-
-    def start(self, controlled: bool, on_progress: OnProgress | None = None) -> LocalState | None:
-        """Run the warm-up, then hand the CAVs over, unless they stay human (`controlled` false).
-
-        `on_progress` is called now and then with 0: no decision is made yet.
-
-        Returns:
-            What the CAVs perceived in the last minute of the warm-up at the times of decisions, shape
-            (CAVs, moments), oldest first; None without a warm-up that may be remembered.
-        """
-        raise NotImplementedError
+        simulation.load(files_of(scenario, road), scenario.simulation_step, sumo)
 
     def _warm_up(self, simulate: Callable[[], None], on_progress: OnProgress | None) -> None:
         """Let people drive alone; raise `EpisodeError` where they collide."""
@@ -107,11 +91,6 @@ class Traffic(Generic[RoadKind]):
                 raise EpisodeError(f"collision in step {step} of the all-human warm-up")
             if on_progress is not None and step % WARMUP_PROGRESS_STEPS == 0:
                 on_progress(0)
-
-    @property
-    def cavs(self) -> Sequence[str]:
-        """The CAVs on the road now: the rows of what drivers are given and answer."""
-        raise NotImplementedError
 
     @property
     def rows(self) -> int:
@@ -126,37 +105,16 @@ class Traffic(Generic[RoadKind]):
     @property
     def kept(self) -> Sequence[int] | None:
         """Rows of the CAVs before the last decision that are on the road after it; None: the same ones."""
-        return None
+        return self._kept
 
     @property
     def ended(self) -> bool:
         """Whether there was a collision, nobody will be on the road any more, or the horizon is reached."""
         return self.crashed or self.over or self.decisions >= self.scenario.horizon
 
-    @property
-    def speeds(self) -> Sequence[float]:
-        """Speeds of all vehicles on the road now [m/s]."""
-        raise NotImplementedError
-
-    def perceive(self) -> LocalState:
-        """Return what the CAVs perceive now: arrays of shape (CAVs,), or plain numbers of a single one."""
-        raise NotImplementedError
-
-    def advance(self, command: Command | None) -> None:
-        """Simulate one decision, held over its simulation steps; None: the CAVs stay human.
-
-        Raises:
-            InputError: an acceleration is not finite, or there are not as many as CAVs.
-        """
-        raise NotImplementedError
-
     def noise(self) -> Array:
         """Return standard normal noise for one decision: an array (CAVs,), or a plain number."""
         return self._exploration_generator.standard_normal(len(self.cavs))
-
-    def record(self, driven: Driven) -> Episode:
-        """Return what happened since the start, but for what was earned."""
-        raise NotImplementedError
 
     def scene(self) -> Scene:
         """Return this moment as pictures show it."""
@@ -166,6 +124,16 @@ class Traffic(Generic[RoadKind]):
         """Return what the CAVs are told, within the limits [m/s2]; raise `InputError` where it cannot be."""
         wanted = Command(np.zeros(0)) if command is None else command
         return accelerations(wanted, self.limits, self.cavs, f"driver: step {self.decisions}")
+
+    def _drivers_of(self, names: Sequence[str]) -> list[IDMParameters]:
+        """Return how the human driver of each vehicle drives."""
+        return [self.road.people.get(name, self.scenario.humans) for name in names]
+
+    def _check_odometer(self, names: Sequence[str], starts: Floats, positions: Floats) -> None:
+        """Raise `EpisodeError` where `starts` and what SUMO says was driven are not the positions [m]."""
+        error = np.abs(starts + np.array(self._simulation.distances(names)) - positions).max(initial=0.0)
+        if error > ODOMETER_TOLERANCE:
+            raise EpisodeError(f"positions differ from SUMO's odometer by {error:.2g} m")
 
     def _facts(self) -> dict[str, Any]:
         """Return what every record says."""
