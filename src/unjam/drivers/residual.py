@@ -58,8 +58,9 @@ class ResidualDriver(Wrapper):
     def decide(self, state: LocalState, memory: Memory, noise: Noise | None = None) -> Decision:
         """Return the decision taken apart; with `noise`, the network explores."""
         wanted, after = self.expert.act(state, memory[EXPERT])
-        expert, remembered = self.limits.keep(wanted), {EXPERT: after}
-        due: Any = True if self.hold == 1 else memory[AGE] % self.hold == 0
+        limits, hold, remembered = self.limits, self.hold, {EXPERT: after}
+        expert = limits.keep(wanted)
+        due: Any = True if hold == 1 else memory[AGE] % hold == 0
         if due is False:  # where one age counts for all rows, as in plain numbers, no network is asked
             observation, residual = (), memory[RESIDUAL]
         else:
@@ -68,9 +69,9 @@ class ResidualDriver(Wrapper):
             residual = network(observation) if noise is None else network.explore(observation, noise())
             if due is not True:
                 residual = namespace(residual).where(due, residual, memory[RESIDUAL])
-        if self.hold > 1:
+        if hold > 1:
             remembered |= {RESIDUAL: residual, AGE: memory[AGE] + 1.0}
-        command = Command(self.limits.keep(expert + residual))
+        command = Command(limits.keep(expert + residual))
         return Decision(command, expert, residual, observation, remembered)
 
     def observation(self, state: LocalState, memory: Memory) -> Array:
