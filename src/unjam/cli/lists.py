@@ -36,7 +36,7 @@ def scenarios(
     """
     from rich.markup import escape
 
-    from unjam.scenarios.registry import SCENARIOS, scenario_recipe
+    from unjam.scenarios import SCENARIOS, scenario_recipe
 
     if picture is not None:
         if name is None or picture.suffix.lower() != ".png":
@@ -69,7 +69,7 @@ def scenarios(
 
 def _scenario(name: str) -> Any:
     """Return a scenario by name; your own network has no default share of CAVs, and gets one here."""
-    from unjam.scenarios.registry import make_scenario
+    from unjam.scenarios import make_scenario
 
     return make_scenario(name, {"cav_share": SHOWN_SHARE} if name.endswith(".sumocfg") else None)
 

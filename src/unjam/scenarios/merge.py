@@ -147,15 +147,6 @@ class Merge(Scenario):
         length = INFLOW_EDGE + ENTRANCE_WAY + BEFORE + JUNCTION_WAYS[HIGHWAY] + AFTER
         return _undisturbed_speed(self.inflow, length, self.humans, self.simulation_step)
 
-    @property
-    def drawn_ranges(self) -> dict[str, tuple[float, float]]:
-        """Nothing: all that is random is which vehicles are CAVs."""
-        return {}
-
-    def part(self, index: int, count: int) -> "Merge":
-        """Return the merge itself."""
-        return self
-
     def possible_cavs(self) -> tuple[str, ...]:
         """Return the ids that any of the highway's vehicles has as a CAV."""
         return tuple(f"cav_{index}" for index in range(len(self._times(self.inflow))))

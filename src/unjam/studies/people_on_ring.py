@@ -15,7 +15,7 @@ from unjam.manifest import manifest
 from unjam.measures.metrics import measure, wave_speed
 from unjam.reports.figures import png_bytes, space_time
 from unjam.reports.results import read_results
-from unjam.scenarios.registry import make_scenario
+from unjam.scenarios import make_scenario
 from unjam.studies.study import OnProgress
 from unjam.training.evaluate import Evaluation, raise_failure, save_evaluation
 from unjam.worlds.record import Episode

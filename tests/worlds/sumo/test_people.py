@@ -6,8 +6,8 @@ import pytest
 from unjam.drivers.idm import Human
 from unjam.drivers.network import Network
 from unjam.physics.idm import PAPER_IDM, IDMParameters, idm_acceleration
+from unjam.scenarios import make_scenario
 from unjam.scenarios.population import Population, write_population
-from unjam.scenarios.registry import make_scenario
 from unjam.worlds.episode import run_episode
 from unjam.worlds.sumo.people import as_calibrated
 
