@@ -20,11 +20,7 @@ from xml.parsers import expat
 
 DEFAULT_TYPE = "DEFAULT_VEHTYPE"
 """SUMO's type of vehicles that name none"""
-OTHER_DEFAULT_TYPES = {
-    "DEFAULT_BIKETYPE": "bicycle",
-    "DEFAULT_TAXITYPE": "taxi",
-    "DEFAULT_RAILTYPE": "rail",
-}
+OTHER_DEFAULT_TYPES = {"DEFAULT_BIKETYPE": "bicycle", "DEFAULT_TAXITYPE": "taxi", "DEFAULT_RAILTYPE": "rail"}
 """vehicle classes of SUMO's other types that no file need define"""
 DEMAND = ("vehicle", "trip", "flow")
 UNITS = (1.0, 60.0, 3600.0, 86400.0)
