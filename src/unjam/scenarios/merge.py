@@ -39,7 +39,7 @@ class Merge(Scenario):
     """A highway of 700 m that a ramp joins 100 m before its end; some highway vehicles are CAVs.
 
     At 2,000 + 100 vehicles an hour the road has two lives. From an empty start it flows freely; with a few
-    vehicles standing at the start a jam grows before the ramp and stays, and traffic backs up past the
+    vehicles standing at the start a jam grows before the ramp and stays, and traffic backs up beyond the
     entrance. Every CAV on the road is driven by the same driver, each with a memory of its own, from the
     decision after it entered until it leaves.
     """
