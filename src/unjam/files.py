@@ -1,5 +1,6 @@
 """Writing files so that nothing is lost or half-written, whatever happens in between."""
 
+import errno
 import json
 import math
 import os
@@ -47,14 +48,12 @@ def make_folder(path: Path) -> None:
     """Make a folder and those above it; raise `DiskError` where that is impossible."""
     try:
         path.mkdir(parents=True, exist_ok=True)
-    except FileExistsError as error:
-        raise disk_error(error, path) from None
     except OSError as error:
-        raise _disk(error, path) from None
+        raise _disk(error, path, errno.EEXIST) from None
 
 
-def _disk(error: OSError, path: Path) -> Exception:
-    return disk_error(error, path) if error.errno in DISK_ERRNOS else error
+def _disk(error: OSError, path: Path, *more: int) -> OSError | DiskError:
+    return disk_error(error, path) if error.errno in (*DISK_ERRNOS, *more) else error
 
 
 def to_json(value: Any, indent: int | None = None) -> str:

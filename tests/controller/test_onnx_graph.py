@@ -35,8 +35,7 @@ from unjam.errors import InputError, MissingPartError
 from unjam.learners.sac import SquashedResidualPolicy
 from unjam.learners.settings import PolicySettings
 from unjam.learners.trpo_ppo import ResidualPolicy
-from unjam.scenarios import Ring
-from unjam.scenarios.registry import make_scenario
+from unjam.scenarios import Ring, make_scenario
 from unjam.scenarios.scenario import Scenario
 from unjam.worlds.episode import run_episode
 from unjam.worlds.record import Trajectory

@@ -13,7 +13,7 @@ import numpy as np
 
 from tests.worlds.sumo.own_roads import straight
 from unjam.drivers.registry import DRIVERS, named_driver
-from unjam.scenarios.registry import make_scenario
+from unjam.scenarios import make_scenario
 from unjam.scenarios.scenario import Scenario
 from unjam.worlds.episode import run_episode
 from unjam.worlds.record import Episode

@@ -5,9 +5,8 @@ import numpy as np
 import pytest
 
 from unjam.errors import InputError
-from unjam.scenarios import SCENARIOS, FigureEight, make_scenario
+from unjam.scenarios import SCENARIOS, FigureEight, make_scenario, scenario_from_recipe, scenario_recipe
 from unjam.scenarios.figure_eight import loop_length
-from unjam.scenarios.registry import scenario_from_recipe, scenario_recipe
 from unjam.scenarios.road import ClosedRoad
 from unjam.worlds.sumo.files import network_file
 

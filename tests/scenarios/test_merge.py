@@ -8,9 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from unjam.errors import InputError
-from unjam.scenarios import Merge, make_scenario
+from unjam.scenarios import Merge, make_scenario, scenario_from_recipe, scenario_recipe
 from unjam.scenarios.merge import ENTRANCE_WAY, JUNCTION_WAYS
-from unjam.scenarios.registry import scenario_from_recipe, scenario_recipe
 from unjam.scenarios.road import MergingRoad
 from unjam.worlds.sumo.files import files_of, network_file
 

@@ -8,9 +8,8 @@ import pytest
 
 from tests.sumo_files.test_sumo_files import configuration
 from unjam.errors import InputError
-from unjam.scenarios import make_scenario
+from unjam.scenarios import make_scenario, scenario_from_recipe, scenario_recipe
 from unjam.scenarios.own_network import OwnNetwork
-from unjam.scenarios.registry import scenario_from_recipe, scenario_recipe
 from unjam.scenarios.road import OwnRoad
 from unjam.worlds.sumo.files import files_of
 

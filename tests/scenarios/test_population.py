@@ -7,8 +7,8 @@ import pytest
 from unjam.drivers.network import Network
 from unjam.errors import InputError
 from unjam.physics.idm import PAPER_IDM, IDMParameters
+from unjam.scenarios import make_scenario, scenario_from_recipe, scenario_recipe
 from unjam.scenarios.population import Population, read_population, write_population
-from unjam.scenarios.registry import make_scenario, scenario_from_recipe, scenario_recipe
 from unjam.scenarios.road import BuiltRoad
 from unjam.worlds.sumo.files import files_of
 

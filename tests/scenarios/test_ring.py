@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from unjam.errors import InputError
-from unjam.scenarios import SCENARIOS, Ring, make_scenario
-from unjam.scenarios.registry import scenario_from_recipe, scenario_recipe
+from unjam.scenarios import SCENARIOS, Ring, make_scenario, scenario_from_recipe, scenario_recipe
 
 
 def test_lengths_are_integers_from_the_whole_range() -> None:

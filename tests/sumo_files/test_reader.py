@@ -11,7 +11,7 @@ import pytest
 from tests.sumo_files.test_sumo_files import NETWORK, ROUTES, configuration
 from unjam import sumo_files
 from unjam.errors import InputError
-from unjam.sumo_files import read_lanes, read_sumo_files, reader
+from unjam.sumo_files import read_lanes, read_sumo_files
 
 LAUGHS = "".join(f'<!ENTITY l{n} "{f"&l{n - 1};" * 10 if n else "lol"}">' for n in range(10))
 DEFINITIONS = {
@@ -62,12 +62,12 @@ def test_what_takes_too_long_is_refused(tmp_path: Path, monkeypatch: pytest.Monk
 
 def test_a_reader_that_is_lost_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = configuration(tmp_path)
-    monkeypatch.setattr(reader, "__file__", str(tmp_path / "none.py"))
+    monkeypatch.setattr(sumo_files, "__file__", str(tmp_path / "none.py"))
     assert "cannot be read within" in refused(path)
 
 
 def test_it_needs_pythons_own_library_alone(tmp_path: Path) -> None:
-    program = [sys.executable, "-I", "-S", reader.__file__, "configuration"]
+    program = [sys.executable, "-I", "-S", sumo_files.__file__, "configuration"]
     ran = subprocess.run(
         [*program, str(configuration(tmp_path)), str(2**30), "60"], capture_output=True, check=True
     )
@@ -94,7 +94,7 @@ def test_in_this_process_it_answers_the_same(
 ) -> None:
     monkeypatch.setitem(sys.modules, "resource", None)  # where there are no limits
     path = configuration(tmp_path, routes=ROUTES)
-    reader.main("configuration", str(path), "0", "0")
+    sumo_files.main("configuration", str(path), "0", "0")
     assert json.loads(capsys.readouterr().out)["found"]["network"] == str(tmp_path / "road.net.xml")
-    reader.main("lanes", str(tmp_path / "none"), "0", "0")
+    sumo_files.main("lanes", str(tmp_path / "none"), "0", "0")
     assert "cannot be read" in json.loads(capsys.readouterr().out)["broken"]

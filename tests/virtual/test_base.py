@@ -12,9 +12,8 @@ from unjam.drivers.check import random_state
 from unjam.drivers.local_state import LARGEST_GAP
 from unjam.drivers.network import Network
 from unjam.physics import IDMParameters
-from unjam.scenarios import Ring
+from unjam.scenarios import Ring, make_scenario
 from unjam.scenarios.population import Population, write_population
-from unjam.scenarios.registry import make_scenario
 from unjam.virtual.model import BASES, absent, base_reward, base_step
 from unjam.worlds.reward import make_reward
 

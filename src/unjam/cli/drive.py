@@ -76,7 +76,7 @@ def drive(
 
       unjam drive ring -d pi -d runs/ring-001 --held-out --episodes 20
     """
-    from unjam.scenarios.registry import make_scenario
+    from unjam.scenarios import make_scenario
     from unjam.training.evaluate import drive as run
     from unjam.training.evaluate import raise_failures
 
@@ -122,7 +122,7 @@ def watch(
     from unjam.files import check_folder
     from unjam.measures.metrics import measure
     from unjam.reports.film import check_format, write_video
-    from unjam.scenarios.registry import make_scenario
+    from unjam.scenarios import make_scenario
     from unjam.training.evaluate import raise_failure
     from unjam.worlds.workers import EpisodeTask, Workers
 

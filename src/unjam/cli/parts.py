@@ -36,7 +36,7 @@ def scenarios(
     """
     from rich.markup import escape
 
-    from unjam.scenarios.registry import SCENARIOS, make_scenario, scenario_recipe
+    from unjam.scenarios import SCENARIOS, make_scenario, scenario_recipe
 
     if picture is not None and (name is None or picture.suffix.lower() != ".png"):
         raise InputError("picture: wants the name of a scenario, and a file that ends in .png")

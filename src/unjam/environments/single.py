@@ -16,7 +16,7 @@ from unjam.drivers.driver import Decision, Driver, Memory, Noise
 from unjam.drivers.local_state import LocalState
 from unjam.drivers.observation import FeatureName, Seen, observation_size, observe
 from unjam.errors import EpisodeError, InputError, UnjamError
-from unjam.scenarios.registry import make_scenario
+from unjam.scenarios import make_scenario
 from unjam.worlds.drive import Drive
 from unjam.worlds.reward import Outcome, make_reward, time_headway
 from unjam.worlds.sumo import make_traffic

@@ -147,7 +147,7 @@ def gap_objective(
 
     `headways` are factors on the time headway, of each stretch.
     """
-    moments = stretches.present[1:].sum(0)
+    moments = stretches.moments
 
     def objective(candidates: Floats) -> Floats:
         v0, headway, acceleration, deceleration, minimum_gap, kept = candidates.reshape(6, -1, 1)
@@ -165,14 +165,12 @@ def gap_squares(stretches: Stretches, model: Model, candidates: int = 1) -> Floa
 
     As `open_loop`, but for many drivers at once, and without keeping where they were.
     """
-    moments = stretches.present[1:].sum(0)
-    shape = (candidates, len(moments))
-    start = (np.broadcast_to(stretches.speed[0], shape), np.broadcast_to(stretches.gap[0], shape))
-    leader = (stretches.leader_speed, stretches.leader_path)
-    total = np.zeros(shape)
-    for moment, (_, gap) in enumerate(drive_behind(model(*start), start, leader, stretches.step), 1):
+    total = np.zeros((candidates, len(stretches.moments)))
+    speed, gap = (np.broadcast_to(values, total.shape) for values in stretches.start)
+    driven = drive_behind(model(speed, gap), (speed, gap), stretches.leader, stretches.step)
+    for moment, (_, gap) in enumerate(driven, 1):
         total += np.square(gap - stretches.gap[moment]) * stretches.present[moment]
-    return total / moments
+    return total / stretches.moments
 
 
 def at_an_end(value: float, within: Range) -> bool:
@@ -186,7 +184,7 @@ def calibrate_each(
     typical: IDMParameters,
     own: Sequence[str],
     settings: CalibrationSettings | None = None,
-    on_progress: Callable[[int], object] | None = None,
+    on_progress: Callable[[int], object] = lambda done: None,
 ) -> list[Calibrated]:
     """Return a calibration of each group of pairs, for instance of each driver.
 
@@ -198,15 +196,13 @@ def calibrate_each(
     settings = settings or CalibrationSettings()
     if len(own) == 1:
         found = _one_parameter(groups, typical, own[0], settings)
-        if on_progress is not None:
-            on_progress(len(found))
+        on_progress(len(found))
         return found
     fixed = {name: (getattr(typical, name),) * 2 for name in SEARCHED if name not in own}
     found: list[Calibrated] = []
     for number, pairs in enumerate(groups, 1):
         found.append(calibrate(pairs, replace(settings, **fixed)))
-        if on_progress is not None:
-            on_progress(number)
+        on_progress(number)
     return found
 
 
@@ -271,7 +267,7 @@ def _by_group(squares: Floats, stretches: Stretches, group: NDArray[np.int64], e
     """Return the error of each group from the mean squared errors of its stretches, as settings say."""
     if every == "trajectory":
         return np.bincount(group, np.sqrt(squares)) / np.bincount(group)
-    moments = stretches.present[1:].sum(0)
+    moments = stretches.moments
     return np.sqrt(np.bincount(group, squares * moments) / np.bincount(group, moments))
 
 

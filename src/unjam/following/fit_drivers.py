@@ -25,6 +25,7 @@ from unjam.parameters import STRICT, Count, CountOrNone, build, nested
 from unjam.physics.idm import IDMParameters
 from unjam.scenarios.population import Population
 
+OnProgress = Callable[[int, int], object]
 VALIDATION_SHARE = 0.2
 """share of the drivers who decide whether a residual is better than none"""
 FEWEST = 5
@@ -90,7 +91,7 @@ def fit_from_files(
     driver: tuple[str, ...] = (),
     only: dict[str, str] | None = None,
     out: Path | None = None,
-    on_progress: Callable[[int, int], None] | None = None,
+    on_progress: OnProgress = lambda done, drivers: None,
 ) -> FittedDrivers:
     """Return the population of the drivers in files.
 
@@ -138,7 +139,7 @@ def fit_from_files(
 def fit_drivers(
     pairs: Sequence[Pair],
     settings: FitDriversSettings | None = None,
-    on_progress: Callable[[int, int], None] | None = None,
+    on_progress: OnProgress = lambda done, drivers: None,
 ) -> Population:
     """Return the population of all drivers in `pairs`.
 
@@ -179,18 +180,13 @@ def _levels(
     pairs: Sequence[Pair],
     names: Sequence[str],
     settings: FitDriversSettings,
-    on_progress: Callable[[int, int], None] | None,
+    on_progress: OnProgress,
 ) -> tuple[IDMParameters, dict[str, Calibrated]]:
     """Return what drivers have in common, and each driver's own, each calibrated given the other in turn.
 
     One IDM for people who keep different distances is too soft: it must not react to gaps that are just the
     driver's own. So what is common is calibrated with everybody's own headway.
     """
-
-    def counted(done: int) -> None:
-        if on_progress is not None:
-            on_progress(done, len(names))
-
     groups = [[pair for pair in pairs if pair.driver == name] for name in names]
     shared = replace(settings.calibration, kept_headway=(0.0, 1.0))
     typical, found = calibrate(pairs, shared).parameters, {}
@@ -198,7 +194,9 @@ def _levels(
         if turn:
             own = [found[pair.driver].parameters.time_headway / typical.time_headway for pair in pairs]
             typical = calibrate(pairs, settings.calibration, own).parameters
-        each = calibrate_each(groups, typical, settings.own, settings.calibration, counted)
+        each = calibrate_each(
+            groups, typical, settings.own, settings.calibration, lambda done: on_progress(done, len(names))
+        )
         found = dict(zip(names, each, strict=True))
     return typical, found
 

@@ -217,9 +217,8 @@ def _header(path: Path) -> tuple[int, dict[Hashable, str]]:
     with open(path, encoding="utf-8-sig") as file:
         lines = [file.readline().strip() for _ in range(20)]
     first = lines[0].split(",")
-    if len(first) == len(RECONSTRUCTED_ORDER) and all(
-        re.fullmatch(r"\s*-?[\d.eE+-]+", cell) for cell in first
-    ):
+    numbers = all(re.fullmatch(r"\s*-?[\d.eE+-]+", cell) for cell in first)
+    if numbers and len(first) == len(RECONSTRUCTED_ORDER):
         return -1, {}
     for number, line in enumerate(lines):
         if re.match(r"time\s*,\s*speed1\b", line, re.IGNORECASE):

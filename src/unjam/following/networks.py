@@ -7,6 +7,7 @@ behind a recorded leader.
 
 import itertools
 from collections.abc import Sequence
+from copy import deepcopy
 from dataclasses import dataclass, field
 from typing import Annotated
 
@@ -29,7 +30,7 @@ from unjam.following.open_loop import (
     personal_idm,
     with_residual,
 )
-from unjam.following.pairs import Floats, Moments, Pair, Stretches, moments_of, stretches_of
+from unjam.following.pairs import DRIVEN, Floats, Moments, Pair, Stretches, moments_of, stretches_of
 from unjam.parameters import STRICT, Count, NotNegative, Positive
 from unjam.physics.idm import IDMParameters, IDMRows, parameter_rows
 from unjam.scenarios.population import RESIDUAL_INPUTS, residual_inputs
@@ -128,10 +129,6 @@ class FollowingNetwork(nn.Module):
         layers[-1] = (weight / self.authority, bias / self.authority)
         return Network(tuple(layers), self.authority)
 
-    def weights(self) -> dict[str, Tensor]:
-        """Return a copy of all that it has learned, to be loaded again."""
-        return {name: value.clone() for name, value in self.state_dict().items()}
-
 
 def _tensor(values: Floats) -> Tensor:
     return torch.as_tensor(np.ascontiguousarray(values), dtype=torch.float32)
@@ -182,7 +179,7 @@ def fit_one_step(
     )
     optimizer = torch.optim.Adam(network.parameters(), lr=settings.rate, fused=True)
     generator = torch.Generator().manual_seed(seed)
-    losses, best, waited, kept = Losses(), float("inf"), 0, network.weights()
+    losses, best, waited, kept = Losses(), float("inf"), 0, deepcopy(network.state_dict())
     while len(losses.training) < settings.epochs and waited < settings.patience:
         total = torch.zeros(())
         for batch in torch.randperm(len(wanted), generator=generator).split(settings.batch):
@@ -197,9 +194,9 @@ def fit_one_step(
         losses.validation.append(found)
         if not np.isfinite([losses.training[-1], found]).all():
             raise UnjamError(f"following network: the loss of pass {len(losses.training)} is not finite")
-        waited = waited + 1 if found >= best else 0
+        waited += 1
         if found < best:
-            best, kept = found, network.weights()
+            best, waited, kept = found, 0, deepcopy(network.state_dict())
     network.load_state_dict(kept)
     return network, losses
 
@@ -260,7 +257,7 @@ def fit_multi_step(
     optimizer = torch.optim.Adam(network.parameters(), lr=settings.rate)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, settings.steps)
     generator = np.random.default_rng(seed)
-    found, kept = [gap_error()], network.weights()
+    found, kept = [gap_error()], deepcopy(network.state_dict())
     for step in range(1, settings.steps + 1):
         part = stretches.some(generator.choice(stretches.gap.shape[1], settings.batch))
         loss = _loss(network, known.model(part.owner, limits, tensors=True), limits, part, settings)
@@ -274,7 +271,7 @@ def fit_multi_step(
         if step % settings.validate_every == 0:
             found.append(gap_error())
             if found[-1] <= min(found):
-                kept = network.weights()
+                kept = deepcopy(network.state_dict())
     network.load_state_dict(kept)
     return MultiStepFit(network, found)
 
@@ -283,8 +280,7 @@ def _loss(
     network: FollowingNetwork, base: Model, limits: Limits, real: Stretches, settings: MultiStepSettings
 ) -> Tensor:
     """Return the loss of driving behind the leaders of some stretches."""
-    recorded = (real.speed, real.leader_speed, real.gap, real.leader_path)
-    speeds, leader_speeds, gaps, paths = map(_tensor, recorded)
+    speeds, leader_speeds, gaps, paths = (_tensor(getattr(real, name)) for name in DRIVEN)
     present = torch.as_tensor(real.present)[1:]
     residuals: list[Tensor] = []
 

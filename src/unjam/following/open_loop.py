@@ -138,14 +138,9 @@ class DrivenBehind:
 
 def open_loop(model: Model, stretches: Stretches) -> DrivenBehind:
     """Drive behind the leader of each stretch from its first moment on, and compare with the follower."""
-    follow = model(stretches.speed[0], stretches.gap[0])
-    speeds, gaps = [stretches.speed[0]], [stretches.gap[0]]
-    leader = (stretches.leader_speed, stretches.leader_path)
-    for speed, gap in drive_behind(follow, (speeds[0], gaps[0]), leader, stretches.step):
-        speeds.append(speed)
-        gaps.append(gap)
-    speed, gap, present = np.stack(speeds), np.stack(gaps), stretches.present
-    moments = present[1:].sum(0)
+    start, present, moments = stretches.start, stretches.present, stretches.moments
+    driven = drive_behind(model(*start), start, stretches.leader, stretches.step)
+    speed, gap = map(np.stack, zip(start, *driven, strict=True))
     return DrivenBehind(
         speed,
         gap,
@@ -158,7 +153,6 @@ def open_loop(model: Model, stretches: Stretches) -> DrivenBehind:
 
 def one_step_error(model: Model, stretches: Stretches) -> Floats:
     """Return the mean squared error of the acceleration until the next moment [(m/s2)2], shape (n,)."""
-    follow = model(stretches.speed[0], stretches.gap[0])
-    predicted = follow(stretches.speed[:-1], stretches.leader_speed[:-1], stretches.gap[:-1])
+    predicted = model(*stretches.start)(stretches.speed[:-1], stretches.leader_speed[:-1], stretches.gap[:-1])
     error = predicted - np.diff(stretches.speed, axis=0) / stretches.step
-    return (np.square(error) * stretches.present[1:]).sum(0) / stretches.present[1:].sum(0)
+    return (np.square(error) * stretches.present[1:]).sum(0) / stretches.moments

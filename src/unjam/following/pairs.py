@@ -119,6 +119,21 @@ class Stretches:
     owner: NDArray[np.int64] = field(repr=False)
     """which pair each stretch is of, shape (n,)"""
 
+    @cached_property
+    def moments(self) -> NDArray[np.int64]:
+        """Moments of each stretch but the first, shape (n,)."""
+        return self.present[1:].sum(0)
+
+    @property
+    def start(self) -> tuple[Floats, Floats]:
+        """Speed and gap at the first moment, shape (n,)."""
+        return self.speed[0], self.gap[0]
+
+    @property
+    def leader(self) -> tuple[Floats, Floats]:
+        """Speeds and paths of the leaders, shape (T, n)."""
+        return self.leader_speed, self.leader_path
+
     def some(self, chosen: NDArray[np.int64]) -> "Stretches":
         """Return the chosen stretches, as long as the longest of them."""
         long = int(self.present[:, chosen].sum(0).max())

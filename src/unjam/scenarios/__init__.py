@@ -1,10 +1,64 @@
 """Where the vehicles drive: roads, traffic, how an episode starts and ends."""
 
+from dataclasses import asdict
+from typing import Any
+
+from unjam.errors import wrong
+from unjam.parameters import build
 from unjam.scenarios.figure_eight import FigureEight
 from unjam.scenarios.merge import Merge
-from unjam.scenarios.registry import SCENARIOS, make_scenario
+from unjam.scenarios.own_network import OwnNetwork, own_network
+from unjam.scenarios.population import read_population
 from unjam.scenarios.ring import Ring
 from unjam.scenarios.road import Road
 from unjam.scenarios.scenario import Scenario
 
 __all__ = ["SCENARIOS", "FigureEight", "Merge", "Ring", "Road", "Scenario", "make_scenario"]
+
+SCENARIOS: dict[str, Scenario] = {
+    "ring": Ring(),
+    "ring-warm": Ring(warmup=750),
+    "ring-jammed": Ring(warmup=6000),
+    "figure-eight": FigureEight(),
+    "figure-eight-30": FigureEight(radius=(30, 30)),
+    "merge": Merge(),
+}
+
+KINDS = {kind.title: kind for kind in (Ring, FigureEight, Merge, OwnNetwork)}
+"""All kinds of road, by their title."""
+
+
+def make_scenario(name: str, changes: dict[str, Any] | None = None) -> Scenario:
+    """Return the scenario `name`, or that of a .sumocfg file, with `changes` to its parameters.
+
+    Raises:
+        InputError: unknown scenario or parameter, or a value out of range.
+    """
+    if name.endswith(".sumocfg"):
+        return own_network(name, changes or {})
+    if name not in SCENARIOS:
+        raise wrong("scenario", name, ", ".join([*SCENARIOS, "a .sumocfg file"]))
+    scenario = SCENARIOS[name]
+    if not changes:
+        return scenario
+    if changes.get("population"):
+        changes = {**_of_population(str(changes["population"])), **changes}
+    return build(type(scenario), {**asdict(scenario), **changes}, f"scenario {name}")
+
+
+def _of_population(file: str) -> dict[str, Any]:
+    """Return what else changes with a population: who is typical, and who computes how people drive."""
+    population = read_population(file)
+    commanded = {"people": "commanded"} if population.residual else {}
+    return {"humans": asdict(population.typical), **commanded}
+
+
+def scenario_recipe(scenario: Scenario) -> dict[str, Any]:
+    """Return a scenario as JSON; `scenario_from_recipe` makes it again."""
+    return {"kind": scenario.title, **asdict(scenario)}
+
+
+def scenario_from_recipe(recipe: dict[str, Any]) -> Scenario:
+    """Return the scenario that `scenario_recipe` wrote down."""
+    values = {key: value for key, value in recipe.items() if key != "kind"}
+    return build(KINDS[recipe["kind"]], values, "scenario")

@@ -85,31 +85,27 @@ class Merge(Scenario):
     def draw(self, generator: np.random.Generator) -> MergingRoad:
         """Return the road with all vehicles that may enter; random is which of them are CAVs."""
         chosen = self._chosen(generator)
-        origins: dict[str, Origin] = {}
-        entries: list[Entry] = []
-
-        def enter(entry: Entry, origin: Origin) -> None:
-            origins[entry.name] = origin
-            entries.append(entry)
-
+        entering: list[tuple[Entry, Origin]] = []
         begin = -(BEFORE + JUNCTION_WAYS[HIGHWAY])
         start = begin - ENTRANCE_WAY - INFLOW_EDGE
-        for index, along in enumerate(self._standing_places()):
-            beyond = along - INFLOW_EDGE
-            on_inflow = beyond < 0
-            edge, place = ("inflow_highway", along) if on_inflow else ("highway", beyond)
-            origin = Origin(HIGHWAY, place + (start if on_inflow else begin))
-            enter(Entry(f"human_s{index}", f"from_{edge}", place), origin)
+        for index in range(self.standing):
+            along = index * (INFLOW_EDGE + BEFORE) / max(1, self.standing)
+            past = along - INFLOW_EDGE
+            edge, place, first = ("inflow_highway", along, start) if past < 0 else ("highway", past, begin)
+            entering.append((Entry(f"human_s{index}", f"from_{edge}", place), Origin(HIGHWAY, place + first)))
         for index, time in enumerate(self._times(self.inflow)):
             name = f"{'cav' if index in chosen else 'human'}_{index}"
-            enter(Entry(name, "from_inflow_highway", 0.0, HIGHWAY_SPEED, time), Origin(HIGHWAY, start))
+            entry = Entry(name, "from_inflow_highway", 0.0, HIGHWAY_SPEED, time)
+            entering.append((entry, Origin(HIGHWAY, start)))
         start = -(INFLOW_EDGE + ENTRANCE_WAY + RAMP + JUNCTION_WAYS[ON_RAMP])
         for index, time in enumerate(self._times(self.ramp_flow)):
-            enter(Entry(f"human_r{index}", "from_inflow_ramp", 0.0, RAMP_SPEED, time), Origin(ON_RAMP, start))
+            entry = Entry(f"human_r{index}", "from_inflow_ramp", 0.0, RAMP_SPEED, time)
+            entering.append((entry, Origin(ON_RAMP, start)))
+        origins = {entry.name: origin for entry, origin in entering}
         return MergingRoad(
             network=Network(_NODES, _EDGES, self.top_speed),
             routes=_ROUTES,
-            entries=tuple(sorted(entries, key=lambda entry: entry.time)),
+            entries=tuple(sorted((entry for entry, _ in entering), key=lambda entry: entry.time)),
             limit_speed=self.limit(),
             origins=origins,
             cav_ids=frozenset(name for name in origins if name.startswith("cav")),
@@ -138,23 +134,10 @@ class Merge(Scenario):
             return set(every.astype(int).tolist())
         return set(np.flatnonzero(generator.random(count) < self.penetration).tolist())
 
-    def _standing_places(self) -> list[float]:
-        """Return where people stand at the start, along the highway [m]."""
-        return [index * (INFLOW_EDGE + BEFORE) / max(1, self.standing) for index in range(self.standing)]
-
     def limit(self) -> float:
         """Return the mean speed of the highway's people where no ramp, no noise and no jam disturbs them."""
         length = INFLOW_EDGE + ENTRANCE_WAY + BEFORE + JUNCTION_WAYS[HIGHWAY] + AFTER
         return _undisturbed_speed(self.inflow, length, self.humans, self.simulation_step)
-
-    @property
-    def drawn_ranges(self) -> dict[str, tuple[float, float]]:
-        """Nothing: all that is random is which vehicles are CAVs."""
-        return {}
-
-    def part(self, index: int, count: int) -> "Merge":
-        """Return the merge itself."""
-        return self
 
     def possible_cavs(self) -> tuple[str, ...]:
         """Return the ids that any of the highway's vehicles has as a CAV."""

@@ -84,15 +84,6 @@ class OwnNetwork(Scenario):
         """How people drive."""
         return "as the vehicle types of its files say"
 
-    @property
-    def drawn_ranges(self) -> dict[str, tuple[float, float]]:
-        """Nothing that a critic could see."""
-        return {}
-
-    def part(self, index: int, count: int) -> "OwnNetwork":
-        """Return the network itself."""
-        return self
-
     def possible_cavs(self) -> tuple[str, ...]:
         """Return nothing: which vehicles there will be is known to SUMO alone."""
         raise InputError(

@@ -67,11 +67,10 @@ class Population:
         found = {}
         for name in PARAMETER_NAMES:
             values = np.array([getattr(one, name) for one in self.drivers])
-            low, median, high = np.quantile(values, [0.25, 0.5, 0.75])
             found[name] = {
                 "mean": float(values.mean()),
                 "std": float(values.std()),
-                "quartiles": [float(low), float(median), float(high)],
+                "quartiles": np.quantile(values, [0.25, 0.5, 0.75]).tolist(),
             }
         return found
 

@@ -1,34 +1,153 @@
-"""The ring road: one lane, closed, and too full for people to drive without waves."""
+"""Closed roads with one lane, and the simplest of them: the ring, too full to be driven without waves."""
 
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import Annotated, ClassVar
+from typing import Annotated, ClassVar, NamedTuple, Self
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field, model_validator
 from pydantic.dataclasses import dataclass
 
 from unjam.parameters import STRICT, Count
 from unjam.physics.idm import equilibrium_speed
-from unjam.scenarios.road import (
-    ClosedRoad,
-    Edge,
-    Network,
-    Node,
-    Place,
-    cavs_among,
-    check_counts,
-    loop_entries,
-    part_of_range,
-    vehicle_names,
-    words_of_range,
-)
+from unjam.scenarios.road import ClosedRoad, Edge, Entry, Network, Node, Route, as_line
 from unjam.scenarios.scenario import VEHICLE_LENGTH, Scenario
 
 EDGES = 4
+"""of a ring"""
+
+
+class Place(NamedTuple):
+    """Where along a closed road an edge lies."""
+
+    name: str
+    start: float
+    """[m]"""
+    length: float
+    """[m]"""
+
+    @property
+    def end(self) -> float:
+        """Where it ends [m]."""
+        return self.start + self.length
+
+
+class Lap(NamedTuple):
+    """One closed road, and where vehicles stand on it."""
+
+    places: Sequence[Place]
+    """its edges, in driving order"""
+    length: float
+    """[m]"""
+    positions: NDArray[np.float64]
+    """of the vehicles, from the last to the first of the queue [m]"""
+    network: Network
+    outline: NDArray[np.float64]
+    """rows (coordinate along the lap, x, y) [m]"""
+    crossings: tuple[tuple[float, float], ...] = ()
+    """where it crosses itself [m]"""
 
 
 @dataclass(frozen=True, config=STRICT)
-class Ring(Scenario):
+class Loop(Scenario):
+    """What closed roads share: each episode draws their size anew."""
+
+    size: ClassVar[str]
+    """the parameter that is drawn, uniformly among the integers of its range [m]"""
+    about: ClassVar[str]
+    """in words, with braces for the sizes"""
+    about_limit: ClassVar[str]
+    """what its limit is, in words"""
+    first_in_front: ClassVar[bool] = False
+    """whether vehicle 0 leads the queue, and does not end it"""
+
+    vehicles: Annotated[int, Field(ge=2)] = 22
+    """on the road, CAVs among them"""
+    cavs: Count = 1
+    """vehicles that are CAVs, evenly spread"""
+
+    @model_validator(mode="after")
+    def _counts_fit(self) -> "Loop":
+        low, high = self._sizes
+        if high < low:
+            raise ValueError(f"{self.size}: {high} m is not allowed as the largest; allowed: >= {low} m")
+        if self.cavs > self.vehicles:
+            raise ValueError(f"cavs: {self.cavs} is not allowed; allowed: <= vehicles, {self.vehicles}")
+        return self
+
+    def lap(self, size: float) -> Lap:
+        """Return the road of a size [m]."""
+        raise NotImplementedError
+
+    def limit(self, size: float) -> float:
+        """Return the speed that the traffic cannot exceed in the long run on a road of a size [m/s]."""
+        raise NotImplementedError
+
+    def draw(self, generator: np.random.Generator) -> ClosedRoad:
+        """Return a road of random size with its vehicles."""
+        size = float(generator.integers(*self._sizes, endpoint=True))
+        lap, ids = self.lap(size), self._vehicle_ids()
+        routes, entries = _entries(lap, ids, self.seconds * self.top_speed)
+        return ClosedRoad(
+            network=lap.network,
+            routes=routes,
+            entries=entries,
+            vehicle_ids=ids,
+            cav_ids=self.possible_cavs(),
+            start_positions=lap.positions,
+            loop_length=lap.length,
+            crossings=lap.crossings,
+            limit_speed=self.limit(size),
+            outline=lap.outline,
+            drawn={self.size: size},
+            people=self.draw_people(ids, generator),
+        )
+
+    @property
+    def drawn_ranges(self) -> dict[str, tuple[float, float]]:
+        """The size."""
+        return {self.size: self._sizes}
+
+    def part(self, index: int, count: int) -> Self:
+        """Return this road with one of `count` equal parts of its sizes, both ends included."""
+        low, high = self._sizes
+        borders = np.linspace(low, high + 1, count + 1).astype(int)
+        first, last = int(borders[index]), int(borders[index + 1]) - 1
+        return replace(self, **{self.size: (first, max(first, last))})
+
+    def possible_cavs(self) -> tuple[str, ...]:
+        """Return the ids of the CAVs, in the order in which they stand along the road."""
+        return tuple(name for name in self._vehicle_ids() if name.startswith("cav"))
+
+    def facts(self) -> list[tuple[str, str]]:
+        """Return the road's own facts for `unjam scenarios`."""
+        ends = dict.fromkeys(self._sizes)
+        return [
+            ("road", self.about.format("-".join(map(str, ends)))),
+            ("vehicles", f"{self.vehicles} ({self.cavs} CAV)"),
+            ("limit", "-".join(f"{self.limit(size):.2f}" for size in ends) + " m/s"),
+            ("limit is", self.about_limit),
+        ]
+
+    @property
+    def _sizes(self) -> tuple[int, int]:
+        return getattr(self, self.size)
+
+    @property
+    def _needed(self) -> float:
+        """Road that the vehicles need at least [m]."""
+        return self.vehicles * (VEHICLE_LENGTH + self.humans.minimum_gap)
+
+    def _vehicle_ids(self) -> tuple[str, ...]:
+        """Return all ids in the order along the road; CAVs are evenly spread, vehicle 0 is one of them."""
+        chosen = {round(index * self.vehicles / self.cavs) for index in range(self.cavs)}
+        ids = [f"{'cav' if index in chosen else 'human'}_{index}" for index in range(self.vehicles)]
+        return tuple(reversed(ids) if self.first_in_front else ids)
+
+
+@dataclass(frozen=True, config=STRICT)
+class Ring(Loop):
     """Vehicles on a circle, evenly spaced and standing at the start; the length is new in each episode.
 
     The paper's ring has 22 vehicles, one of them a CAV, on 220 to 270 m. At that density the IDM's own
@@ -37,97 +156,67 @@ class Ring(Scenario):
 
     title: ClassVar[str] = "ring"
     reward: ClassVar[str] = "released"
+    size: ClassVar[str] = "length"
+    about: ClassVar[str] = "ring of {} m"
+    about_limit: ClassVar[str] = (
+        "the IDM's equilibrium speed, at which all vehicles could drive alike for ever"
+    )
 
     length: tuple[Annotated[int, Field(ge=10)], Annotated[int, Field(ge=10)]] = (220, 270)
     """shortest and longest ring, drawn uniformly among the integers between them [m]"""
-    vehicles: Annotated[int, Field(ge=2)] = 22
-    """on the ring, CAVs among them"""
-    cavs: Count = 1
-    """vehicles that are CAVs, evenly spread"""
 
     @model_validator(mode="after")
     def _fits(self) -> "Ring":
-        check_counts("length", self.length, self.vehicles, self.cavs)
         shortest = self.length[0]
-        needed = self.vehicles * (VEHICLE_LENGTH + self.humans.minimum_gap)
-        if shortest < needed:
+        if shortest < self._needed:
             raise ValueError(
-                f"length: {shortest} m is not allowed for {self.vehicles} vehicles; allowed: >= {needed:g} m"
+                f"length: {shortest} m is not allowed for {self.vehicles} vehicles; "
+                f"allowed: >= {self._needed:g} m"
             )
         return self
 
-    def draw(self, generator: np.random.Generator) -> ClosedRoad:
-        """Return a ring of random length with its vehicles."""
-        length = float(generator.integers(self.length[0], self.length[1], endpoint=True))
-        ids = vehicle_names(self.vehicles, self.cavs)
-        positions = np.arange(self.vehicles, dtype=np.float64) * (length / self.vehicles)
-        people = self.draw_people(ids, generator)
-        each = length / EDGES
-        places = [Place(f"edge_{index}", index * each, each) for index in range(EDGES)]
-        routes, entries = loop_entries(places, ids, positions, self.seconds, self.top_speed)
-        return ClosedRoad(
-            network=_network(length, self.top_speed),
-            routes=routes,
-            entries=entries,
-            vehicle_ids=ids,
-            cav_ids=cavs_among(ids),
-            start_positions=positions,
-            loop_length=length,
-            crossings=(),
-            limit_speed=equilibrium_speed(length / self.vehicles - VEHICLE_LENGTH, self.humans),
-            outline=_outline(length),
-            drawn={"length": length},
-            people=people,
+    def lap(self, size: float) -> Lap:
+        """Return the circle of a length [m], of equal edges."""
+        each = size / EDGES
+        coordinates = np.linspace(0, size, 161)
+        return Lap(
+            places=[Place(f"edge_{index}", index * each, each) for index in range(EDGES)],
+            length=size,
+            positions=np.arange(self.vehicles, dtype=np.float64) * (size / self.vehicles),
+            network=_circle(size, self.top_speed),
+            outline=np.column_stack([coordinates, _on_circle(2 * np.pi * coordinates / size, size)]),
         )
 
-    @property
-    def drawn_ranges(self) -> dict[str, tuple[float, float]]:
-        """The ring's length."""
-        return {"length": self.length}
-
-    def part(self, index: int, count: int) -> "Ring":
-        """Return this ring with one of `count` equal parts of its lengths."""
-        return replace(self, length=part_of_range(self.length, index, count))
-
-    def possible_cavs(self) -> tuple[str, ...]:
-        """Return the ids of the CAVs."""
-        return cavs_among(vehicle_names(self.vehicles, self.cavs))
-
-    def facts(self) -> list[tuple[str, str]]:
-        """Return the ring's own facts for `unjam scenarios`."""
-        return [
-            ("road", f"ring of {words_of_range(self.length)} m"),
-            ("vehicles", f"{self.vehicles} ({self.cavs} CAV)"),
-            ("limit", f"{self._limits()} m/s"),
-            ("limit is", "the IDM's equilibrium speed, at which all vehicles could drive alike for ever"),
-        ]
-
-    def _limits(self) -> str:
-        speeds = [
-            f"{equilibrium_speed(length / self.vehicles - VEHICLE_LENGTH, self.humans):.2f}"
-            for length in dict.fromkeys(self.length)
-        ]
-        return "-".join(speeds)
+    def limit(self, size: float) -> float:
+        """Return the IDM's equilibrium speed on a ring of this length [m/s]."""
+        return equilibrium_speed(size / self.vehicles - VEHICLE_LENGTH, self.humans)
 
 
-def _on_circle(angles: np.ndarray, length: float) -> np.ndarray:
+def _entries(lap: Lap, ids: Sequence[str], way: float) -> tuple[tuple[Route, ...], tuple[Entry, ...]]:
+    """Return routes from each edge on, at least `way` [m] long, and the vehicles that stand there."""
+    places = lap.places
+    laps = int(way / sum(place.length for place in places)) + 2
+    names = [place.name for place in places]
+    routes = [
+        Route(f"from_{name}", (*names[first:], *names[:first]), laps) for first, name in enumerate(names)
+    ]
+    entries = []
+    for name, position in zip(ids, lap.positions.tolist(), strict=True):
+        edge = max((place for place in places if place.start <= position), key=lambda place: place.start)
+        entries.append(Entry(name, f"from_{edge.name}", min(position - edge.start, edge.length)))
+    return tuple(routes), tuple(entries)
+
+
+def _on_circle(angles: NDArray[np.float64], length: float) -> NDArray[np.float64]:
     return length / (2 * np.pi) * np.column_stack([np.cos(angles), np.sin(angles)])
 
 
-def _network(length: float, speed: float) -> Network:
-    """Return a circle of equal edges."""
+def _circle(length: float, speed: float) -> Network:
     corners = _on_circle(2 * np.pi * np.arange(EDGES) / EDGES, length)
     nodes = tuple(Node(f"node_{index}", x, y, priority=True) for index, (x, y) in enumerate(corners.tolist()))
     edges = []
     for index in range(EDGES):
         line = _on_circle(2 * np.pi * (index + np.linspace(0, 1, 41)) / EDGES, length)
         begin, end = nodes[index].name, nodes[(index + 1) % EDGES].name
-        edges.append(
-            Edge(f"edge_{index}", begin, end, length / EDGES, shape=tuple(map(tuple, line.tolist())))
-        )
+        edges.append(Edge(f"edge_{index}", begin, end, length / EDGES, shape=as_line(line)))
     return Network(nodes, tuple(edges), speed, links=False)
-
-
-def _outline(length: float) -> np.ndarray:
-    coordinates = np.linspace(0, length, 161)
-    return np.column_stack([coordinates, _on_circle(2 * np.pi * coordinates / length, length)])

@@ -1,6 +1,5 @@
 """One episode's road and traffic, as a scenario draws it: geometry, vehicles, demand."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -9,6 +8,14 @@ from numpy.typing import NDArray
 
 from unjam.physics.idm import IDMParameters
 from unjam.sumo_files import SumoFiles
+
+Line = tuple[tuple[float, float], ...]
+"""points (x, y) [m]"""
+
+
+def as_line(points: NDArray[np.float64]) -> Line:
+    """Return points of shape (n, 2) as a line."""
+    return tuple((x, y) for x, y in points.tolist())
 
 
 class Node(NamedTuple):
@@ -35,8 +42,8 @@ class Edge(NamedTuple):
     """[m]"""
     priority: int | None = None
     """larger goes first where edges meet"""
-    shape: tuple[tuple[float, float], ...] = ()
-    """points of its line (x, y) [m]; empty: straight"""
+    shape: Line = ()
+    """empty: straight"""
 
 
 @dataclass(frozen=True)
@@ -151,65 +158,3 @@ class OwnRoad(Road):
     """vehicle types that the share may pick"""
     cav_seed: int
     """which vehicles the share picks"""
-
-
-class Place(NamedTuple):
-    """Where along a closed road an edge lies."""
-
-    name: str
-    start: float
-    """[m]"""
-    length: float
-    """[m]"""
-
-
-def vehicle_names(vehicles: int, cavs: int) -> tuple[str, ...]:
-    """Return the ids of all vehicles in road order; CAVs are evenly spread, the first is one of them."""
-    chosen = {round(index * vehicles / cavs) for index in range(cavs)}
-    return tuple(f"{'cav' if index in chosen else 'human'}_{index}" for index in range(vehicles))
-
-
-def cavs_among(ids: Sequence[str]) -> tuple[str, ...]:
-    """Return the ids of the CAVs."""
-    return tuple(name for name in ids if name.startswith("cav"))
-
-
-def check_counts(name: str, drawn: tuple[int, int], vehicles: int, cavs: int) -> None:
-    """Raise `ValueError` where a range is the wrong way round, or there are more CAVs than vehicles."""
-    low, high = drawn
-    if high < low:
-        raise ValueError(f"{name}: {high} m is not allowed as the largest; allowed: >= {low} m")
-    if cavs > vehicles:
-        raise ValueError(f"cavs: {cavs} is not allowed; allowed: <= vehicles, {vehicles}")
-
-
-def part_of_range(whole: tuple[int, int], index: int, count: int) -> tuple[int, int]:
-    """Return one of `count` equal parts of a range of integers, both ends included."""
-    low, high = whole
-    borders = np.linspace(low, high + 1, count + 1).astype(int)
-    first, last = int(borders[index]), int(borders[index + 1]) - 1
-    return first, max(first, last)
-
-
-def words_of_range(whole: tuple[int, int]) -> str:
-    """Return `220-270`, or `230` where both ends are the same."""
-    return "-".join(str(end) for end in dict.fromkeys(whole))
-
-
-def loop_entries(
-    places: Sequence[Place], ids: Sequence[str], positions: NDArray[np.float64], seconds: float, speed: float
-) -> tuple[tuple[Route, ...], tuple[Entry, ...]]:
-    """Return routes and vehicles that stand at `positions` along a closed road.
-
-    Routes are as long as anybody can drive in `seconds` at `speed` [m/s].
-    """
-    laps = int(seconds * speed / sum(place.length for place in places)) + 2
-    routes = [
-        Route(f"from_{place.name}", tuple(other.name for other in (*places[first:], *places[:first])), laps)
-        for first, place in enumerate(places)
-    ]
-    entries = []
-    for name, position in zip(ids, positions, strict=True):
-        edge = max((place for place in places if place.start <= position), key=lambda place: place.start)
-        entries.append(Entry(name, f"from_{edge.name}", min(float(position) - edge.start, edge.length)))
-    return tuple(routes), tuple(entries)

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import field
 from functools import cached_property
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Field
@@ -141,16 +141,16 @@ class Scenario:
 
     @property
     def drawn_ranges(self) -> dict[str, tuple[float, float]]:
-        """What each episode draws anew, and from which range."""
-        raise NotImplementedError
+        """What each episode draws anew that a critic could see, and from which range."""
+        return {}
 
-    def part(self, index: int, count: int) -> "Scenario":
+    def part(self, index: int, count: int) -> Self:
         """Return this scenario with what it draws narrowed to one of `count` equal parts of the range.
 
         Episodes of all parts cover the range evenly: with few episodes, whether a ring is long or short
         otherwise hides what the driver does.
         """
-        raise NotImplementedError
+        return self
 
     def possible_cavs(self) -> tuple[str, ...]:
         """Return the ids of all CAVs that an episode may have."""

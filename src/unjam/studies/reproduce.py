@@ -12,7 +12,7 @@ from unjam.errors import InputError, wrong_name
 from unjam.files import make_folder, to_json, write_whole
 from unjam.manifest import manifest
 from unjam.reports.results import EVALUATION_FILE
-from unjam.scenarios.registry import SCENARIOS
+from unjam.scenarios import SCENARIOS
 from unjam.studies import STUDIES, TOGETHER
 from unjam.studies.study import REFERENCES, ROADS, OnProgress, PlannedRun, Study, StudyFolder
 from unjam.training.config import load_config

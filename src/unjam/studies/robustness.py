@@ -23,7 +23,7 @@ from unjam.measures.metrics import measure, wave_speed
 from unjam.measures.statistics import paired_difference
 from unjam.reports.figures import png_bytes, space_time
 from unjam.reports.results import read_results
-from unjam.scenarios.registry import make_scenario
+from unjam.scenarios import make_scenario
 from unjam.studies.comparison import HONEST, entries, estimates, interval, number, table_rows, write_table
 from unjam.studies.study import REFERENCES, ROADS, OnProgress, PlannedRun, Study, StudyFolder, Table, planned
 from unjam.training.config import load_config

@@ -15,7 +15,7 @@ from unjam.drivers.observation import observed
 from unjam.errors import InputError
 from unjam.learners.settings import Agents, PolicySettings
 from unjam.parameters import STRICT, Count, CountOrNone, Positive, build, merge, nested
-from unjam.scenarios.registry import make_scenario
+from unjam.scenarios import make_scenario
 from unjam.scenarios.scenario import Scenario
 from unjam.training.presets import preset_values
 from unjam.virtual.settings import VirtualSettings

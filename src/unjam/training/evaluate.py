@@ -23,7 +23,7 @@ from unjam.measures.metrics import METRICS, measure
 from unjam.measures.statistics import Estimate, summarise
 from unjam.reports.html import write_report
 from unjam.reports.results import PICTURED
-from unjam.scenarios.registry import make_scenario
+from unjam.scenarios import make_scenario
 from unjam.scenarios.scenario import Scenario
 from unjam.training.config import RunConfig
 from unjam.training.executors import error_named

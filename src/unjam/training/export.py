@@ -17,7 +17,7 @@ from unjam.files import check_folder, write_whole
 from unjam.measures.metrics import measure
 from unjam.measures.statistics import summarise
 from unjam.reports.results import EVALUATION_FILE, rows_by_driver
-from unjam.scenarios.registry import make_scenario
+from unjam.scenarios import make_scenario
 from unjam.scenarios.scenario import Scenario
 from unjam.training.evaluate import TRAINED, held_out_seeds, raise_failure
 from unjam.training.folder import origin, read_config

@@ -19,7 +19,7 @@ from unjam.drivers.observation import feature, observation_size
 from unjam.errors import InputError
 from unjam.files import make_folder, to_json, write_whole
 from unjam.manifest import manifest, package_versions
-from unjam.scenarios.registry import scenario_recipe
+from unjam.scenarios import scenario_recipe
 from unjam.scenarios.scenario import Scenario
 from unjam.training.config import RunConfig, load_config, to_toml
 from unjam.worlds.reward import make_reward

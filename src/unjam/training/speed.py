@@ -21,7 +21,7 @@ from unjam.drivers.network import Network
 from unjam.drivers.pi_saturation import PISaturation
 from unjam.drivers.residual import ResidualDriver
 from unjam.learners.settings import PolicySettings
-from unjam.scenarios.registry import SCENARIOS
+from unjam.scenarios import SCENARIOS
 from unjam.scenarios.ring import Ring
 from unjam.scenarios.scenario import Scenario
 from unjam.training.executors import OnLine

@@ -19,8 +19,8 @@ from safetensors.numpy import load, save
 
 from unjam.drivers.registry import driver_from_recipe
 from unjam.errors import DISK_ERRNOS, UnjamError, disk_error
+from unjam.scenarios import scenario_from_recipe
 from unjam.scenarios.own_network import OwnNetwork
-from unjam.scenarios.registry import scenario_from_recipe
 from unjam.tree import Arrays, pack
 from unjam.worlds.episode import run_episode
 from unjam.worlds.record import failed_episode

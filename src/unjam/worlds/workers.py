@@ -14,7 +14,7 @@ from typing import Any, Self, TypeVar
 from unjam.drivers.driver import Driver
 from unjam.drivers.registry import recipe_of
 from unjam.errors import EpisodeError
-from unjam.scenarios.registry import scenario_recipe
+from unjam.scenarios import scenario_recipe
 from unjam.scenarios.scenario import Scenario
 from unjam.tree import Arrays, unpack
 from unjam.worlds.record import Episode, failed_episode

@@ -6,8 +6,8 @@ import pytest
 from unjam.drivers.car_following import Human
 from unjam.drivers.network import Network
 from unjam.physics.idm import PAPER_IDM, IDMParameters, idm_acceleration
+from unjam.scenarios import make_scenario
 from unjam.scenarios.population import Population, as_calibrated, write_population
-from unjam.scenarios.registry import make_scenario
 from unjam.worlds.episode import run_episode
 
 DRIVERS = (

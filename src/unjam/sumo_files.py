@@ -1,11 +1,13 @@
-"""Reads the user's own SUMO files: a program of its own, so that no file can harm who asks.
+"""What the user's own SUMO files say, read before SUMO starts: SUMO crashes on some that are broken.
 
-Started by `unjam.sumo_files` with limits on memory and time; answers one JSON document. It uses
-Python's own library alone, and starts in a twentieth of a second.
+Such files may come from anywhere. So that none can harm who asks, this file is also the program that reads
+them, in a process of its own with limits on memory and time, which answers one JSON document. As a program it
+uses Python's own library alone, and starts in a twentieth of a second.
 """
 
 import gzip
 import json
+import subprocess
 import sys
 import zlib
 from collections.abc import Callable, Iterator
@@ -18,11 +20,7 @@ from xml.parsers import expat
 
 DEFAULT_TYPE = "DEFAULT_VEHTYPE"
 """SUMO's type of vehicles that name none"""
-OTHER_DEFAULT_TYPES = {
-    "DEFAULT_BIKETYPE": "bicycle",
-    "DEFAULT_TAXITYPE": "taxi",
-    "DEFAULT_RAILTYPE": "rail",
-}
+OTHER_DEFAULT_TYPES = {"DEFAULT_BIKETYPE": "bicycle", "DEFAULT_TAXITYPE": "taxi", "DEFAULT_RAILTYPE": "rail"}
 """vehicle classes of SUMO's other types that no file need define"""
 DEMAND = ("vehicle", "trip", "flow")
 UNITS = (1.0, 60.0, 3600.0, 86400.0)
@@ -32,11 +30,97 @@ CHUNK = 65_536
 SYNONYMS = {"net": "net-file", "routes": "route-files", "additional": "additional-files"}
 
 
+LARGEST_MEMORY = 4 * 2**30
+"""bytes that reading may take"""
+LONGEST_TIME = 120
+"""seconds that reading may take"""
+
+Lane = tuple[str, float, list[tuple[float, float]]]
+"""edge, length [m] and centre line [(x, y), m]"""
+
+
+class SumoFiles(NamedTuple):
+    """A .sumocfg file and what the files that it names hold."""
+
+    path: Path
+    network: Path
+    additional_files: tuple[Path, ...]
+    begin: float
+    """[s]"""
+    end: float | None
+    """[s]; None: when the last vehicle has arrived"""
+    step: float
+    """[s]"""
+    types: dict[str, dict[str, str]]
+    """attributes of all vehicle types, by id"""
+    used_types: frozenset[str]
+    """types that vehicles have"""
+
+
+_known: dict[Path, tuple[dict[Path, tuple[int, int]], SumoFiles]] = {}
+"""what was read already, with the stamps of all files that were read for it"""
+
+
+def read_sumo_files(path: Path) -> SumoFiles:
+    """Return what a .sumocfg file and the files that it names say; read again where one has changed.
+
+    Raises:
+        InputError: one is missing, broken or too large, the network has no version, or there are no
+            vehicles.
+    """
+    if path in _known:
+        stamps, files = _known[path]
+        if all(file.is_file() and _stamp(file) == before for file, before in stamps.items()):
+            return files
+    found = _ask("configuration", path)
+    stamps = {Path(file): (time, size) for file, (time, size) in found.pop("stamps").items()}
+    found["network"] = Path(found["network"])
+    found["additional_files"] = tuple(map(Path, found["additional_files"]))
+    found["used_types"] = frozenset(found["used_types"])
+    files = SumoFiles(path, **found)
+    _known[path] = stamps, files
+    return files
+
+
+def read_lanes(path: Path) -> list[Lane]:
+    """Return all lanes of a network file.
+
+    Raises:
+        InputError: it is broken, or too large.
+    """
+    lanes = _ask("lanes", path)
+    return [(edge, length, [(x, y) for x, y in line]) for edge, length, line in lanes]
+
+
+def _ask(command: Literal["configuration", "lanes"], path: Path) -> Any:
+    """Return what the program answers; raise `InputError` where it says what is wrong, or is lost."""
+    from unjam.errors import InputError  # the program has no packages
+
+    program = [sys.executable, "-I", "-S", __file__, command, str(path)]
+    try:
+        done = subprocess.run(
+            [*program, str(LARGEST_MEMORY), str(LONGEST_TIME)],
+            capture_output=True,
+            timeout=LONGEST_TIME,
+            check=False,
+        )
+        answer = json.loads(done.stdout)
+    except (subprocess.TimeoutExpired, ValueError):
+        limits = f"{LARGEST_MEMORY / 2**30:g} GiB, {LONGEST_TIME:g} s"
+        raise InputError(f"{path.name}: its files cannot be read within {limits}") from None
+    if "broken" in answer:
+        raise InputError(answer["broken"])
+    return answer["found"]
+
+
+# From here on: the program.
+
+
 class Broken(Exception):
     """What is wrong with a file, in one line."""
 
 
-def read_configuration(path: Path) -> dict[str, Any]:
+def _configuration(path: Path) -> dict[str, Any]:
     """Return what a .sumocfg file and the files that it names say, as JSON; the fields of `SumoFiles`.
 
     Raises:
@@ -60,7 +144,7 @@ def read_configuration(path: Path) -> dict[str, Any]:
     for file in files:
         if not file.is_file():
             raise Broken(f"{str(file)!r}: there is no such file")
-    stamps = {str(file): stamp(file) for file in files}
+    stamps = {str(file): _stamp(file) for file in files}
     _check_network(network)
     demand = _Demand({}, {}, set())
     for file in [*additional, *routes]:
@@ -88,19 +172,23 @@ def read_configuration(path: Path) -> dict[str, Any]:
     }
 
 
-def read_lanes(path: Path) -> list[list[str]]:
-    """Return edge, length [m] and centre line of each lane of a network file, as they are written there."""
-    lanes = []
-    for element in _elements(path, "end"):
-        if element.tag == "lane":
-            lane = [element.get(name, "") for name in ("id", "length", "shape")]
-            lanes.append([lane[0].rpartition("_")[0], *lane[1:]])
-        if element.tag == "edge":
-            element.clear()
+def _lanes(path: Path) -> list[Lane]:
+    """Return all lanes of a network file."""
+    lanes: list[Lane] = []
+    try:
+        for element in _elements(path, "end"):
+            if element.tag == "lane":
+                edge, length, shape = (element.get(name, "") for name in ("id", "length", "shape"))
+                line = [tuple(map(float, point.split(",")[:2])) for point in shape.split()]
+                lanes.append((edge.rpartition("_")[0], float(length), [(x, y) for x, y in line]))
+            if element.tag == "edge":
+                element.clear()
+    except ValueError as error:
+        raise Broken(f"{path.name}: cannot be read: {error}") from None
     return lanes
 
 
-def stamp(file: Path) -> tuple[int, int]:
+def _stamp(file: Path) -> tuple[int, int]:
     """Return time of change and size of a file: another content has another stamp."""
     found = file.stat()
     return found.st_mtime_ns, found.st_size
@@ -193,7 +281,7 @@ def _open(path: Path) -> IO[bytes]:
     return gzip.open(path) if path.suffix == ".gz" else path.open("rb")  # type: ignore[return-value]
 
 
-COMMANDS: dict[str, Callable[[Path], Any]] = {"configuration": read_configuration, "lanes": read_lanes}
+COMMANDS: dict[str, Callable[[Path], Any]] = {"configuration": _configuration, "lanes": _lanes}
 
 
 def main(command: str, path: str, memory: str, seconds: str) -> None:
