@@ -46,9 +46,9 @@ def sloped_target(observations: np.ndarray) -> np.ndarray:
 def episode_of(network: Network, seed: tuple[int, ...], hold: int, target: Target) -> Episode:
     """An episode in which a residual is held for `hold` decisions."""
     generator = np.random.default_rng(seed)
-    looks = DECISIONS // hold
-    observations = generator.uniform(-1.0, 1.0, size=(looks + 1, INPUTS))
-    chosen = network.explore(observations[:-1], generator.normal(size=looks))
+    choices = DECISIONS // hold
+    observations = generator.uniform(-1.0, 1.0, size=(choices + 1, INPUTS))
+    chosen = network.explore(observations[:-1], generator.normal(size=choices))
     residual = np.repeat(chosen, hold)
     wanted = np.repeat(target(observations[:-1]), hold)
     nothing = np.zeros(DECISIONS)

@@ -28,15 +28,15 @@ INPUTS = 3
 def make_trajectory(seed: int, decisions: int, hold: int = 1, terminated: bool = False) -> Trajectory:
     """A trajectory of random numbers, its residual held as a driver holds it."""
     generator = np.random.default_rng(seed)
-    looks = -(-decisions // hold)
+    choices = -(-decisions // hold)
     nothing = np.zeros(decisions)
     return Trajectory(
         vehicle="cav_0",
         start=0,
         states=LocalState(*[np.zeros(decisions + 1)] * len(LocalState._fields)),
-        observations=generator.normal(size=(looks + 1, INPUTS)),
+        observations=generator.normal(size=(choices + 1, INPUTS)),
         expert=nothing,
-        residual=np.repeat(generator.normal(size=looks), hold)[:decisions],
+        residual=np.repeat(generator.normal(size=choices), hold)[:decisions],
         applied=nothing,
         shield=nothing,
         terms={"one": generator.normal(size=decisions), "other": generator.uniform(size=decisions)},
@@ -72,7 +72,7 @@ def value(policy: ResidualPolicy, row: np.ndarray) -> float:
 
 
 def looks_written_out(trajectory: Trajectory) -> list[float]:
-    """What was earned from one look of the network to the next."""
+    """What was earned from one choice of the network to the next."""
     earned = [
         float(trajectory.terms["one"][t] + trajectory.terms["other"][t])
         for t in range(len(trajectory.residual))
@@ -286,10 +286,10 @@ def test_the_replay_buffer_holds_what_sb3_would_have_put_there_row_by_row() -> N
         for trajectory, more in zip(trajectories, extra, strict=True):
             seen = [np.append(row, more).astype(np.float32) for row in trajectory.observations]
             residuals, earned = trajectory.choices
-            for look, (residual, reward) in enumerate(zip(residuals, earned, strict=True)):
-                done = trajectory.terminated and look == len(earned) - 1
+            for choice, (residual, reward) in enumerate(zip(residuals, earned, strict=True)):
+                done = trajectory.terminated and choice == len(earned) - 1
                 action = np.array([np.float32(residual) / np.float32(2.0)])
-                theirs.add(seen[look], seen[look + 1], action, reward, np.array(done), [{}])
+                theirs.add(seen[choice], seen[choice + 1], action, reward, np.array(done), [{}])
         assert (ours.pos, ours.full) == (theirs.pos, theirs.full)
         for name in ("observations", "next_observations", "actions", "rewards", "dones"):
             np.testing.assert_array_equal(getattr(ours, name), getattr(theirs, name))

@@ -146,11 +146,11 @@ def test_the_ratio_is_exactly_one_before_each_update(agent: str, shared: Simulat
 
 
 def rollouts_of(rewards: np.ndarray, made: list[int], terminated: list[bool]) -> Rollouts:
-    rows, looks = rewards.shape
+    rows, choices = rewards.shape
     generator = torch.Generator().manual_seed(0)
     return Rollouts(
-        observations=torch.randn((rows, looks + 1, INPUTS), generator=generator),
-        actions=torch.randn((rows, looks), generator=generator),
+        observations=torch.randn((rows, choices + 1, INPUTS), generator=generator),
+        actions=torch.randn((rows, choices), generator=generator),
         rewards=torch.as_tensor(rewards),
         made=torch.tensor(made),
         terminated=torch.tensor(terminated),

@@ -95,7 +95,7 @@ def test_recipe_makes_the_same_scenario_again() -> None:
         ({"cavs": 15}, "cavs: 15 is not allowed; allowed: <= vehicles, 14"),
         ({"radius": (5, 5)}, "radius"),
         ({"length": (230, 230)}, "length: unknown name"),
-        ({"people": "wild"}, "people"),
+        ({"human_control": "wild"}, "human_control"),
     ],
 )
 def test_wrong_parameters_get_one_clear_line(changes: dict[str, object], words: str) -> None:

@@ -179,7 +179,10 @@ def test_recipe_makes_the_same_scenario_again() -> None:
         ({"inflow": 0}, "inflow: 0"),
         ({"ramp_flow": -5}, "ramp_flow: -5"),
         ({"spacing": "odd"}, "'random' or 'even'"),
-        ({"people": "native"}, "people: 'native' is not allowed on the merge; allowed: 'commanded'"),
+        (
+            {"human_control": "native"},
+            "human_control: 'native' is not allowed on the merge; allowed: 'commanded'",
+        ),
         ({"length": (230, 230)}, "length: unknown name"),
     ],
 )

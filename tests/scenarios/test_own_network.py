@@ -107,7 +107,11 @@ BIKES = '<routes><vType id="bike" vClass="bicycle"/><flow id="g" type="bike"/></
         ({"cav_types": ["tank"]}, TYPES, "no vehicle has the type 'tank'; allowed: bike, car, truck"),
         ({"cav_types": ["unused"]}, TYPES, "no vehicle has the type 'unused'"),
         ({"cav_share": 0.1}, BIKES, "no vehicle is a car; its types are bike; name cav_types"),
-        ({"cav_share": 0.1, "people": "commanded"}, TYPES, "people: 'commanded' is not allowed"),
+        (
+            {"cav_share": 0.1, "human_control": "commanded"},
+            TYPES,
+            "human_control: 'commanded' is not allowed",
+        ),
         ({"cav_share": 0.1, "noise": 0.2}, TYPES, "noise: 0.2"),
         ({"cav_share": 0.1, "simulation_step": 0}, TYPES, "simulation_step: 0"),
         ({"cav_share": 0.1, "simulation_step": "fast"}, TYPES, "simulation_step: 'fast'"),

@@ -111,5 +111,5 @@ def test_without_a_population_roads_are_as_they_were() -> None:
 
 
 def test_a_residual_is_commanded(tmp_path: Path) -> None:
-    assert make_scenario("ring", {"population": str(written(tmp_path, NETWORK))}).people == "commanded"
-    assert make_scenario("ring", {"population": str(written(tmp_path))}).people == "native"
+    assert make_scenario("ring", {"population": str(written(tmp_path, NETWORK))}).human_control == "commanded"
+    assert make_scenario("ring", {"population": str(written(tmp_path))}).human_control == "native"

@@ -25,7 +25,7 @@ def known_ahead(world: LittleWorld) -> ActualData:
 
 def test_a_model_that_is_the_truth_is_never_off() -> None:
     data = known_ahead(LittleWorld(leader=0.0))
-    found = open_loop(alone(), data, data.looks(40), 40, RING)
+    found = open_loop(alone(), data, data.choices(40), 40, RING)
     for name in NUMBERS:
         assert found.error[name].shape == found.spread[name].shape == (40,)
         assert found.error[name].max() < 1e-3, name
@@ -36,11 +36,11 @@ def test_a_model_that_is_the_truth_is_never_off() -> None:
 def test_errors_are_those_of_the_base_written_out() -> None:
     """The base believes that the leader keeps its speed."""
     data = known_ahead(LittleWorld())
-    looks = data.looks(30)
-    found = open_loop(alone(), data, looks, 30, RING)
+    choices = data.choices(30)
+    found = open_loop(alone(), data, choices, 30, RING)
     for step in (1, 10, 30):
         off, moved = [], []
-        for place, at in looks:
+        for place, at in choices:
             speeds = data.recordings[place].states.leader_speed
             off.append(speeds[at + step] - speeds[at])
             gaps = data.recordings[place].states.leader_gap
@@ -53,10 +53,10 @@ def test_errors_are_those_of_the_base_written_out() -> None:
 
 def test_learning_brings_virtual_and_actual_together() -> None:
     data = known_ahead(LittleWorld())
-    looks, model = data.looks(30), alone()
-    before = open_loop(model, data, looks, 30, RING)
+    choices, model = data.choices(30), alone()
+    before = open_loop(model, data, choices, 30, RING)
     fit(model, data.transitions(0.2), SETTINGS, RING, "", (2,))
-    after = open_loop(model, data, looks, 30, RING)
+    after = open_loop(model, data, choices, 30, RING)
     for name in ("leader_speed", "leader_gap"):
         assert after.error[name][-1] < 0.6 * before.error[name][-1]
         assert 0.0 < after.spread[name][-1] < 2 * after.error[name][-1]
@@ -67,15 +67,17 @@ def test_each_member_drives_alone_from_what_was_recorded() -> None:
     data = known_ahead(LittleWorld())
     model = alone()
     fit(model, data.transitions(0.2), SETTINGS, RING, "", (2,))
-    looks = data.looks(30)[:5]
-    actual, virtual = recorded(data, looks, 30), replay(model, data, looks, 30, RING)
+    choices = data.choices(30)[:5]
+    actual, virtual = recorded(data, choices, 30), replay(model, data, choices, 30, RING)
     for name in NUMBERS:
         assert virtual[name].shape == (3, 5, 30)
         assert actual[name].shape == (5, 31)
-        np.testing.assert_array_equal(actual[name][:, 0], getattr(data.states_at(looks), name))
+        np.testing.assert_array_equal(actual[name][:, 0], getattr(data.states_at(choices), name))
     assert np.ptp(virtual["leader_speed"], axis=0)[:, -1].min() > 0.0
     np.testing.assert_allclose(
-        virtual["leader_speed"][1, :1], replay(model, data, looks[:1], 30, RING)["leader_speed"][1], rtol=1e-4
+        virtual["leader_speed"][1, :1],
+        replay(model, data, choices[:1], 30, RING)["leader_speed"][1],
+        rtol=1e-4,
     )
 
 
@@ -96,7 +98,7 @@ def test_a_new_model_is_as_wrong_as_its_base() -> None:
 
 
 def gap_of(driver: ResidualDriver, world: LittleWorld, data: ActualData) -> ReturnGap:
-    starts = begin(data, data.looks(20), driver.expert, "cpu")
+    starts = begin(data, data.choices(20), driver.expert, "cpu")
     found = return_gap(imagine(driver, world, starts, 20, torch_generator((1,), "cpu")), data, 18)
     assert found is not None
     return found
@@ -108,8 +110,8 @@ def test_in_the_true_world_there_is_no_gap_between_returns() -> None:
     quiet = ResidualDriver(IDM(), random_network(), 1.0, hold=3)
     object.__setattr__(quiet.network, "exploration_std", 0.0)
     found = gap_of(quiet, world, data)
-    looks = data.looks(20)
-    actual = [data.recordings[place].reward[at : at + 18].sum() for place, at in looks]
+    choices = data.choices(20)
+    actual = [data.recordings[place].reward[at : at + 18].sum() for place, at in choices]
     assert found.actual == pytest.approx(np.mean(actual))
     assert found.virtual == pytest.approx(found.actual, abs=2e-3)
     assert found.standard_error < 1e-3

@@ -114,10 +114,10 @@ def test_without_data_there_is_nothing_to_learn_from() -> None:
 
 def test_looks_are_where_a_residual_was_due_and_enough_follows() -> None:
     data = filled(7, 3, hold=3)
-    assert data.looks().tolist() == [[0, 0], [0, 3], [0, 6], [1, 0]]
-    assert data.looks(3).tolist() == [[0, 0], [0, 3], [1, 0]]
-    assert data.looks(8).tolist() == []
-    found = data.states_at(data.looks()[[3, 1, 1]])
+    assert data.choices().tolist() == [[0, 0], [0, 3], [0, 6], [1, 0]]
+    assert data.choices(3).tolist() == [[0, 0], [0, 3], [1, 0]]
+    assert data.choices(8).tolist() == []
+    found = data.states_at(data.choices()[[3, 1, 1]])
     np.testing.assert_array_equal(found.speed, [1000, 3, 3])
     np.testing.assert_allclose(found.leader_gap, np.array([1000, 3, 3]) + 0.2)
 

@@ -48,7 +48,7 @@ def experts(my_drivers: Path) -> list[Driver]:
 def test_remembers_what_the_driver_really_did(
     number: int, warmup: int, my_drivers: Path, simulation: Simulation, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Two episodes with two CAVs each, driven with exploration; every look of all four trajectories."""
+    """Two episodes with two CAVs each, driven with exploration; every choice of all four trajectories."""
     expert = experts(my_drivers)[number]
     driver = ResidualDriver(expert, random_network(), 1.0, hold=3)
     ring, data, memories = replace(RING, warmup=warmup), ActualData(1000), []
@@ -57,9 +57,9 @@ def test_remembers_what_the_driver_really_did(
             seen = watch(expert, patch)
             data.add([run_episode(ring, driver, (seed,), explore=True, simulation=simulation)], ring)
         memories += [seen, seen]
-    looks = np.random.default_rng(0).permutation(data.looks())[:40]
-    found = remembered(expert, data.recordings, looks)
-    for row, (place, decision) in enumerate(looks):
+    choices = np.random.default_rng(0).permutation(data.choices())[:40]
+    found = remembered(expert, data.recordings, choices)
+    for row, (place, decision) in enumerate(choices):
         really = memories[place][decision]
         flat, expected = dict(leaves(found)), dict(leaves(really))
         assert flat.keys() == expected.keys()
@@ -75,9 +75,9 @@ def test_remembers_nothing_of_what_came_later_or_elsewhere() -> None:
     with Simulation() as simulation:
         episodes = [run_episode(RING, driver, (seed,), simulation=simulation) for seed in range(3)]
     data.add(episodes, RING)
-    looks = data.looks()
-    found = remembered(expert, data.recordings, looks)
-    for row, (place, decision) in enumerate(looks):
+    choices = data.choices()
+    found = remembered(expert, data.recordings, choices)
+    for row, (place, decision) in enumerate(choices):
         speeds = data.recordings[place].states.speed[:decision]
         assert found["seen"][row] == decision
         np.testing.assert_array_equal(found["window"][row, :decision], speeds)
@@ -88,7 +88,7 @@ def test_a_driver_without_memory_needs_none() -> None:
     data = ActualData(1000)
     driver = ResidualDriver(IDM(), random_network(), 1.0)
     data.add([run_episode(RING, driver, (1,))], RING)
-    assert remembered(IDM(), data.recordings, data.looks()[:5]) == {}
+    assert remembered(IDM(), data.recordings, data.choices()[:5]) == {}
 
 
 def test_built_in_drivers_take_tensors_as_they_are(my_drivers: Path) -> None:

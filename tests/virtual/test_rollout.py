@@ -88,13 +88,13 @@ def test_with_the_true_dynamics_virtual_is_actual(number: int, hold: int, my_dri
     world, gamma, decisions = LittleWorld(), 0.97, 41
     driver = residual_driver(experts(my_drivers)[number], hold)
     data = actual_data(world, driver, 3, 120, explore=False)
-    looks = data.looks(ahead=decisions)
-    found = imagine(driver, world, begin(data, looks, driver.expert, "cpu"), decisions, None)
+    choices = data.choices(ahead=decisions)
+    found = imagine(driver, world, begin(data, choices, driver.expert, "cpu"), decisions, None)
     made = decisions // hold
-    assert found.rewards.shape == (len(looks), made)
+    assert found.rewards.shape == (len(choices), made)
     assert not found.terminated.any()
     drives = [replay(driver, data, place) for place in range(3)]
-    for row, (place, at) in enumerate(looks):
+    for row, (place, at) in enumerate(choices):
         recording, driven = data.recordings[place], drives[place]
         seen = driven[0][at : at + made * hold + 1 : hold]
         np.testing.assert_allclose(found.observations[row].numpy(), seen, atol=2e-4)
@@ -128,16 +128,16 @@ def crash_course(limit: float = 1.0) -> tuple[ResidualDriver, ActualData]:
 
 def test_a_crash_ends_a_row_and_its_rewards() -> None:
     driver, data = crash_course()
-    looks = data.looks()
-    found = imagine(driver, LittleWorld(), begin(data, looks, driver.expert, "cpu"), 300, None)
+    choices = data.choices()
+    found = imagine(driver, LittleWorld(), begin(data, choices, driver.expert, "cpu"), 300, None)
     assert found.terminated.all()
     assert found.made.max() < 150
-    for row in range(len(looks)):
+    for row in range(len(choices)):
         made = int(found.made[row])
         assert made > 0
         assert (found.rewards[row, made:] == 0.0).all()
         assert found.rewards[row, :made].abs().sum() > 0.0
-    one = looks[:1]
+    one = choices[:1]
     alone = imagine(driver, LittleWorld(), begin(data, one, driver.expert, "cpu"), 300, None)
     assert alone.decisions in (2 * int(alone.made[0]), 2 * int(alone.made[0]) - 1)
     assert_close(alone.rewards[0], found.rewards[0])
@@ -157,7 +157,7 @@ class Bounded(LittleWorld):
 
 def test_bounds_count_until_the_crash() -> None:
     driver, data = crash_course()
-    starts = begin(data, data.looks()[:50], driver.expert, "cpu")
+    starts = begin(data, data.choices()[:50], driver.expert, "cpu")
     found = imagine(driver, Bounded(), starts, 300, None)
     assert found.decisions < 50 * 300
     assert found.bounded == pytest.approx(
@@ -178,8 +178,8 @@ def noisy() -> tuple[ResidualDriver, ActualData, EnvironmentModel]:
 def run(noisy: tuple[ResidualDriver, ActualData, EnvironmentModel], seed: int) -> Rollouts:
     driver, data, model = noisy
     generator = torch_generator((seed,), "cpu")
-    looks = draw_starts(data, 200, 1, (seed,))
-    starts = begin(data, looks, driver.expert, "cpu")
+    choices = draw_starts(data, 200, 1, (seed,))
+    starts = begin(data, choices, driver.expert, "cpu")
     return imagine(driver, VirtualDynamics(model, RING, "", generator), starts, 23, generator)
 
 
@@ -218,7 +218,7 @@ def test_explores_with_the_networks_own_deviation(
 
 def test_no_decisions_are_the_start_alone(noisy: tuple[ResidualDriver, ActualData, EnvironmentModel]) -> None:
     driver, data, _ = noisy
-    starts = begin(data, data.looks()[:7], driver.expert, "cpu")
+    starts = begin(data, data.choices()[:7], driver.expert, "cpu")
     found = imagine(driver, LittleWorld(), starts, 4, None)
     assert found.observations.shape == (7, 1, 8)
     assert found.rewards.shape == found.actions.shape == (7, 0)
@@ -237,7 +237,7 @@ def test_starts_are_looks_with_enough_ahead() -> None:
 
 def test_what_is_not_finite_is_told() -> None:
     driver, data = residual_driver(IDM()), actual_data(LittleWorld(), residual_driver(IDM()), 1, 10)
-    starts = begin(data, data.looks(), driver.expert, "cpu")
+    starts = begin(data, data.choices(), driver.expert, "cpu")
     with pytest.raises(UnjamError, match="rewards of a rollout are not finite"):
         imagine(driver, LittleWorld(bonus=inf), starts, 3, None)
 
@@ -252,7 +252,7 @@ def test_the_action_limit_holds_for_expert_and_sum() -> None:
             return super().step(state, applied, drawn)
 
     strong = replace(driver, expert=IDM(), network=random_network(6))
-    imagine(strong, Watching(), begin(data, data.looks(), IDM(), "cpu"), 20, None)
+    imagine(strong, Watching(), begin(data, data.choices(), IDM(), "cpu"), 20, None)
     assert torch.stack(commands).abs().max() == 0.25
     assert torch.stack(commands).unique().numel() > 10
 
@@ -266,6 +266,6 @@ def test_drives_on_a_gpu_as_on_the_processor(
     for device in ("cpu", "cuda"):
         generator = torch_generator((1,), device)
         world = VirtualDynamics(model.to(device), RING, "", generator, noise=False)
-        found.append(imagine(driver, world, begin(data, data.looks(), driver.expert, device), 20, None))
+        found.append(imagine(driver, world, begin(data, data.choices(), driver.expert, device), 20, None))
     model.to("cpu")
     assert_close(found[1].rewards.cpu(), found[0].rewards, atol=1e-3, rtol=1e-3)

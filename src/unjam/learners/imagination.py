@@ -106,12 +106,12 @@ class Imagination:
             return None
         count = ceil(self.settings.virtual_ratio * self._actual / parts / driven)
         seeds = [self._seed(iteration, purpose, part) for purpose in (STARTS, NOISE, EXPLORATION)]
-        looks = draw_starts(self.data, count, 1, seeds[0], self._first)
-        if len(looks) == 0:
+        choices = draw_starts(self.data, count, 1, seeds[0], self._first)
+        if len(choices) == 0:
             return None
         noise, exploration = (torch_generator(seed, self.settings.device) for seed in seeds[1:])
         world = VirtualDynamics(self.model, self.scenario, self._task.reward, noise, self.settings.noise)
-        starts = begin(self.data, looks, self._task.expert, self.settings.device)
+        starts = begin(self.data, choices, self._task.expert, self.settings.device)
         rollouts = imagine(driver, world, starts, driven, exploration)
         self.steps += rollouts.decisions
         if part == 0:  # the policy that drove the actual episodes: returns can be compared

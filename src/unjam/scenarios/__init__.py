@@ -34,8 +34,9 @@ def make_scenario(name: str, changes: dict[str, Any] | None = None) -> Scenario:
     Raises:
         InputError: unknown scenario or parameter, or a value out of range.
     """
+    changes = _named_as_now(changes or {})
     if name.endswith(".sumocfg"):
-        return own_network(name, changes or {})
+        return own_network(name, changes)
     if name not in SCENARIOS:
         raise wrong("scenario", name, ", ".join([*SCENARIOS, "a .sumocfg file"]))
     scenario = SCENARIOS[name]
@@ -46,10 +47,15 @@ def make_scenario(name: str, changes: dict[str, Any] | None = None) -> Scenario:
     return build(type(scenario), {**asdict(scenario), **changes}, f"scenario {name}")
 
 
+def _named_as_now(values: dict[str, Any]) -> dict[str, Any]:
+    """Return parameters of a scenario by the names that they have now; older files say `people`."""
+    return {"human_control" if key == "people" else key: value for key, value in values.items()}
+
+
 def _of_population(file: str) -> dict[str, Any]:
     """Return what else changes with a population: who is typical, and who computes how people drive."""
     population = read_population(file)
-    commanded = {"people": "commanded"} if population.residual else {}
+    commanded = {"human_control": "commanded"} if population.residual else {}
     return {"humans": asdict(population.typical), **commanded}
 
 
@@ -61,4 +67,4 @@ def scenario_recipe(scenario: Scenario) -> dict[str, Any]:
 def scenario_from_recipe(recipe: dict[str, Any]) -> Scenario:
     """Return the scenario that `scenario_recipe` wrote down."""
     values = {key: value for key, value in recipe.items() if key != "kind"}
-    return build(KINDS[recipe["kind"]], values, "scenario")
+    return build(KINDS[recipe["kind"]], _named_as_now(values), "scenario")

@@ -12,7 +12,7 @@ from unjam.parameters import STRICT, Count, NotNegative
 from unjam.physics.idm import equilibrium_speed
 from unjam.scenarios.ring import Lap, Loop, Place
 from unjam.scenarios.road import Edge, Line, Network, Node, as_line
-from unjam.scenarios.scenario import VEHICLE_LENGTH, Actuation, People
+from unjam.scenarios.scenario import VEHICLE_LENGTH, Actuation, HumanControl
 
 CROSSING_RADIUS = 3.1
 """of the node where the ways of a figure eight cross [m], as Flow's"""
@@ -62,7 +62,7 @@ class FigureEight(Loop):
     horizon: Count = 1500
     """decisions in an episode"""
     actuation: Actuation = "flow"
-    people: People = "commanded"
+    human_control: HumanControl = "commanded"
     impatience: Annotated[float, Field(ge=0, le=1)] = 0.5
 
     @model_validator(mode="after")

@@ -14,7 +14,7 @@ from unjam.physics.arrays import at_least
 from unjam.physics.idm import IDMParameters, idm_acceleration
 from unjam.physics.kinematics import next_position, next_speed
 from unjam.scenarios.road import Edge, Entry, MergingRoad, Network, Node, Origin, Route
-from unjam.scenarios.scenario import VEHICLE_LENGTH, People, Scenario
+from unjam.scenarios.scenario import VEHICLE_LENGTH, HumanControl, Scenario
 
 INFLOW_EDGE, BEFORE, AFTER, RAMP = 100.0, 500.0, 100.0, 100.0
 """lengths of the edges on which vehicles enter, of the highway before and after the ramp, of the ramp [m]"""
@@ -65,7 +65,7 @@ class Merge(Scenario):
     steps_per_decision: Count = 5
     horizon: Count = 600
     """decisions in an episode"""
-    people: People = "commanded"
+    human_control: HumanControl = "commanded"
     right_of_way: bool = False
 
     @model_validator(mode="after")
@@ -78,8 +78,8 @@ class Merge(Scenario):
             raise ValueError(
                 f"cavs: {self.cavs} is not allowed; allowed: <= {early}, who enter in the first half"
             )
-        if self.people == "native":
-            raise ValueError("people: 'native' is not allowed on the merge; allowed: 'commanded'")
+        if self.human_control == "native":
+            raise ValueError("human_control: 'native' is not allowed on the merge; allowed: 'commanded'")
         return self
 
     def draw(self, generator: np.random.Generator) -> MergingRoad:

@@ -58,8 +58,10 @@ class OwnNetwork(Scenario):
                 raise ValueError("cav_share: 0.0 is not allowed without cav_types; allowed: > 0, <= 1")
             if not any(is_car(files.types.get(name, {})) for name in files.used_types):
                 raise ValueError(f"cav_share: no vehicle is a car; its types are {known}; name cav_types")
-        if self.people != "native":
-            raise ValueError("people: 'commanded' is not allowed on your own network; allowed: 'native'")
+        if self.human_control != "native":
+            raise ValueError(
+                "human_control: 'commanded' is not allowed on your own network; allowed: 'native'"
+            )
         if self.population:
             raise ValueError(
                 f"population: {self.population!r} is not allowed on your own network: people drive as its "

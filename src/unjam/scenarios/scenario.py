@@ -26,7 +26,7 @@ Actuation = Literal["shielded", "raw", "flow"]
 `flow`: as in Flow, the CAV is also bound by SUMO's human model and can never accelerate beyond it.
 """
 
-People = Literal["native", "commanded"]
+HumanControl = Literal["native", "commanded"]
 """Who computes how people drive.
 
 `native`: SUMO's own IDM with the scenario's parameters, to whose speeds noise is added.
@@ -70,7 +70,7 @@ class Scenario:
     population: str = ""
     """file of calibrated drivers, of `unjam fit-drivers`, each of whom drives in its own way; empty: all
     drive as `humans` says"""
-    people: People = "native"
+    human_control: HumanControl = "native"
     """who computes how people drive: `native` SUMO's own IDM; `commanded` the same IDM as a speed command in
     every step, as in Flow"""
     right_of_way: bool = True

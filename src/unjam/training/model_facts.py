@@ -141,7 +141,7 @@ def _replayed(imagination: Imagination, scenario: Scenario, generator: np.random
     data, model = imagination.data, imagination.model
     held_out = data.held_out(imagination.settings.holdout)
     decisions = decisions_ahead([int(rows.sum()) for rows in held_out if rows.any()])
-    starts = data.looks(decisions)
+    starts = data.choices(decisions)
     starts = starts[[held_out[place][at] for place, at in starts]]
     starts = starts[np.sort(generator.permutation(len(starts))[:STARTS])]
     single = replace(imagination.settings, members=1, error="unexplained")

@@ -33,24 +33,24 @@ class OpenLoop(NamedTuple):
 
 
 def open_loop(
-    model: EnvironmentModel, data: ActualData, looks: NDArray[np.int64], decisions: int, scenario: Scenario
+    model: EnvironmentModel, data: ActualData, choices: NDArray[np.int64], decisions: int, scenario: Scenario
 ) -> OpenLoop:
     """Replay recorded accelerations in the virtual environment, and tell how far it goes astray.
 
     The arguments are those of `replay`.
     """
-    actual = recorded(data, looks, decisions)
+    actual = recorded(data, choices, decisions)
     error, spread, change = {}, {}, {}
-    for name, virtual in replay(model, data, looks, decisions, scenario).items():
+    for name, virtual in replay(model, data, choices, decisions, scenario).items():
         error[name] = np.sqrt(np.square(virtual - actual[name][:, 1:]).mean((0, 1)))
         spread[name] = np.sqrt(virtual.var(0).mean(0))
         change[name] = np.sqrt(np.square(actual[name][:, 1:] - actual[name][:, :1]).mean(0))
     return OpenLoop(error, spread, change)
 
 
-def recorded(data: ActualData, looks: NDArray[np.int64], decisions: int) -> dict[str, Floats]:
-    """Return what happened from `looks` on, by number of the state [m/s, m], shape (rows, H + 1)."""
-    windows = [(data.recordings[place].states, slice(at, at + decisions + 1)) for place, at in looks]
+def recorded(data: ActualData, choices: NDArray[np.int64], decisions: int) -> dict[str, Floats]:
+    """Return what happened from `choices` on, by number of the state [m/s, m], shape (rows, H + 1)."""
+    windows = [(data.recordings[place].states, slice(at, at + decisions + 1)) for place, at in choices]
     return {name: np.stack([getattr(states, name)[at] for states, at in windows]) for name in NUMBERS}
 
 
@@ -68,14 +68,14 @@ class Replayed(Driver):
 
 @torch.no_grad()
 def replay(
-    model: EnvironmentModel, data: ActualData, looks: NDArray[np.int64], decisions: int, scenario: Scenario
+    model: EnvironmentModel, data: ActualData, choices: NDArray[np.int64], decisions: int, scenario: Scenario
 ) -> dict[str, Floats]:
     """Replay recorded accelerations in the virtual environment, without noise, each member by itself.
 
     Args:
         model: fitted, or new: then it is the base alone.
         data: actual data.
-        looks: where to begin, rows (recording, decision); at least `decisions` recorded ones must follow.
+        choices: where to begin, rows (recording, decision); at least `decisions` recorded ones must follow.
         decisions: H.
         scenario: the road.
 
@@ -83,7 +83,7 @@ def replay(
         By number of the state [m/s, m], shape (members, rows, H).
     """
     device = model.input_mean.device
-    each_member = np.tile(looks, (model.members, 1))
+    each_member = np.tile(choices, (model.members, 1))
     states = data.states_at(each_member).each(lambda values: on_device(values, device))
     drawn = np.stack([data.recordings[place].drawn for place in each_member[:, 0]])
     applied = np.stack([data.recordings[place].applied[at : at + decisions] for place, at in each_member], 1)
@@ -94,7 +94,7 @@ def replay(
     world = ImaginedWorld(dynamics, starts, decisions, scenario.limits, None)
     for _ in Drive(world, Replayed(on_device(applied, device)), memory={"decision": 0}):
         pass
-    shape = model.members, len(looks), decisions
+    shape = model.members, len(choices), decisions
     found = {name: torch.stack([getattr(state, name) for state in world.states[1:]], 1) for name in NUMBERS}
     return {name: numbers.view(shape).cpu().numpy() for name, numbers in found.items()}
 

@@ -117,7 +117,7 @@ class ActualData:
             return [np.arange(length) >= max(1, (1 - holdout) * length) for length in lengths]
         return held_out
 
-    def looks(self, ahead: int = 1, since: int = 0) -> NDArray[np.int64]:
+    def choices(self, ahead: int = 1, since: int = 0) -> NDArray[np.int64]:
         """Return where a residual was due and at least `ahead` decisions follow, rows (recording, decision).
 
         Only of the episodes from number `since` on.
@@ -130,10 +130,10 @@ class ActualData:
         places = np.repeat(np.array(list(due), np.int64), [len(decisions) for decisions in due.values()])
         return np.column_stack([places, np.concatenate([[], *due.values()]).astype(np.int64)])
 
-    def states_at(self, looks: NDArray[np.int64]) -> LocalState:
-        """Return the states at `looks`, rows (recording, decision), arrays of shape (rows,)."""
+    def states_at(self, choices: NDArray[np.int64]) -> LocalState:
+        """Return the states at `choices`, rows (recording, decision), arrays of shape (rows,)."""
         first = np.cumsum([0, *(len(recording.states.speed) for recording in self.recordings)])
-        rows = first[looks[:, 0]] + looks[:, 1]
+        rows = first[choices[:, 0]] + choices[:, 1]
         return _joined([recording.states for recording in self.recordings]).each(lambda values: values[rows])
 
 
@@ -153,26 +153,26 @@ def _joined(parts: Sequence[LocalState]) -> LocalState:
     return first.each(lambda *values: np.concatenate(values), *others)
 
 
-def remembered(expert: Driver, recordings: Sequence[Recording], looks: NDArray[np.int64]) -> Memory:
-    """Return what the expert remembered before each of the decisions `looks`, rows (recording, decision).
+def remembered(expert: Driver, recordings: Sequence[Recording], choices: NDArray[np.int64]) -> Memory:
+    """Return what the expert remembered before each of the decisions `choices`, rows (recording, decision).
 
     It is driven once more over the recorded states, from the memory with which the recording began: that is
     exact for every driver, since a driver's memory depends on what it has seen alone.
 
     Returns:
-        NumPy arrays with a row for each look.
+        NumPy arrays with a row for each choice.
     """
-    places, rows = np.unique(looks[:, 0], return_inverse=True)
+    places, rows = np.unique(choices[:, 0], return_inverse=True)
     used = [recordings[place] for place in places]
     memory = mapped(lambda *each: np.stack(each), *(recording.memory for recording in used))
-    found = mapped(lambda values: np.empty((len(looks), *values.shape[1:])), memory)
+    found = mapped(lambda values: np.empty((len(choices), *values.shape[1:])), memory)
     if not found:
         return found
-    last = int(looks[:, 1].max())
+    last = int(choices[:, 1].max())
     steps = [np.arange(last).clip(0, len(recording.applied)) for recording in used]
     states = [kept.states.each(lambda values: values[at]) for kept, at in zip(used, steps, strict=True)]  # noqa: B023
-    order = np.argsort(looks[:, 1], kind="stable")
-    bounds = np.searchsorted(looks[order, 1], np.arange(last + 2))
+    order = np.argsort(choices[:, 1], kind="stable")
+    bounds = np.searchsorted(choices[order, 1], np.arange(last + 2))
 
     def note(decision: int, memory: Memory) -> None:
         here = order[bounds[decision] : bounds[decision + 1]]

@@ -55,22 +55,22 @@ class Starts(NamedTuple):
     """of the expert, as `on_tensors` of it takes it"""
     drawn: Tensor
     """what the rows' episodes have drawn, scaled, shape (n, m)"""
-    looks: NDArray[np.int64]
+    choices: NDArray[np.int64]
     """where they are: rows (recording, decision), shape (n, 2)"""
 
 
 @dataclass(frozen=True)
 class Rollouts:
-    """Virtual experience: n rows, each of as many looks of the network; tensors."""
+    """Virtual experience: n rows, each of as many choices of the network; tensors."""
 
     observations: Tensor
-    """what the network saw at each look, and at the end, shape (n, looks + 1, inputs)"""
+    """what the network saw at each choice, and at the end, shape (n, choices + 1, inputs)"""
     actions: Tensor
-    """the residual it chose, with its exploration noise, not clipped [m/s2], shape (n, looks)"""
+    """the residual it chose, with its exploration noise, not clipped [m/s2], shape (n, choices)"""
     rewards: Tensor
-    """what was earned while each residual was held, zero after a crash, shape (n, looks)"""
+    """what was earned while each residual was held, zero after a crash, shape (n, choices)"""
     made: Tensor
-    """looks that each row made: those after its crash mean nothing, shape (n,)"""
+    """choices that each row made: those after its crash mean nothing, shape (n,)"""
     terminated: Tensor
     """whether it crashed; otherwise it was cut, and goes on where it ended, shape (n,)"""
     drawn: Tensor
@@ -91,19 +91,23 @@ def draw_starts(
     At least `ahead` recorded decisions follow each, and its episode is number `since` or a later one; shape
     (0, 2) where there are none such.
     """
-    looks = data.looks(ahead, since)
-    return looks[np.random.default_rng(list(seed)).integers(len(looks), size=rows)] if len(looks) else looks
+    choices = data.choices(ahead, since)
+    return (
+        choices[np.random.default_rng(list(seed)).integers(len(choices), size=rows)]
+        if len(choices)
+        else choices
+    )
 
 
-def begin(data: ActualData, looks: NDArray[np.int64], expert: Driver, device: torch.device | str) -> Starts:
-    """Return the start of virtual rollouts at `looks`, with what the expert remembered there."""
-    drawn = np.stack([data.recordings[place].drawn for place in looks[:, 0]])
-    memory = remembered(expert, data.recordings, looks)
+def begin(data: ActualData, choices: NDArray[np.int64], expert: Driver, device: torch.device | str) -> Starts:
+    """Return the start of virtual rollouts at `choices`, with what the expert remembered there."""
+    drawn = np.stack([data.recordings[place].drawn for place in choices[:, 0]])
+    memory = remembered(expert, data.recordings, choices)
     return Starts(
-        state=data.states_at(looks).each(lambda values: on_device(values, device)),
+        state=data.states_at(choices).each(lambda values: on_device(values, device)),
         memory=memory_on(on_tensors(expert, device), memory, device),
         drawn=on_device(drawn, device),
-        looks=looks,
+        choices=choices,
     )
 
 
@@ -165,18 +169,18 @@ class ImaginedWorld:
         return torch.randn(len(like), generator=self._generator, device=like.device)
 
     def record(self, driven: Driven) -> Rollouts:
-        """Return what happened, look by look.
+        """Return what happened, choice by choice.
 
         Raises:
             UnjamError: something of it is not finite.
         """
         hold, nothing = driven.hold, self.states[0].speed.new_zeros((self.rows, 0))
-        looks = range(0, len(self._rewards), hold)
-        actions = [driven.decisions[look][1] for look in looks]
+        choices = range(0, len(self._rewards), hold)
+        actions = [driven.decisions[choice][1] for choice in choices]
         none = torch.zeros_like(self._running)
-        rewards = [sum(self._rewards[look : look + hold], none) for look in looks]
-        made = sum((self._ran[look] for look in looks), none)
-        seen = [*(driven.decisions[look][2] for look in looks), driven.last_observation]
+        rewards = [sum(self._rewards[choice : choice + hold], none) for choice in choices]
+        made = sum((self._ran[choice] for choice in choices), none)
+        seen = [*(driven.decisions[choice][2] for choice in choices), driven.last_observation]
         rollouts = Rollouts(
             observations=torch.stack(seen, 1),
             actions=torch.stack(actions, 1) if actions else nothing,
@@ -184,7 +188,7 @@ class ImaginedWorld:
             made=made.long(),
             terminated=self._running == 0.0,
             drawn=self._starts.drawn,
-            start=self._starts.looks,
+            start=self._starts.choices,
             decisions=int(self._lived.item()),
             bounded=dict(zip(BOUNDS, (self._bounded / self._lived.clip(1.0)).tolist(), strict=True)),
         )
@@ -204,7 +208,7 @@ def imagine(
 ) -> Rollouts:
     """Drive with the full policy, expert plus residual, for `decisions` from actual states.
 
-    `decisions` is rounded down to whole looks of the network; the expert decides in each of them, and what
+    `decisions` is rounded down to whole choices of the network; the expert decides in each of them, and what
     it remembers is rolled forward.
 
     Args:
@@ -222,6 +226,6 @@ def imagine(
     driver = replace(driver, expert=on_tensors(driver.expert, like.device))
     memory: Memory = {EXPERT: starts.memory}
     if driver.hold > 1:
-        memory |= {RESIDUAL: torch.zeros_like(like), AGE: 0.0}  # all rows begin with a look
+        memory |= {RESIDUAL: torch.zeros_like(like), AGE: 0.0}  # all rows begin with a choice
     world = ImaginedWorld(dynamics, starts, decisions // driver.hold * driver.hold, driver.limits, generator)
     return drive(world, driver, generator is not None, memory)

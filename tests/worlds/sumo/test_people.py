@@ -32,11 +32,18 @@ def test_limits_and_residual_change_an_idm() -> None:
     np.testing.assert_allclose(found, [acceleration[0] + 0.25, -4.0])
 
 
-@pytest.mark.parametrize("people", ["native", "commanded"])
-def test_each_person_on_the_ring_drives_by_its_own_parameters(tmp_path: Path, people: str) -> None:
+@pytest.mark.parametrize("human_control", ["native", "commanded"])
+def test_each_person_on_the_ring_drives_by_its_own_parameters(tmp_path: Path, human_control: str) -> None:
     file = population(tmp_path)
     scenario = make_scenario(
-        "ring", {"population": file, "people": people, "noise": 0.0, "horizon": 300, "length": (300, 300)}
+        "ring",
+        {
+            "population": file,
+            "human_control": human_control,
+            "noise": 0.0,
+            "horizon": 300,
+            "length": (300, 300),
+        },
     )
     road = scenario.draw(np.random.default_rng(0))
     assert set(road.people.values()) == set(DRIVERS)

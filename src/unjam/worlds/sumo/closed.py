@@ -48,7 +48,7 @@ class ClosedTraffic(Traffic[ClosedRoad]):
         """of the CAVs, in road order"""
         self._near = loop_neighbours(np.array(self._places), vehicles)
         self._near_single = loop_neighbours(self._places[0], vehicles)
-        self._commanded = scenario.people == "commanded"
+        self._commanded = scenario.human_control == "commanded"
         self._drivers = self._drivers_of(road.vehicle_ids)
         needed = range(vehicles) if self._commanded else np.concatenate(self._near).tolist()
         self._near_positions = {place: float(road.start_positions[place]) for place in needed}

@@ -68,7 +68,7 @@ def files_of(scenario: Scenario, road: Road) -> Files:
 
 def _traffic_xml(scenario: Scenario, road: BuiltRoad) -> str:
     """Return the XML of types, routes and vehicles of an episode."""
-    own = road.people if scenario.people == "native" else {}
+    own = road.people if scenario.human_control == "native" else {}
     humans = {"human": scenario.humans, **{f"of_{name}": one for name, one in own.items()}}
     lines = [_vehicle_type(name, scenario, **_human_layer(scenario, one)) for name, one in humans.items()]
     lines.append(_cav_type(scenario))
@@ -127,7 +127,7 @@ def _human_layer(scenario: Scenario, humans: IDMParameters) -> Attributes:
         "minGap": humans.minimum_gap,
         "maxSpeed": humans.desired_speed,
     }
-    if scenario.people == "commanded":
+    if scenario.human_control == "commanded":
         layer |= {"accel": 2.6, "decel": 4.5, "tau": 1.0, "minGap": scenario.people_gap}
         if population:  # the layer may not hold back who keeps less than a second
             layer |= {"tau": min(1.0, population.quickest), "maxSpeed": population.fastest}
