@@ -56,25 +56,23 @@ def as_rows(acceleration: Any, rows: int, where: str) -> NDArray[np.float64]:
     return array
 
 
-def accelerations(command: Command, limits: Limits, names: Sequence[str], where: str) -> list[float]:
+def accelerations(command: Command, limits: Limits, names: Sequence[str], step: int) -> list[float]:
     """Return what vehicles are told, within the limits, as plain floats [m/s2].
 
     Args:
         command: a driver's; its acceleration a number, or one for each vehicle.
         limits: of the road.
         names: the vehicles, in order.
-        where: when it was asked for, for messages.
+        step: in which it was asked for, for messages.
 
     Raises:
         InputError: an acceleration is not finite, or there are not as many as vehicles.
     """
     found, rows = command.acceleration, len(names)
-    if type(found) is float and rows == 1:
-        if isfinite(found):  # the common case, in every step of a simulator
-            return [limits.keep(found)]
-        values = [found]
-    else:
-        values = as_rows(found, rows, where).tolist()
+    if type(found) is float and rows == 1 and isfinite(found):  # in every step of a simulator: be quick
+        return [limits.keep(found)]
+    where = f"driver: step {step}"
+    values = [found] if type(found) is float and rows == 1 else as_rows(found, rows, where).tolist()
     for name, value in zip(names, values, strict=True):
         if not isfinite(value):
             raise InputError(f"{where}: acceleration of {name} is {value}; allowed: finite")

@@ -58,7 +58,7 @@ class ResidualDriver(Wrapper):
     def decide(self, state: LocalState, memory: Memory, noise: Noise | None = None) -> Decision:
         """Return the decision taken apart; with `noise`, the network explores."""
         wanted, after = self.expert.act(state, memory[EXPERT])
-        limits, hold, remembered = self.limits, self.hold, {EXPERT: after}
+        limits, hold = self.limits, self.hold
         expert = limits.keep(wanted)
         due: Any = True if hold == 1 else memory[AGE] % hold == 0
         if due is False:  # where one age counts for all rows, as in plain numbers, no network is asked
@@ -69,8 +69,9 @@ class ResidualDriver(Wrapper):
             residual = network(observation) if noise is None else network.explore(observation, noise())
             if due is not True:
                 residual = namespace(residual).where(due, residual, memory[RESIDUAL])
+        remembered = {EXPERT: after}
         if hold > 1:
-            remembered |= {RESIDUAL: residual, AGE: memory[AGE] + 1.0}
+            remembered = {EXPERT: after, RESIDUAL: residual, AGE: memory[AGE] + 1.0}
         command = Command(limits.keep(expert + residual))
         return Decision(command, expert, residual, observation, remembered)
 

@@ -131,10 +131,10 @@ def slide(memory: Window, speed: Array) -> Window:
 def mean_speed(memory: Window) -> Array:
     """Return the mean of what was seen [m/s], shape (n,); zero where nothing was."""
     window = memory["window"]
-    if isinstance(window, (PastSpeeds, WrittenRows)):
-        steps = window.steps
+    if isinstance(window, array):
+        steps = len(window)
     else:
-        steps = len(window) if isinstance(window, array) else window.shape[-1]
+        steps = window.steps if isinstance(window, (PastSpeeds, WrittenRows)) else window.shape[-1]
     return memory["total"] / clip(memory["seen"], 1.0, float(steps))
 
 

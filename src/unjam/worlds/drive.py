@@ -57,7 +57,8 @@ class Drive:
                 decision = decide(perceive(), self.memory, noise)
                 self.memory = decision.memory
                 advance(decision.command)
-            self._carry()
+            if world.kept is not None or world.entered > len(self.memories):
+                self._carry()
             made += 1
             if self._on_progress is not None and made % PROGRESS_STEPS == 0:
                 self._on_progress(made)

@@ -25,8 +25,8 @@ class Trajectory:
     states: LocalState
     """what it perceived, shape (T + 1,): the last entry is where it ended"""
     observations: Floats
-    """what the residual network saw at each of its looks, and at the end, shape (looks + 1, inputs); it
-    looks every `hold` decisions; (1, 0) without a network"""
+    """what the residual network saw at each of its choices, and at the end, shape (choices + 1, inputs); it
+    choices every `hold` decisions; (1, 0) without a network"""
     expert: Floats
     """the expert's acceleration within the action limit [m/s2]"""
     residual: Floats
@@ -57,7 +57,7 @@ class Trajectory:
 
     @property
     def choices(self) -> tuple[Floats, Floats]:
-        """The residuals that the network chose, and what was earned while each was held; shape (looks,)."""
+        """The residuals that the network chose, and what was earned while each was held; shape (choices,)."""
         starts = np.arange(0, len(self.residual), self.hold)
         return self.residual[starts], np.add.reduceat(self.reward, starts)
 
@@ -99,8 +99,8 @@ def trajectory(
 
     experts, residuals, seen = zip(*driven.decisions, strict=True)
     steps = range(start, start + len(applied))
-    looks = [*steps[:: driven.hold], steps.stop]
-    observations = own([*seen, driven.last_observation], looks).astype(np.float64).reshape(len(looks), -1)
+    choices = [*steps[:: driven.hold], steps.stop]
+    observations = own([*seen, driven.last_observation], choices).astype(np.float64).reshape(len(choices), -1)
     decided = observations, own(experts, steps), own(residuals, steps)
     return Trajectory(*about, *decided, applied, shield, driven.memories[number], driven.hold, terminated)
 

@@ -117,7 +117,7 @@ class RecordedWorld:
         """Note what was asked for, and go on to the next moment."""
         names, moment = [f"row {number}" for number in range(self.rows)], len(self._answers)
         wanted = Command(np.zeros(0)) if command is None else command
-        self._answers.append(accelerations(wanted, self.limits, names, f"step {moment}"))
+        self._answers.append(accelerations(wanted, self.limits, names, moment))
 
     def noise(self) -> Any:
         """Return none: nobody explores here."""

@@ -137,19 +137,23 @@ class ClosedTraffic(Traffic[ClosedRoad]):
         if self._commanded:
             self._command_people()
         simulation.step()
-        self._expect_all()
+        if simulation.vehicle_count() != len(self._human_mask):
+            self._expect_all()
         speeds = simulation.speeds(self.road.vehicle_ids)
         self._log_moved.fromlist(speeds)
         for place in near:
             near[place] += speeds[place] * step
         if self.scenario.noise > 0 and not self._commanded:
-            noisy = map(add, speeds, self._next_noise())
-            speeds = [speed if speed > 0.0 else 0.0 for speed in noisy]
+            speeds = list(map(add, speeds, self._next_noise()))
+            if min(speeds) < 0.0:
+                speeds = [at_least(speed, 0.0) for speed in speeds]
             simulation.replace_speeds(self._human_ids, compress(speeds, self._human_mask))
         self.speeds = speeds
         self._log_speeds.fromlist(speeds)
-        self.collisions = max(self.collisions, simulation.colliding_count())  # SUMO tells of each only once
-        self.crashed = self.collisions > 0
+        colliding = simulation.colliding_count()
+        if colliding:
+            self.collisions = max(self.collisions, colliding)  # SUMO tells of each only once
+            self.crashed = True
 
     def _expect_all(self) -> None:
         """Raise `EpisodeError` where not all vehicles are on the road."""
@@ -220,8 +224,8 @@ class ClosedTraffic(Traffic[ClosedRoad]):
         """Return what happened since the start."""
         road, each = self.road, self.scenario.steps_per_decision
         speeds, positions = (values[:, ::each] for values in self.speeds_and_positions())
-        everybody = loop_neighbours(np.arange(len(road.vehicle_ids)), len(road.vehicle_ids))
-        states = loop_state(speeds, positions, everybody, road.loop_length)
+        gaps = gap_on_loop(positions, np.roll(positions, -1, axis=0), road.loop_length, VEHICLE_LENGTH)
+        states = loop_state(speeds, positions, self._near, road.loop_length)
         applied, shield = self._applied(), self._shield()
         trajectories = tuple(
             trajectory(
@@ -229,13 +233,13 @@ class ClosedTraffic(Traffic[ClosedRoad]):
                 number=row,
                 start=0,
                 rows=None if self.single else np.full(self.decisions + 1, row),
-                states=states.each(lambda values: np.ascontiguousarray(values[place])),  # noqa: B023
+                states=states.each(lambda values: np.ascontiguousarray(values[row])),  # noqa: B023
                 applied=np.ascontiguousarray(applied[:, row]),
                 shield=np.ascontiguousarray(shield[:, row]),
                 terminated=self.crashed,
                 driven=driven,
             )
-            for row, (name, place) in enumerate(zip(road.cav_ids, self._places, strict=True))
+            for row, name in enumerate(road.cav_ids)
         )
         return Episode(
             **self._facts(),
@@ -243,7 +247,7 @@ class ClosedTraffic(Traffic[ClosedRoad]):
             cav_ids=road.cav_ids,
             speeds=np.ascontiguousarray(speeds.T),
             positions=np.ascontiguousarray(positions.T),
-            gaps=np.ascontiguousarray(states.leader_gap.T),
+            gaps=np.ascontiguousarray(gaps.T),
             fuel=np.array(self.log_fuel) if self.full else np.zeros((0, 0)),
             loop_length=road.loop_length,
             crossings=road.crossings,

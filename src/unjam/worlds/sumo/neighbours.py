@@ -37,14 +37,14 @@ def loop_state(speeds: Any, positions: Any, near: Neighbours, loop_length: float
     """
     own, ahead, behind = near
     speed, position = speeds[own], positions[own]
-    return LocalState(
-        speed=speed,
-        leader_speed=speeds[ahead],
-        leader_gap=gap_on_loop(position, positions[ahead], loop_length, VEHICLE_LENGTH),
-        follower_speed=speeds[behind],
-        follower_gap=gap_on_loop(positions[behind], position, loop_length, VEHICLE_LENGTH),
-        route_position=position % loop_length,
-        loop_length=loop_length if isinstance(position, float) else np.full(position.shape, loop_length),
+    return LocalState(  # names would cost as much as all the rest, in every step of a simulator
+        speed,
+        speeds[ahead],
+        gap_on_loop(position, positions[ahead], loop_length, VEHICLE_LENGTH),
+        speeds[behind],
+        gap_on_loop(positions[behind], position, loop_length, VEHICLE_LENGTH),
+        position % loop_length,
+        loop_length if type(position) is float else np.full(position.shape, loop_length),
     )
 
 

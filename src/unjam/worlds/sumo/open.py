@@ -156,7 +156,7 @@ class OpenTraffic(Traffic[RoadKind]):
         scenario, simulation, known = self.scenario, self._simulation, set(self.cavs)
         rows = [row for row, name in enumerate(self.cavs) if name in self._on_road]
         new = [name for name, chosen in self._on_road.items() if chosen and name not in known]
-        self._kept = rows if new or len(rows) < len(known) else None
+        self.kept = rows if new or len(rows) < len(known) else None
         self.cavs = [*(self.cavs[row] for row in rows), *new]
         self.entered += len(new)
         if self._controlled:

@@ -54,7 +54,7 @@ class Traffic(World[Episode], Generic[RoadKind]):
     """the CAVs on the road now, in order of entry: the rows of what drivers are given and answer"""
     speeds: Sequence[float]
     """of all vehicles on the road now [m/s]"""
-    _kept: Sequence[int] | None = None
+    kept: Sequence[int] | None = None  # pyright: ignore[reportIncompatibleMethodOverride]
 
     def __init__(
         self, scenario: Scenario, road: RoadKind, seed: Seed, simulation: Simulation, full: bool
@@ -103,11 +103,6 @@ class Traffic(World[Episode], Generic[RoadKind]):
         return False
 
     @property
-    def kept(self) -> Sequence[int] | None:
-        """Rows of the CAVs before the last decision that are on the road after it; None: the same ones."""
-        return self._kept
-
-    @property
     def ended(self) -> bool:
         """Whether there was a collision, nobody will be on the road any more, or the horizon is reached."""
         return self.crashed or self.over or self.decisions >= self.scenario.horizon
@@ -123,7 +118,7 @@ class Traffic(World[Episode], Generic[RoadKind]):
     def _told(self, command: Command | None) -> list[float]:
         """Return what the CAVs are told, within the limits [m/s2]; raise `InputError` where it cannot be."""
         wanted = Command(np.zeros(0)) if command is None else command
-        return accelerations(wanted, self.limits, self.cavs, f"driver: step {self.decisions}")
+        return accelerations(wanted, self.limits, self.cavs, self.decisions)
 
     def _drivers_of(self, names: Sequence[str]) -> list[IDMParameters]:
         """Return how the human driver of each vehicle drives."""
