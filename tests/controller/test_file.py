@@ -179,6 +179,66 @@ def test_a_file_by_itself_never_runs_code_that_it_names(tmp_path: Path, nested: 
     assert not (tmp_path / "sprung").exists()
 
 
+@pytest.fixture
+def seen_by_own(tmp_path: Path) -> tuple[Path, dict[str, Any], bytes]:
+    """A file whose running leaves a mark; manifest and weights of a mixture that sees its feature."""
+    code = tmp_path / "eyes.py"
+    code.write_text("def look(state):\n    return state.speed\n")
+    driver = Mixed((IDM(), residual(IDM(), parts=("local", f"{code}:look"))))
+    manifest, weights = parts_of(controller_bytes(driver, ABOUT))
+    trap = f"from pathlib import Path\nPath({str(tmp_path / 'sprung')!r}).touch()\n"
+    code.write_text(trap + code.read_text())
+    manifest["driver"]["drivers"][1]["files"][0]["sha256"] = hashlib.sha256(code.read_bytes()).hexdigest()
+    return code, manifest, weights
+
+
+@pytest.mark.parametrize(
+    "hide",
+    [
+        lambda recipe: recipe.pop("files"),
+        lambda recipe: recipe.update(files=[]),
+        lambda recipe: recipe["files"][0].update(kind="named"),
+        lambda recipe: recipe["files"][0].pop("kind"),
+        lambda recipe: recipe["files"][0].update(path="/other.py"),
+        lambda recipe: recipe["files"][0].update(name="other"),
+    ],
+    ids=["no list", "empty list", "another kind", "no kind", "another file", "another name"],
+)
+@pytest.mark.parametrize("own", [False, True], ids=["by itself", "run folder"])
+def test_a_feature_whose_file_is_not_listed_is_never_run(
+    tmp_path: Path,
+    seen_by_own: tuple[Path, dict[str, Any], bytes],
+    hide: Callable[[dict[str, Any]], object],
+    own: bool,
+) -> None:
+    code, manifest, weights = seen_by_own
+    hide(manifest["driver"]["drivers"][1])
+    content = archive_of(manifest=json.dumps(manifest), weights=weights)
+    (tmp_path / "controller.unjam").write_bytes(content)
+    with pytest.raises(InputError) as caught:
+        load_controller(tmp_path if own else written(tmp_path, content))
+    assert str(caught.value) == (
+        f"driver recipe: part: '{code}:look' is not allowed; allowed: features whose files the recipe lists "
+        f"with their hashes"
+    )
+    assert not (tmp_path / "sprung").exists()
+
+
+def test_a_feature_of_the_users_own_runs_from_its_run_folder_alone_and_unchanged(
+    tmp_path: Path, seen_by_own: tuple[Path, dict[str, Any], bytes]
+) -> None:
+    code, manifest, weights = seen_by_own
+    content = archive_of(manifest=json.dumps(manifest), weights=weights)
+    (tmp_path / "controller.unjam").write_bytes(content)
+    assert "is Python code (eyes.py), which a file by itself may not run" in refused(
+        written(tmp_path, content)
+    )
+    assert not (tmp_path / "sprung").exists()
+    assert isinstance(load_controller(tmp_path), Mixed)
+    code.write_text(code.read_text() + "# changed")
+    assert "has changed since" in refused(tmp_path)
+
+
 def test_changed_weights_are_noticed(tmp_path: Path) -> None:
     manifest, weights = parts_of(controller_bytes(residual(IDM()), ABOUT))
     changed = bytearray(weights)

@@ -17,7 +17,7 @@ from safetensors.numpy import load, save
 from unjam import __version__
 from unjam.drivers.driver import Driver
 from unjam.drivers.local_state import STATE_UNITS
-from unjam.drivers.registry import driver_from_recipe, files_of, recipe_of
+from unjam.drivers.registry import code_of, driver_from_recipe, recipe_of
 from unjam.errors import InputError
 from unjam.files import to_json
 from unjam.tree import leaves
@@ -125,7 +125,7 @@ def _check_code(name: str, recipe: Any, own: bool) -> None:
 
     What lies in a run folder is the user's `own`; a file by itself may come from anywhere.
     """
-    for found in files_of(recipe):
+    for found in code_of(recipe):
         code = Path(found["path"])
         if not own:
             raise InputError(

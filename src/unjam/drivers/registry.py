@@ -14,7 +14,7 @@ from unjam.drivers.driver import Driver, Recipe
 from unjam.drivers.follower_stopper import FollowerStopper
 from unjam.drivers.from_file import FileDriver, FileReference, is_file_reference
 from unjam.drivers.network import network_from_arrays
-from unjam.drivers.observation import FeatureName, observation_size
+from unjam.drivers.observation import FEATURES, FeatureName, observation_size
 from unjam.drivers.pi_saturation import PISaturation
 from unjam.drivers.residual import EXPERT, ResidualDriver
 from unjam.drivers.road_experts import JamAbsorber, Pacer
@@ -140,9 +140,29 @@ RECIPES: dict[str, Callable[[Recipe, Arrays, Held], Driver]] = {
 """how each kind of recipe becomes a driver again"""
 
 
-def files_of(recipe: Any) -> list[Recipe]:
-    """Return what within `recipe` refers to the users' own files: it is Python code."""
-    return [part for part in _within(recipe) if part["kind"] == "file"]
+def code_of(recipe: Any) -> list[Recipe]:
+    """Return what within `recipe` refers to the users' own files: it is Python code.
+
+    Raises:
+        InputError: a network sees a feature of a file that is not listed beside it with its hash.
+    """
+    held = list(_within(recipe))
+    for part in held:
+        if part["kind"] == "residual":
+            _check_listed(part)
+    return [part for part in held if part["kind"] == "file"]
+
+
+def _check_listed(recipe: Recipe) -> None:
+    """Raise `InputError` where a residual sees a feature whose file is not among those that it lists."""
+    found = build(_ResidualRecipe, recipe, "driver recipe")
+    listed = [(file.get("path"), file.get("name")) for file in found.files if file.get("kind") == "file"]
+    for name in found.parts:
+        if name not in FEATURES:
+            reference = FileReference.of(name)
+            if (str(reference.path), reference.name) not in listed:
+                allowed = "features whose files the recipe lists with their hashes"
+                raise wrong("driver recipe: part", name, allowed)
 
 
 def _within(recipe: Any) -> Iterator[Recipe]:

@@ -10,7 +10,7 @@ from unjam.controller.file import GRAPH, SAMPLE, read_controller
 from unjam.controller.verify import sample_bytes, verify_controller
 from unjam.drivers.driver import Driver
 from unjam.drivers.local_state import LocalState
-from unjam.drivers.registry import files_of, recipe_of
+from unjam.drivers.registry import code_of, recipe_of
 from unjam.drivers.residual import ResidualDriver
 from unjam.errors import InputError, wrong
 from unjam.files import check_folder, write_whole
@@ -59,7 +59,7 @@ def export_controller(source: str | Path, to: str | Path, onnx: bool = False, sc
         raise wrong("to", str(to), f"a file that ends in {SUFFIX}")
     check_folder(to)
     road, driver, about = _of_run(source, scenario) if source.is_dir() else _of_driver(str(source), scenario)
-    code = files_of(recipe_of(driver)[0])
+    code = code_of(recipe_of(driver)[0])
     if driver.native or code:
         why = f"{Path(code[0]['path']).name} is Python code" if code else "human is the simulator itself"
         raise InputError(f"export: {driver.describe()} is not allowed: {why}; allowed: drivers that are data")
