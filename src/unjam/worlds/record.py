@@ -26,7 +26,7 @@ class Trajectory:
     """what it perceived, shape (T + 1,): the last entry is where it ended"""
     observations: Floats
     """what the residual network saw at each of its choices, and at the end, shape (choices + 1, inputs); it
-    choices every `hold` decisions; (1, 0) without a network"""
+    chooses every `hold` decisions; (1, 0) without a network"""
     expert: Floats
     """the expert's acceleration within the action limit [m/s2]"""
     residual: Floats
