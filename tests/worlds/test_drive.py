@@ -6,8 +6,9 @@ import pytest
 from tests.conftest import random_network
 from tests.mock_world import MockWorld
 from unjam.drivers import IDM, Human, LocalState, PISaturation, ResidualDriver
-from unjam.drivers.command import Limits
+from unjam.drivers.command import Command, Limits
 from unjam.drivers.wrappers import Impaired, Mixed
+from unjam.errors import InputError
 from unjam.worlds.drive import Drive, drive
 from unjam.worlds.world import RecordedWorld
 
@@ -79,3 +80,11 @@ def test_it_goes_on_from_a_memory() -> None:
     assert len(list(first)) == 2
     rest = RecordedWorld(states.each(lambda values: values[2:]), Limits(-1.0, 1.0))
     np.testing.assert_array_equal(drive(rest, PI, memory=first.memory), whole[2:])
+
+
+def test_a_recording_names_the_row_that_is_driven_wrongly() -> None:
+    states = LocalState(*(np.full((6, 2), value) for value in (4.0, 5.0, 10.0, 3.0, 8.0, 20.0, 250.0)))
+    world = RecordedWorld(states, Limits(-1.0, 1.0))
+    world.advance(Command(np.zeros(2)))
+    with pytest.raises(InputError, match="driver: step 1: acceleration of row 1 is nan; allowed: finite"):
+        world.advance(Command(np.array([0.0, np.nan])))

@@ -56,11 +56,11 @@ def as_rows(acceleration: Any, rows: int, where: str) -> NDArray[np.float64]:
     return array
 
 
-def accelerations(command: Command, limits: Limits, names: Sequence[str], step: int) -> list[float]:
+def accelerations(command: Command | None, limits: Limits, names: Sequence[str], step: int) -> list[float]:
     """Return what vehicles are told, within the limits, as plain floats [m/s2].
 
     Args:
-        command: a driver's; its acceleration a number, or one for each vehicle.
+        command: a driver's; its acceleration a number, or one for each vehicle. None is right for no vehicle.
         limits: of the road.
         names: the vehicles, in order.
         step: in which it was asked for, for messages.
@@ -68,12 +68,14 @@ def accelerations(command: Command, limits: Limits, names: Sequence[str], step: 
     Raises:
         InputError: an acceleration is not finite, or there are not as many as vehicles.
     """
-    found, rows = command.acceleration, len(names)
-    if type(found) is float and rows == 1 and isfinite(found):  # in every step of a simulator: be quick
+    found: Array = () if command is None else command.acceleration
+    rows = len(names)
+    one = type(found) is float and rows == 1
+    if one and isfinite(found):  # in every step of a simulator: be quick
         return [limits.keep(found)]
     where = f"driver: step {step}"
-    values = [found] if type(found) is float and rows == 1 else as_rows(found, rows, where).tolist()
-    for name, value in zip(names, values, strict=True):
-        if not isfinite(value):
-            raise InputError(f"{where}: acceleration of {name} is {value}; allowed: finite")
-    return [limits.keep(value) for value in values]
+    values = as_rows([found] if one else found, rows, where)
+    if not all(map(isfinite, values.tolist())):  # quicker than NumPy where vehicles are few
+        first = int(np.isfinite(values).argmin())
+        raise InputError(f"{where}: acceleration of {names[first]} is {values[first]}; allowed: finite")
+    return limits.keep(values).tolist()

@@ -97,6 +97,7 @@ class RecordedWorld:
         """Take the states of n CAVs at T moments, arrays of shape (T, n)."""
         self.states, self.limits = states, limits
         self.rows = self.entered = states.speed.shape[1]
+        self._names = [f"row {number}" for number in range(self.rows)]
         self._answers: list[list[float]] = []
 
     def start(self, controlled: bool, on_progress: OnProgress | None = None) -> None:
@@ -115,9 +116,7 @@ class RecordedWorld:
 
     def advance(self, command: Command | None) -> None:
         """Note what was asked for, and go on to the next moment."""
-        names, moment = [f"row {number}" for number in range(self.rows)], len(self._answers)
-        wanted = Command(np.zeros(0)) if command is None else command
-        self._answers.append(accelerations(wanted, self.limits, names, moment))
+        self._answers.append(accelerations(command, self.limits, self._names, len(self._answers)))
 
     def noise(self) -> Any:
         """Return none: nobody explores here."""

@@ -117,8 +117,7 @@ class Traffic(World[Episode], Generic[RoadKind]):
 
     def _told(self, command: Command | None) -> list[float]:
         """Return what the CAVs are told, within the limits [m/s2]; raise `InputError` where it cannot be."""
-        wanted = Command(np.zeros(0)) if command is None else command
-        return accelerations(wanted, self.limits, self.cavs, self.decisions)
+        return accelerations(command, self.limits, self.cavs, self.decisions)
 
     def _drivers_of(self, names: Sequence[str]) -> list[IDMParameters]:
         """Return how the human driver of each vehicle drives."""

@@ -1,0 +1,40 @@
+import numpy as np
+import pytest
+
+from unjam.drivers.command import Command, Limits, accelerations
+from unjam.errors import InputError
+
+LIMITS = Limits(-1.0, 0.5)
+
+
+@pytest.mark.parametrize("wanted", [[-3.0, 0.2, 3.0], np.array([-3.0, 0.2, 3.0])])
+def test_vehicles_are_told_plain_numbers_within_the_limits(wanted: object) -> None:
+    told = accelerations(Command(wanted), LIMITS, "abc", 0)
+    assert told == [-1.0, 0.2, 0.5]
+    assert {type(number) for number in told} == {float}
+
+
+def test_a_plain_number_is_for_one_vehicle() -> None:
+    assert accelerations(Command(2.0), LIMITS, "a", 0) == [0.5]
+    with pytest.raises(InputError, match=r"driver: step 4: acceleration has shape \(\); allowed: \(2,\)"):
+        accelerations(Command(2.0), LIMITS, "ab", 4)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("rows", [1, 3, 200])
+def test_the_first_that_is_not_finite_is_named(bad: float, rows: int) -> None:
+    wanted = np.zeros(rows)
+    wanted[rows // 2 :] = bad
+    message = f"driver: step 7: acceleration of car {rows // 2} is {bad}; allowed: finite"
+    with pytest.raises(InputError) as caught:
+        accelerations(Command(wanted), LIMITS, [f"car {number}" for number in range(rows)], 7)
+    assert str(caught.value) == message
+    if rows == 1:
+        with pytest.raises(InputError, match="acceleration of car 0 is"):
+            accelerations(Command(bad), LIMITS, ["car 0"], 7)
+
+
+def test_no_command_is_right_where_there_is_nobody() -> None:
+    assert accelerations(None, LIMITS, [], 0) == []
+    with pytest.raises(InputError, match=r"driver: step 2: acceleration has shape \(0,\); allowed: \(2,\)"):
+        accelerations(None, LIMITS, "ab", 2)
