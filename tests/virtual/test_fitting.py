@@ -163,3 +163,10 @@ def test_every_estimator_is_there(known: tuple[EnvironmentModel, Fit]) -> None:
     assert 0 < errors["unexplained"] < 0.1
     assert 0 < errors["total_variation"] < 1
     assert 0 < errors["released"] < 0.1
+
+
+@pytest.mark.parametrize("base", ["none", "idm"])
+def test_what_there_is_to_learn_of_a_row_hangs_on_that_row_alone(actual: Transitions, base: str) -> None:
+    rows = np.random.default_rng(0).permutation(np.flatnonzero(actual.held_out))[:37]
+    found = targets_of(actual.chosen(rows), base, RING, "")
+    np.testing.assert_array_equal(found, targets_of(actual, base, RING, "")[rows])

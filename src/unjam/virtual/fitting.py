@@ -130,9 +130,8 @@ def fit(
     model.learned.copy_(torch.as_tensor(learned))
     model.noise.copy_(torch.as_tensor(noise))
 
-    steps = OneStepErrors(
-        wanted, predicted, targets_of(actual, "none", scenario, reward)[holdout]
-    ).by_number()
+    change = targets_of(actual.chosen(holdout), "none", scenario, reward)
+    steps = OneStepErrors(wanted, predicted, change).by_number()
     errors = {
         "unexplained": unexplained([steps[name] for name in NUMBERS]),
         "total_variation": total_variation(predicted[:, :, :-1], left[:, :-1].std(0)),
