@@ -24,7 +24,7 @@ def content_of(iteration: int) -> Content:
         "iteration": iteration,
         "actual_steps": 300 * iteration,
         "validation_best": 1 / 3,
-        "expert_return": -1e9,
+        "expert_returns": [-1e9],
     }
     generator = torch.Generator().manual_seed(iteration)
     tensors = {"policy.weight": torch.randn(3, 2, generator=generator), "optimizer.0.step": torch.tensor(4.0)}
@@ -50,12 +50,13 @@ def test_gives_back_what_was_saved(tmp_path: Path) -> None:
 
 
 def test_numbers_that_json_does_not_know_come_back(tmp_path: Path) -> None:
-    state = {"iteration": 1, "validation_best": float("-inf"), "expert_return": float("nan")}
+    state = {"iteration": 1, "validation_best": float("-inf"), "expert_returns": [float("nan")]}
     save_checkpoint(tmp_path, state, {})
     found = load_checkpoint(tmp_path)
     assert found is not None
     assert found[0]["validation_best"] == float("-inf")
-    assert found[0]["expert_return"] != found[0]["expert_return"]
+    (expert,) = found[0]["expert_returns"]
+    assert expert != expert
 
 
 def test_without_any_there_is_none(tmp_path: Path) -> None:

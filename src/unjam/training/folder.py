@@ -27,7 +27,7 @@ from unjam.worlds.reward import make_reward
 if TYPE_CHECKING:
     from unjam.learners.learner import Tensors
 
-FORMAT = 3
+FORMAT = 4
 """of what a checkpoint holds; one of another unjam is refused"""
 GENERATIONS = 2
 STATE, TENSORS = "state.json", "tensors.safetensors"

@@ -163,7 +163,7 @@ class Trainer:
             state, tensors = checkpoint
             self.training.restore(state, tensors)
             self._validation_best = state["validation_best"]
-            self._expert_returns = state.get("expert_returns", [state["expert_return"]])
+            self._expert_returns = state["expert_returns"]
             for place in {folder, *self.folders}:
                 _forget_progress_after(state["iteration"], place)
 
@@ -230,8 +230,7 @@ class Trainer:
         state = {
             **counters,
             "validation_best": self._validation_best,
-            "expert_return": whole["return_expert"],
-            **({"expert_returns": self._expert_returns} if self.config.tasks else {}),
+            "expert_returns": self._expert_returns,
         }
         save_checkpoint(self.folder / "checkpoint", state, tensors)
         self._on_iteration(whole)
