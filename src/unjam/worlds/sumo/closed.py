@@ -137,8 +137,7 @@ class ClosedTraffic(Traffic[ClosedRoad]):
         if self._commanded:
             self._command_people()
         simulation.step()
-        if simulation.vehicle_count() != len(self._human_mask):
-            self._expect_all()
+        self._expect_all()
         speeds = simulation.speeds(self.road.vehicle_ids)
         self._log_moved.fromlist(speeds)
         for place in near:
