@@ -92,11 +92,9 @@ def draw_starts(
     (0, 2) where there are none such.
     """
     choices = data.choices(ahead, since)
-    return (
-        choices[np.random.default_rng(list(seed)).integers(len(choices), size=rows)]
-        if len(choices)
-        else choices
-    )
+    if len(choices) == 0:
+        return choices
+    return choices[np.random.default_rng(list(seed)).integers(len(choices), size=rows)]
 
 
 def begin(data: ActualData, choices: NDArray[np.int64], expert: Driver, device: torch.device | str) -> Starts:
