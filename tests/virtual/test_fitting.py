@@ -43,9 +43,9 @@ def known(actual: Transitions) -> tuple[EnvironmentModel, Fit]:
 
 def test_what_the_base_knows_is_not_left_to_learn(actual: Transitions) -> None:
     targets = targets_of(actual, "idm", RING, "")
-    left = dict(zip(TARGETS, np.abs(targets).max(0), strict=True))
-    assert left["speed"] == left["follower_speed"] == left["follower_gap"] == pytest.approx(0, abs=1e-12)
-    assert left["leader_speed"] > 0.01
+    worst = dict(zip(TARGETS, np.abs(targets).max(0), strict=True))
+    assert worst["speed"] == worst["follower_speed"] == worst["follower_gap"] == pytest.approx(0, abs=1e-12)
+    assert worst["leader_speed"] > 0.01
     np.testing.assert_allclose(targets[:, -1], 0.1 * actual.states.leader_gap / 20.0, atol=1e-9)
 
 
@@ -119,8 +119,8 @@ def test_noise_is_what_the_holdout_was_off_by(actual: Transitions) -> None:
 def test_the_learned_part_of_the_reward_has_the_range_of_the_data(
     known: tuple[EnvironmentModel, Fit], actual: Transitions
 ) -> None:
-    left = 0.1 * actual.states.leader_gap / 20.0
-    np.testing.assert_allclose(known[0].reward_range.numpy(), [left.min(), left.max()], rtol=1e-5)
+    residual = 0.1 * actual.states.leader_gap / 20.0
+    np.testing.assert_allclose(known[0].reward_range.numpy(), [residual.min(), residual.max()], rtol=1e-5)
 
 
 def test_the_same_seed_gives_the_same_bits(known: tuple[EnvironmentModel, Fit], actual: Transitions) -> None:

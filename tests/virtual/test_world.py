@@ -23,18 +23,18 @@ from unjam.worlds.reward import Outcome, make_reward
 RING = Ring()
 
 
-def model(members: int = 1, left: dict[str, float] | None = None, drawn: int = 1) -> EnvironmentModel:
-    """A model that adds the numbers `left` to its base everywhere; without them, something of its own."""
+def model(members: int = 1, residual: dict[str, float] | None = None, drawn: int = 1) -> EnvironmentModel:
+    """A model that adds the numbers `residual` to its base everywhere; without them, something of its own."""
     made = EnvironmentModel(VirtualSettings(members=members, hidden=(16,)), drawn, (1,))
     made.learned.fill_(1.0)
     made.reward_range.copy_(torch.tensor([-1.0, 1.0]))
     with torch.no_grad():
-        if left is None:
+        if residual is None:
             made.weights[-1] += 0.02 * torch.randn(
                 made.weights[-1].shape, generator=torch_generator((2,), "cpu")
             )
         else:
-            made.biases[-1] += torch.tensor([left.get(name, 0.0) for name in TARGETS])
+            made.biases[-1] += torch.tensor([residual.get(name, 0.0) for name in TARGETS])
     return made
 
 
@@ -48,13 +48,13 @@ def world(of: EnvironmentModel, noise: bool = False, ring: Ring = RING, seed: in
 
 @pytest.mark.parametrize("ring", [RING, replace(RING, simulation_step=0.2, steps_per_decision=5)])
 def test_adds_what_the_networks_say_to_the_base(ring: Ring) -> None:
-    left = {"speed": 0.1, "leader_speed": 0.2, "leader_gap": 0.3, "follower_gap": 0.5, "reward": 0.7}
+    residual = {"speed": 0.1, "leader_speed": 0.2, "leader_gap": 0.3, "follower_gap": 0.5, "reward": 0.7}
     state, applied, drawn = some_state(20), torch.linspace(-1, 1, 20), torch.zeros(20, 1)
     state = state._replace(leader_gap=state.leader_gap + 20, follower_gap=state.follower_gap + 20)
-    step = world(model(left=left), ring=ring).step(state, applied, drawn)
+    step = world(model(residual=residual), ring=ring).step(state, applied, drawn)
     known = base_step("idm", ring, state, applied)
     for name in NUMBERS:
-        assert_close(getattr(step.state, name), getattr(known, name) + left.get(name, 0.0))
+        assert_close(getattr(step.state, name), getattr(known, name) + residual.get(name, 0.0))
     none = torch.zeros(20, dtype=torch.bool)
     assert_close(step.reward, base_reward("idm", make_reward("released"), step.state, applied, none) + 0.7)
     assert not step.crashed.any()
@@ -63,7 +63,7 @@ def test_adds_what_the_networks_say_to_the_base(ring: Ring) -> None:
 
 def test_drives_round_the_loop() -> None:
     state = some_state(1)._replace(speed=torch.tensor([10.0]), route_position=torch.tensor([229.5]))
-    step = world(model(left={})).step(state, torch.zeros(1), torch.zeros(1, 1))
+    step = world(model(residual={})).step(state, torch.zeros(1), torch.zeros(1, 1))
     assert_close(step.state.route_position, torch.tensor([0.5]))
     assert_close(step.state.loop_length, torch.tensor([230.0]))
 
@@ -86,7 +86,7 @@ def test_rows_at_once_step_as_single_rows(seed: int) -> None:
 @given(st.integers(0, 10**6), st.sampled_from([0.0, 1.0, 100.0]))
 def test_what_it_leads_to_is_physically_possible(seed: int, scale: float) -> None:
     generator = torch_generator((seed,), "cpu")
-    wild = model(left={name: scale * float(torch.randn(1, generator=generator)) for name in TARGETS})
+    wild = model(residual={name: scale * float(torch.randn(1, generator=generator)) for name in TARGETS})
     state = some_state(30, seed)
     step = world(wild).step(state, torch.ones(30), torch.zeros(30, 1))
     known = base_reward("idm", make_reward("released"), step.state, torch.ones(30), step.crashed)
@@ -100,7 +100,7 @@ def test_what_it_leads_to_is_physically_possible(seed: int, scale: float) -> Non
 
 
 @pytest.mark.parametrize(
-    ("left", "bounded"),
+    ("residual", "bounded"),
     [
         ({"speed": -50.0}, [True, False, False]),
         ({"follower_speed": 50.0}, [True, False, False]),
@@ -110,9 +110,9 @@ def test_what_it_leads_to_is_physically_possible(seed: int, scale: float) -> Non
         ({}, [False, False, False]),
     ],
 )
-def test_each_kind_of_bound_is_told(left: dict[str, float], bounded: list[bool]) -> None:
+def test_each_kind_of_bound_is_told(residual: dict[str, float], bounded: list[bool]) -> None:
     state = some_state(4)._replace(leader_gap=torch.full((4,), 30.0), follower_gap=torch.full((4,), 30.0))
-    step = world(model(left=left)).step(state, torch.zeros(4), torch.zeros(4, 1))
+    step = world(model(residual=residual)).step(state, torch.zeros(4), torch.zeros(4, 1))
     assert BOUNDS == ("speed", "gap", "reward")
     assert step.bounded.tolist() == [[kind] * 4 for kind in bounded]
     assert not step.crashed.any()
@@ -122,7 +122,7 @@ def test_each_kind_of_bound_is_told(left: dict[str, float], bounded: list[bool])
 def test_a_gap_that_is_used_up_is_a_crash_that_earns_nothing(gap: str) -> None:
     state = some_state(3)._replace(leader_gap=torch.full((3,), 30.0), follower_gap=torch.full((3,), 30.0))
     state = state._replace(**{gap: torch.tensor([30.0, 1.0, 30.0])})
-    step = world(model(left={gap: -4.0, "reward": 0.5})).step(state, torch.ones(3), torch.zeros(3, 1))
+    step = world(model(residual={gap: -4.0, "reward": 0.5})).step(state, torch.ones(3), torch.zeros(3, 1))
     assert step.crashed.tolist() == [False, True, False]
     assert getattr(step.state, gap)[1] == 0.0
     assert step.reward[1] == 0.0
@@ -131,18 +131,18 @@ def test_a_gap_that_is_used_up_is_a_crash_that_earns_nothing(gap: str) -> None:
 
 def test_on_an_open_road_nobody_beyond_the_largest_gap_is_seen() -> None:
     state = some_state(2)._replace(loop_length=torch.full((2,), torch.nan), leader_gap=torch.full((2,), 99.0))
-    step = world(model(left={"leader_gap": 5.0})).step(state, torch.zeros(2), torch.zeros(2, 1))
+    step = world(model(residual={"leader_gap": 5.0})).step(state, torch.zeros(2), torch.zeros(2, 1))
     assert (step.state.leader_gap == LARGEST_GAP).all()
     assert_close(step.state.leader_speed, step.state.speed)
     assert_close(step.state.route_position, state.route_position + 0.1 * step.state.speed)
     assert step.reward.isfinite().all()
     closed = state._replace(loop_length=torch.full((2,), 230.0))
-    beyond = world(model(left={"leader_gap": 5.0})).step(closed, torch.zeros(2), torch.zeros(2, 1))
+    beyond = world(model(residual={"leader_gap": 5.0})).step(closed, torch.zeros(2), torch.zeros(2, 1))
     assert (beyond.state.leader_gap > 102.0).all()
 
 
 def test_noise_has_the_distribution_of_the_errors() -> None:
-    noisy = model(left={})
+    noisy = model(residual={})
     error = torch.randn(len(noisy.noise), generator=torch_generator((5,), "cpu"))
     noisy.noise[:, TARGETS.index("leader_speed")] = 0.5 * error
     noisy.noise[:, TARGETS.index("leader_gap")] = 0.2 * error
@@ -164,7 +164,7 @@ def test_noise_has_the_distribution_of_the_errors() -> None:
 @pytest.mark.parametrize("gap", ["leader_gap", "follower_gap"])
 def test_noise_alone_never_makes_a_crash(gap: str) -> None:
     """A jump that does not fit into the gap does not happen; one that fits does."""
-    jumpy = model(left={})
+    jumpy = model(residual={})
     jumpy.noise[:, TARGETS.index(gap)] = -20.0
     jumpy.noise[:, TARGETS.index("reward")] = 0.5
     state = some_state(3)._replace(
@@ -181,7 +181,7 @@ def test_noise_alone_never_makes_a_crash(gap: str) -> None:
 
 
 def test_every_member_answers_for_some_rows_and_each_row_gets_all_in_time() -> None:
-    several = model(members=3, left={})
+    several = model(members=3, residual={})
     with torch.no_grad():
         several.biases[-1][:, 0, NUMBERS.index("leader_gap")] = torch.tensor([1.0, 2.0, 3.0])
     drives = world(several)

@@ -125,8 +125,8 @@ def fit(
     wanted, predicted = targets[holdout].cpu().numpy(), answers_of(model, inputs[holdout])
     learned = np.square(wanted - predicted).mean((0, 1)) < np.square(wanted).mean(0)
     predicted = predicted * learned  # where the base is better, it is used alone
-    left = wanted - predicted.mean(0)
-    noise = left[generator.integers(len(left), size=NOISE_ROWS)] - left.mean(0)
+    error = wanted - predicted.mean(0)
+    noise = error[generator.integers(len(error), size=NOISE_ROWS)] - error.mean(0)
     model.learned.copy_(torch.as_tensor(learned))
     model.noise.copy_(torch.as_tensor(noise))
 
@@ -134,7 +134,7 @@ def fit(
     steps = OneStepErrors(wanted, predicted, change).by_number()
     errors = {
         "unexplained": unexplained([steps[name] for name in NUMBERS]),
-        "total_variation": total_variation(predicted[:, :, :-1], left[:, :-1].std(0)),
+        "total_variation": total_variation(predicted[:, :, :-1], error[:, :-1].std(0)),
         "released": last_loss,
     }
     names = tuple(itertools.compress(TARGETS, learned))
@@ -149,8 +149,8 @@ def targets_of(actual: Transitions, base: str, scenario: Scenario, reward: str) 
     known = base_step(base, scenario, actual.states, actual.applied)
     earned = make_reward(reward or scenario.reward)
     known_reward = base_reward(base, earned, actual.following, actual.applied, actual.crashed)
-    left = [getattr(actual.following, name) - getattr(known, name) for name in NUMBERS]
-    return np.column_stack([*left, actual.reward - known_reward])
+    residual = [getattr(actual.following, name) - getattr(known, name) for name in NUMBERS]
+    return np.column_stack([*residual, actual.reward - known_reward])
 
 
 @torch.no_grad()

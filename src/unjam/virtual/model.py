@@ -1,4 +1,4 @@
-"""The model of the virtual environment: a base, and an ensemble of networks for what is left; Eq. 4."""
+"""The model of the virtual environment: a base, and an ensemble of networks for its residual; Eq. 4."""
 
 import itertools
 from collections.abc import Callable, Sequence
@@ -140,7 +140,7 @@ def base_reward(base: str, reward: Reward, following: LocalState, applied: Array
 
 
 def predict(layers: Layers, inputs: Tensor, members: Tensor) -> Tensor:
-    """Return what is left after the base, SI units, shape (n, 6).
+    """Return the residual of the base, SI units, shape (n, 6).
 
     Args:
         layers: of `EnvironmentModel.layers`.
@@ -219,7 +219,7 @@ class EnvironmentModel(nn.Module):
         self.register_buffer("target_scale", torch.ones(len(TARGETS)))
         self.register_buffer("learned", torch.zeros(len(TARGETS)))  # 1 where the networks beat the base
         self.register_buffer("noise", torch.zeros((NOISE_ROWS, len(TARGETS))))
-        self.register_buffer("reward_range", torch.zeros(2))  # of what is left of the reward
+        self.register_buffer("reward_range", torch.zeros(2))  # of the residual of the reward
         self.to(device)
 
     def forward(self, inputs: Tensor) -> Tensor:

@@ -143,14 +143,14 @@ class VirtualDynamics:
         scenario = self._scenario
         known = base_step(self._model.base, scenario, state, applied)
         expected = torch.stack([getattr(known, name) for name in NUMBERS])
-        left = self._left(state, applied, drawn, expected[GAP_ROWS]).T
-        numbers = expected + left[: len(NUMBERS)]
+        residual = self._residual(state, applied, drawn, expected[GAP_ROWS]).T
+        numbers = expected + residual[: len(NUMBERS)]
         wanted_speeds, wanted_gaps = numbers[: len(SPEEDS)], numbers[GAP_ROWS]
         crashed = (wanted_gaps <= 0.0).any(0)
         largest = largest_gap(state)
         speeds = wanted_speeds.clip(0.0, scenario.top_speed)
         gaps = wanted_gaps.clip(0.0).minimum(largest)
-        left_of_reward = left[-1].clip(*self._model.reward_range)
+        residual_reward = residual[-1].clip(*self._model.reward_range)
         nobody = gaps >= largest
         speed = speeds[0]
         position = state.route_position + distance_driven(
@@ -167,11 +167,11 @@ class VirtualDynamics:
         )
         earned = base_reward(self._model.base, self._reward, following, applied, crashed)
         bounded = torch.stack(
-            [(speeds != wanted_speeds).any(0), (gaps != wanted_gaps).any(0), left_of_reward != left[-1]]
+            [(speeds != wanted_speeds).any(0), (gaps != wanted_gaps).any(0), residual_reward != residual[-1]]
         )
-        return Outcomes(following, earned + left_of_reward * ~crashed, crashed, bounded)
+        return Outcomes(following, earned + residual_reward * ~crashed, crashed, bounded)
 
-    def _left(self, state: LocalState, applied: Tensor, drawn: Tensor, expected_gaps: Tensor) -> Tensor:
+    def _residual(self, state: LocalState, applied: Tensor, drawn: Tensor, expected_gaps: Tensor) -> Tensor:
         """Return what the networks add to the base, with noise, shape (n, 6).
 
         `expected_gaps`, shape (2, n), are those of the base.
@@ -179,12 +179,12 @@ class VirtualDynamics:
         rows, members = len(applied), self._fixed_members
         if members is None:
             members = random_members(self._model.members, rows, self._generator)
-        left = predict(self._layers, model_inputs(state, applied, drawn), members)
+        residual = predict(self._layers, model_inputs(state, applied, drawn), members)
         if self._noisy:
             generator = self._generator
             chosen = torch.randint(NOISE_ROWS, (rows,), generator=generator, device=generator.device)
-            noisy = left + self._model.noise.index_select(0, chosen)
+            noisy = residual + self._model.noise.index_select(0, chosen)
             # A vehicle that changes lanes or merges makes a gap jump: it does so only where it fits.
             closes = (expected_gaps + noisy.T[GAP_ROWS] <= 0.0).any(0)
-            left = torch.where(closes[:, None], left, noisy)
-        return left
+            residual = torch.where(closes[:, None], residual, noisy)
+        return residual
