@@ -40,10 +40,7 @@ class DeterministicResidualPolicy(OffPolicyResidual, TD3Policy):
 
 
 class TD3(OffPolicy):
-    """Twin delayed deep deterministic policy gradient from whole episodes.
-
-    Source: Fujimoto et al. 2018, Addressing function approximation error in actor-critic methods.
-    """
+    """Twin delayed deep deterministic policy gradient from whole episodes."""
 
     def __init__(self, spec: AgentSpec, settings: TD3Settings) -> None:
         super().__init__(
