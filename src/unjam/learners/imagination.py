@@ -14,6 +14,7 @@ from unjam.drivers.residual import ResidualDriver
 from unjam.errors import MissingPartError
 from unjam.following.calibration import calibrated_people
 from unjam.learners.experience import Experience
+from unjam.learners.learner import under
 from unjam.learners.settings import PolicySettings
 from unjam.physics.idm import IDMParameters
 from unjam.virtual.comparison import return_gap
@@ -150,7 +151,7 @@ class Imagination:
 
     def restore(self, facts: dict[str, Any], tensors: dict[str, torch.Tensor]) -> None:
         """Go on from what `state` returned."""
-        arrays = {name.removeprefix(DATA): t.numpy() for name, t in tensors.items() if name.startswith(DATA)}
+        arrays = {name: tensor.numpy() for name, tensor in under(DATA, tensors).items()}
         self.data = unpack_data(facts["data"], arrays)
         self.steps = facts["steps"]
         self.scenario = replace(self.scenario, humans=IDMParameters(**facts["people"]))
