@@ -16,7 +16,10 @@ from unjam.physics.arrays import Array, clip
 
 
 class Command(NamedTuple):
-    """What n CAVs shall do until the next decision; arrays of shape (n,), or plain numbers of one."""
+    """What n CAVs shall do until the next decision; arrays of shape (n,), or plain numbers of one.
+
+    No world carries out `speed_cap` and `lane` yet.
+    """
 
     acceleration: Array
     """[m/s2]"""
