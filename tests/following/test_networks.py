@@ -12,7 +12,7 @@ from unjam.following.networks import (
     fit_one_step,
     on_rows,
 )
-from unjam.following.open_loop import Limits, idm_follow, open_loop, with_residual
+from unjam.following.open_loop import Bounds, idm_follow, open_loop, with_residual
 from unjam.following.pairs import Moments, moments_of, stretches_of
 from unjam.physics.idm import PAPER_IDM, IDMParameters
 from unjam.scenarios.population import residual_inputs
@@ -69,7 +69,7 @@ def test_without_progress_it_ends(rows: Moments) -> None:
     assert len(losses.training) < 50
 
 
-LIMITS: Limits = (-4.0, 2.0)
+LIMITS: Bounds = (-4.0, 2.0)
 DRIVING = MultiStepSettings(hidden=(8,), seconds=6.0, batch=16, steps=30, rate=2e-2, validate_every=10)
 
 

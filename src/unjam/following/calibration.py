@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from pydantic.dataclasses import dataclass as checked_dataclass
 
 from unjam.drivers.local_state import LocalState
-from unjam.following.open_loop import Limits, Model, drive_behind, open_loop, personal_idm, with_values
+from unjam.following.open_loop import Bounds, Model, drive_behind, open_loop, personal_idm, with_values
 from unjam.following.pairs import Floats, Pair, Stretches, people_behind, stretches_of
 from unjam.parameters import STRICT, Count, CountOrNone, NotNegative, Positive
 from unjam.physics.idm import IDMParameters, IDMRows
@@ -43,7 +43,7 @@ class CalibrationSettings:
     every: Literal["trajectory", "moment"] = "trajectory"
     """what counts alike: `trajectory`: the mean of their root mean squared errors; `moment`: one root mean
     square over all of them, in which the few who leave very large gaps decide"""
-    limits: Limits = (-4.0, 2.0)
+    limits: Bounds = (-4.0, 2.0)
     """within which the acceleration is kept [m/s2]: where a gap is nearly used up the IDM alone brakes beyond
     all bounds"""
     seconds: Positive = 120.0
@@ -84,7 +84,7 @@ class Calibrated:
     bounds: tuple[str, ...]
     """parameters that lie at the end of what was searched: the data do not tell them"""
 
-    def model(self, limits: Limits) -> Model:
+    def model(self, limits: Bounds) -> Model:
         """Return it as a driver."""
         return personal_idm(self.parameters, self.kept_headway, limits)
 
@@ -141,7 +141,7 @@ def calibrate(
 
 
 def gap_objective(
-    stretches: Stretches, limits: Limits, every: str, headways: Floats | float = 1.0
+    stretches: Stretches, limits: Bounds, every: str, headways: Floats | float = 1.0
 ) -> Callable[[Floats], Floats]:
     """Return the error of the simulated gap [m] as a function of candidates, shape (6, S) -> (S,).
 

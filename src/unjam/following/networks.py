@@ -21,8 +21,8 @@ from torch import Tensor, nn
 from unjam.drivers.network import Network
 from unjam.errors import UnjamError
 from unjam.following.open_loop import (
+    Bounds,
     Follow,
-    Limits,
     Model,
     Residual,
     drive_behind,
@@ -211,7 +211,7 @@ class Known:
     kept_headway: float = 0.0
     """of `personal_idm`"""
 
-    def model(self, owner: NDArray[np.int64], limits: Limits, tensors: bool = False) -> Model:
+    def model(self, owner: NDArray[np.int64], limits: Bounds, tensors: bool = False) -> Model:
         """Return the base of stretches that are of the trajectories `owner`; for NumPy or for torch."""
         rows = parameter_rows([self.drivers[number] for number in owner])
         return personal_idm(IDMRows(*map(_tensor, rows)) if tensors else rows, self.kept_headway, limits)
@@ -228,7 +228,7 @@ class MultiStepFit:
 
 
 def fit_multi_step(
-    known: Known, validation: Known, limits: Limits, settings: MultiStepSettings, seed: int
+    known: Known, validation: Known, limits: Bounds, settings: MultiStepSettings, seed: int
 ) -> MultiStepFit:
     """Return a residual on what is known that makes the simulated gaps those of the trajectories.
 
@@ -277,7 +277,7 @@ def fit_multi_step(
 
 
 def _loss(
-    network: FollowingNetwork, base: Model, limits: Limits, real: Stretches, settings: MultiStepSettings
+    network: FollowingNetwork, base: Model, limits: Bounds, real: Stretches, settings: MultiStepSettings
 ) -> Tensor:
     """Return the loss of driving behind the leaders of some stretches."""
     speeds, leader_speeds, gaps, paths = (_tensor(getattr(real, name)) for name in DRIVEN)

@@ -26,7 +26,8 @@ Model = Callable[[Array, Array], Follow]
 
 Residual = Callable[[Array], Array]
 """a network: what it sees, shape (..., 3) -> acceleration"""
-Limits = tuple[float, float]
+Bounds = tuple[float, float]
+"""lowest and highest acceleration [m/s2]"""
 
 SLOWEST = 2.0
 """speed below which a time headway is not to be told from the gap [m/s]: it counts as this"""
@@ -44,7 +45,7 @@ def with_values(parameters: IDMParameters | IDMRows, **values: Array) -> IDMRows
     return IDMRows(*(values.get(name, getattr(parameters, name)) for name in PARAMETER_NAMES))
 
 
-def idm_follow(parameters: IDMParameters | IDMRows, limits: Limits | None = None) -> Follow:
+def idm_follow(parameters: IDMParameters | IDMRows, limits: Bounds | None = None) -> Follow:
     """Return the IDM as a model of a driver, its acceleration kept within `limits` [m/s2]."""
 
     def follow(speed: Array, leader_speed: Array, gap: Array) -> Array:
@@ -54,7 +55,7 @@ def idm_follow(parameters: IDMParameters | IDMRows, limits: Limits | None = None
     return follow
 
 
-def personal_idm(parameters: IDMParameters | IDMRows, kept: Array, limits: Limits | None = None) -> Model:
+def personal_idm(parameters: IDMParameters | IDMRows, kept: Array, limits: Bounds | None = None) -> Model:
     """Return an IDM that keeps a part of the headway with which a driver was found.
 
     People differ most in the distance they keep. Of a driver nothing is known but the moment of taking over,
@@ -75,7 +76,7 @@ def personal_idm(parameters: IDMParameters | IDMRows, kept: Array, limits: Limit
     return begin
 
 
-def with_residual(base: Model | None, network: Residual, limits: Limits | None = None) -> Model:
+def with_residual(base: Model | None, network: Residual, limits: Bounds | None = None) -> Model:
     """Return a network on a base, or alone where there is none, kept within `limits` [m/s2]."""
 
     def begin(speed: Array, gap: Array) -> Follow:

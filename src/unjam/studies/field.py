@@ -28,7 +28,7 @@ from unjam.following.networks import (
     on_rows,
 )
 from unjam.following.open_loop import (
-    Limits,
+    Bounds,
     Model,
     always,
     idm_follow,
@@ -42,7 +42,7 @@ from unjam.physics.idm import PAPER_IDM, parameter_rows
 from unjam.reports.figures import INK, LINES, STYLE, new_figure
 from unjam.studies.study import OnProgress, Part, Table, about_study, measure_parts
 
-LIMITS: Limits = (-4.0, 2.0)
+LIMITS: Bounds = (-4.0, 2.0)
 SEEDS = {"ngsim": 3, "astazero": 1}
 STRETCH = 120.0
 """longest stretch that is driven on in [s]"""
@@ -52,8 +52,8 @@ ONE_STEP = NetworkSettings(rate=1e-3, epochs=40, patience=8)
 MULTI_STEP = MultiStepSettings()
 DRAWS = 2000
 """of the bootstrap over trajectories"""
-GIVEN: dict[str, Limits | None] = {"paper's IDM": None, "paper's IDM, clipped": LIMITS}
-KNOWN: dict[str, Limits | None] = {"knowledge, paper's IDM": None, "knowledge, paper's IDM clipped": LIMITS}
+GIVEN: dict[str, Bounds | None] = {"paper's IDM": None, "paper's IDM, clipped": LIMITS}
+KNOWN: dict[str, Bounds | None] = {"knowledge, paper's IDM": None, "knowledge, paper's IDM clipped": LIMITS}
 """the paper's IDM within these limits, alone and below a network"""
 CALIBRATION = CalibrationSettings(limits=LIMITS, seconds=STRETCH)
 CALIBRATED = {
