@@ -12,7 +12,7 @@ from unjam.studies import reproduce as reproduction
 from unjam.studies.comparison import comparison_of
 from unjam.studies.reproduce import make_plan, reproduce
 from unjam.studies.study import StudyFolder, Variant
-from unjam.training.executors import Command
+from unjam.training.executors import CommandLine
 
 SMALL: dict[str, Any] = {
     "scenario": "ring",
@@ -63,7 +63,7 @@ def reproduced(
 
 
 def run_here(
-    commands: dict[str, Command], workers: int, executor: str, on_line: Callable[[str], None]
+    commands: dict[str, CommandLine], workers: int, executor: str, on_line: Callable[[str], None]
 ) -> None:
     """Run command lines of `unjam` in this process."""
     for name, command in commands.items():

@@ -16,12 +16,12 @@ from unjam.errors import MissingPartError, UnjamError
 from unjam.reports.results import read_progress
 from unjam.training import executors
 from unjam.training.config import RunConfig
-from unjam.training.executors import Command, Processes, run_all, training_command
+from unjam.training.executors import CommandLine, Processes, run_all, training_command
 
 FAST = small_config(evaluation__every=0, evaluation__episodes=1, evaluation__baselines=[])
 
 
-def command_of(folder: Path, config: RunConfig = FAST) -> Command:
+def command_of(folder: Path, config: RunConfig = FAST) -> CommandLine:
     return training_command(config, folder / "run", folder / "plan.toml", folder / "log")
 
 
@@ -31,8 +31,8 @@ def hash_of(folder: Path) -> str:
 
 def test_one_failure_does_not_stop_the_others(tmp_path: Path) -> None:
     commands = {
-        "bad": Command(["fly"], tmp_path / "bad.log"),
-        "good": Command(["--version"], tmp_path / "logs" / "good.log"),
+        "bad": CommandLine(["fly"], tmp_path / "bad.log"),
+        "good": CommandLine(["--version"], tmp_path / "logs" / "good.log"),
     }
     told: list[str] = []
     with pytest.raises(UnjamError, match="1 of 2 failed: bad; what the first of them said"):
@@ -57,19 +57,21 @@ def test_what_a_signal_kills_is_started_again(tmp_path: Path, monkeypatch: pytes
         "file.write_text((file.read_text() if file.exists() else '') + 'x')\n"
         "if len(file.read_text()) < int(sys.argv[2]): os.kill(os.getpid(), 9)\n"
     )
-    monkeypatch.setattr(Command, "line", lambda self: [sys.executable, str(script), *self.words])
+    monkeypatch.setattr(CommandLine, "line", lambda self: [sys.executable, str(script), *self.words])
     for times, code in ((2, 0), (3, 0), (9, -9)):
         counted = tmp_path / f"{times}"
-        assert Processes().run(Command([str(counted), str(times)], tmp_path / "log")) == code
+        assert Processes().run(CommandLine([str(counted), str(times)], tmp_path / "log")) == code
         assert len(counted.read_text()) == min(times, executors.ATTEMPTS)
 
 
 def test_a_stop_ends_what_runs_and_starts_nothing_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(Command, "line", lambda self: [sys.executable, "-c", "import time; time.sleep(60)"])
+    monkeypatch.setattr(
+        CommandLine, "line", lambda self: [sys.executable, "-c", "import time; time.sleep(60)"]
+    )
     processes, codes = Processes(), []
-    thread = threading.Thread(target=lambda: codes.append(processes.run(Command([], tmp_path / "log"))))
+    thread = threading.Thread(target=lambda: codes.append(processes.run(CommandLine([], tmp_path / "log"))))
     thread.start()
     while not processes._running:
         time.sleep(0.01)
@@ -82,7 +84,7 @@ def test_a_stop_ends_what_runs_and_starts_nothing_again(
 def test_without_ray_one_line_says_how_to_get_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(MissingPartError, match=r"pip install 'unjam\[ray\]'"):
-        run_all({"any": Command(["--version"], tmp_path / "log")}, 1, "ray", print)
+        run_all({"any": CommandLine(["--version"], tmp_path / "log")}, 1, "ray", print)
 
 
 @pytest.fixture

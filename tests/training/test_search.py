@@ -12,8 +12,8 @@ from tests.training.test_run import small_config
 from unjam.errors import InputError, MissingPartError, UnjamError
 from unjam.files import to_json
 from unjam.training.config import load_config
-from unjam.training.executors import Command, Processes
-from unjam.training.search import Choice, Range, check_space, gain_of, search, space_of, trial_config
+from unjam.training.executors import CommandLine, Processes
+from unjam.training.search import Choice, Range, check_space, search, space_of, trial_config, validation_gain
 
 BASE = small_config(evaluation__every=1)
 SPACE = space_of(["trpo.target_kl=0.001..0.1:log", "trpo.critic_batch=8,16", "trpo.critic_epochs=1..9"])
@@ -71,9 +71,9 @@ def test_a_training_is_worth_its_best_validation_beyond_its_expert(tmp_path: Pat
     rows = [(None, 10.0), (12.0, 10.0), (17.0, 10.0), (11.0, 10.0)]
     lines = [to_json({"return_validation": found, "return_expert": expert}) for found, expert in rows]
     (tmp_path / "progress.jsonl").write_text("\n".join(lines))
-    assert gain_of(tmp_path) == 7.0
+    assert validation_gain(tmp_path) == 7.0
     (tmp_path / "progress.jsonl").write_text(lines[0])
-    assert gain_of(tmp_path) is None
+    assert validation_gain(tmp_path) is None
 
 
 class Trainings:
@@ -84,7 +84,7 @@ class Trainings:
         self.stop_at: int | None = None
         self.failing = False
 
-    def __call__(self, command: Command) -> int:
+    def __call__(self, command: CommandLine) -> int:
         if len(self.done) == self.stop_at:
             raise KeyboardInterrupt
         if self.failing:
@@ -181,5 +181,5 @@ def test_without_optuna_one_line_says_how_to_get_it(tmp_path: Path, monkeypatch:
 def test_real_trainings_are_searched(tmp_path: Path) -> None:
     found = search(BASE, SPACE, 2, tmp_path, 2)
     for trial in found:
-        assert trial.gain == gain_of(trial.folder)
+        assert trial.gain == validation_gain(trial.folder)
         assert (trial.folder / "report.html").is_file()

@@ -36,7 +36,7 @@ ATTEMPTS = 3
 """how often a command line is started that a signal kills, or whose machine is lost"""
 
 
-class Command(NamedTuple):
+class CommandLine(NamedTuple):
     """A command line of unjam."""
 
     words: Sequence[str]
@@ -54,7 +54,7 @@ class Command(NamedTuple):
         return [sys.executable, "-m", "unjam", *(self.again if begun else self.words)]
 
 
-def training_command(config: "RunConfig", folder: Path, plan: Path, log: Path) -> Command:
+def training_command(config: "RunConfig", folder: Path, plan: Path, log: Path) -> CommandLine:
     """Return the command line that begins a training, or goes on with it.
 
     Args:
@@ -68,7 +68,7 @@ def training_command(config: "RunConfig", folder: Path, plan: Path, log: Path) -
     make_folder(plan.parent)
     write_whole(plan, to_toml(config))
     once = ["--workers", str(config.workers)]
-    return Command(
+    return CommandLine(
         ["train", "--config", str(plan), *once, "--out", str(folder)],
         log,
         folder / "config.toml",
@@ -84,7 +84,7 @@ class Processes:
         self._lock = threading.Lock()
         self._stopped = False
 
-    def run(self, command: Command) -> int:
+    def run(self, command: CommandLine) -> int:
         """Run a command line to its end, anew where a signal kills it; return its exit code."""
         make_folder(command.log.parent)
         for _ in range(ATTEMPTS - 1):
@@ -92,7 +92,7 @@ class Processes:
                 return code
         return self._once(command)
 
-    def _once(self, command: Command) -> int:
+    def _once(self, command: CommandLine) -> int:
         line = command.line()
         with open(command.log, "ab") as log:
             log.write(f"$ {shlex.join(line)}\n".encode())
@@ -114,7 +114,7 @@ class Processes:
 
 
 @contextmanager
-def running(executor: Executor, workers: int) -> Iterator[Callable[[Command], Future[int]]]:
+def running(executor: Executor, workers: int) -> Iterator[Callable[[CommandLine], Future[int]]]:
     """Give what starts a command line and promises its exit code; an exception in the block ends them all.
 
     Args:
@@ -135,7 +135,7 @@ def running(executor: Executor, workers: int) -> Iterator[Callable[[Command], Fu
             raise
 
 
-def run_all(commands: dict[str, Command], workers: int, executor: Executor, on_line: OnLine) -> None:
+def run_all(commands: dict[str, CommandLine], workers: int, executor: Executor, on_line: OnLine) -> None:
     """Run command lines, given by name, `workers` at once; `on_line` gets a line when one has ended.
 
     Raises:
@@ -159,7 +159,7 @@ def run_all(commands: dict[str, Command], workers: int, executor: Executor, on_l
 
 
 @contextmanager
-def _ray(workers: int) -> Iterator[Callable[[Command], int]]:
+def _ray(workers: int) -> Iterator[Callable[[CommandLine], int]]:
     """Give what runs a command line somewhere on the Ray cluster that is there, or on one of this machine."""
     try:
         import ray  # pyright: ignore[reportMissingImports]
@@ -176,7 +176,7 @@ def _ray(workers: int) -> Iterator[Callable[[Command], int]]:
         ray.shutdown()
 
 
-def _run_here(command: Command) -> int:
+def _run_here(command: CommandLine) -> int:
     return Processes().run(command)
 
 

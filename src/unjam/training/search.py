@@ -18,7 +18,7 @@ from unjam.manifest import manifest
 from unjam.parameters import merge, nested, parse_value
 from unjam.reports.results import read_progress
 from unjam.training.config import RunConfig, load_config, to_toml
-from unjam.training.executors import Command, Executor, OnLine, running, training_command
+from unjam.training.executors import CommandLine, Executor, OnLine, running, training_command
 from unjam.training.folder import check_possible
 
 if TYPE_CHECKING:
@@ -164,7 +164,8 @@ def search(
                 break
             for done in wait(jobs, return_when=FIRST_COMPLETED).done:
                 number = jobs.pop(done)
-                _tell(study, number, None if done.result() else gain_of(_trial_folder(folder, number)))
+                failed = done.result() != 0
+                _tell(study, number, None if failed else validation_gain(_trial_folder(folder, number)))
                 on_line(_words(study, number, trials))
     found = [
         Trial(trial.number, trial.params, _trial_folder(folder, trial.number), trial.value)
@@ -183,7 +184,7 @@ def _trial_folder(folder: Path, number: int) -> Path:
     return folder / "trials" / f"{number:04d}"
 
 
-def _command(base: RunConfig, folder: Path, number: int, values: dict[str, Any]) -> Command:
+def _command(base: RunConfig, folder: Path, number: int, values: dict[str, Any]) -> CommandLine:
     """Return the command line of a trial."""
     config = trial_config(base, values)
     few = replace(config.evaluation, baselines=(), episodes=1)  # the held-out seeds decide nothing here
@@ -243,7 +244,7 @@ def _tell(study: "Study", number: int, gain: float | None) -> None:
         study.tell(number, gain)
 
 
-def gain_of(folder: Path) -> float | None:
+def validation_gain(folder: Path) -> float | None:
     """Return a training's best validation beyond its expert's; None where there was no validation."""
     rows = read_progress(folder)
     validated = [row["return_validation"] for row in rows if row["return_validation"] is not None]
