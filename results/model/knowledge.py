@@ -20,7 +20,7 @@ from matplotlib.ticker import LogLocator, NullFormatter
 
 from unjam.drivers.residual import ResidualDriver
 from unjam.files import to_json, write_whole
-from unjam.learners.algorithm_1 import begin
+from unjam.learners.algorithm_1 import begin_training
 from unjam.learners.imagination import full_policy
 from unjam.manifest import manifest
 from unjam.measures.metrics import measure
@@ -57,7 +57,7 @@ def settings_for(base: BaseName, passes: int = 1) -> VirtualSettings:
 def untrained(config: RunConfig) -> ResidualDriver:
     """Return the policy with which a training begins."""
     tasks = config.make_tasks()
-    training = begin(tasks, config.policy, config.learner, config.virtual, config.seed)
+    training = begin_training(tasks, config.policy, config.learner, config.virtual, config.seed)
     return full_policy(tasks[0], config.policy, training.learner.network())
 
 

@@ -8,7 +8,7 @@ import torch
 
 from unjam.drivers import LocalState, PISaturation
 from unjam.drivers.network import Network
-from unjam.learners.algorithm_1 import Driven, Iteration, Training, Validated, algorithm_1
+from unjam.learners.algorithm_1 import Collected, Iteration, Training, Validated, algorithm_1
 from unjam.learners.learner import AgentSpec, make_learner
 from unjam.learners.settings import (
     LearnerSettings,
@@ -90,7 +90,7 @@ class Toy:
         self.learner = make_learner(self.settings or QUICK[self.agent], spec)
         self.training = Training([Task(Ring(), PISaturation())], self.policy, self.seed, self.learner)
 
-    def collect(self, network: Network, iteration: int) -> Driven:
+    def collect(self, network: Network, iteration: int) -> Collected:
         self.networks.append(network)
         return [
             [

@@ -13,7 +13,7 @@ from unjam.drivers import PISaturation
 from unjam.drivers.network import Network
 from unjam.drivers.observation import observation_size
 from unjam.drivers.residual import ResidualDriver
-from unjam.learners.algorithm_1 import Driven, Iteration, algorithm_1, begin
+from unjam.learners.algorithm_1 import Collected, Iteration, algorithm_1, begin_training
 from unjam.learners.experience import join
 from unjam.learners.imagination import Imagination, rollout_experience
 from unjam.learners.learner import Update
@@ -64,7 +64,7 @@ class Trained:
         self.told: list[Iteration] = []
         self.episodes_run = 0
 
-        def collect(network: Network, iteration: int) -> Driven:
+        def collect(network: Network, iteration: int) -> Collected:
             driver = ResidualDriver(
                 PISaturation(), network, 1.0, settings.observe, settings.decisions_held(0.1)
             )
@@ -77,7 +77,7 @@ class Trained:
             ]
 
         self.collect = collect
-        self.training = begin([TASK], POLICY, SETTINGS[agent], virtual or FREE, 0)
+        self.training = begin_training([TASK], POLICY, SETTINGS[agent], virtual or FREE, 0)
         self.learner: Any = self.training.learner
 
     def learn(self, iterations: int) -> "Trained":
@@ -211,7 +211,7 @@ def test_a_model_that_is_not_trusted_adds_nothing(shared: Simulation) -> None:
 
 
 def test_without_the_ratio_actual_rows_alone_fill_a_batch_and_with_it_both_do() -> None:
-    sac: Any = begin([TASK], POLICY, SETTINGS["sac"], FREE, 0).learner
+    sac: Any = begin_training([TASK], POLICY, SETTINGS["sac"], FREE, 0).learner
     buffer = sac.buffer
     actual, virtual = (
         rollout_experience(rollouts, rollouts.drawn.numpy())

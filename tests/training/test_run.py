@@ -15,7 +15,7 @@ from unjam.controller import load_controller
 from unjam.drivers import PISaturation, ResidualDriver
 from unjam.drivers.network import Network
 from unjam.errors import InputError
-from unjam.learners.algorithm_1 import Driven
+from unjam.learners.algorithm_1 import Collected
 from unjam.reports.results import read_progress
 from unjam.training.config import RunConfig, load_config
 from unjam.training.evaluate import HELD_OUT, VALIDATION
@@ -80,7 +80,7 @@ def collected(monkeypatch: pytest.MonkeyPatch) -> list[Episode]:
     episodes: list[Episode] = []
     collect = Trainer.collect
 
-    def kept(self: Trainer, network: Network, iteration: int) -> Driven:
+    def kept(self: Trainer, network: Network, iteration: int) -> Collected:
         driven = collect(self, network, iteration)
         episodes.extend(episode for of_task in driven for episode in of_task)
         return driven

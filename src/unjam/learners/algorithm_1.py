@@ -27,7 +27,7 @@ from unjam.worlds.record import Episode, Floats
 COMPARED_ROWS = 2000
 """at most so many of the visited states tell how far an update has moved the policy"""
 
-Driven = Sequence[Sequence[Episode]]
+Collected = Sequence[Sequence[Episode]]
 """the episodes of each task"""
 Validated = Sequence[float] | None
 """return on the validation seeds of each task; None where it was not the time to validate"""
@@ -72,7 +72,7 @@ class Iteration:
 
     number: int
     """from 1"""
-    episodes: Driven
+    episodes: Collected
     actual_steps: int
     """of all iterations so far"""
     virtual_steps: int
@@ -85,7 +85,7 @@ class Iteration:
     """wall time of each part"""
 
 
-def begin(
+def begin_training(
     tasks: Sequence[Task],
     policy: PolicySettings,
     learner: LearnerSettings,
@@ -106,7 +106,7 @@ def begin(
 def algorithm_1(
     training: Training,
     budget: int,
-    collect: Callable[[Network, int], Driven],
+    collect: Callable[[Network, int], Collected],
     validate: Callable[[Iteration], Validated],
     write: Callable[[Iteration, Validated], None],
 ) -> None:
@@ -193,7 +193,7 @@ def plan_updates(training: Training) -> list[tuple[bool, int, int]]:
     return [only_actual, *((False, part, settings.updates) for part in range(settings.updates))]
 
 
-def actual_experience(training: Training, episodes: Driven) -> Experience:
+def actual_experience(training: Training, episodes: Collected) -> Experience:
     """Return what was driven as experience; raise `UnjamError` where some of it is not finite."""
     found = []
     for index, (task, driven) in enumerate(zip(training.tasks, episodes, strict=True)):

@@ -15,7 +15,7 @@ from unjam.drivers.driver import Driver
 from unjam.drivers.network import Network
 from unjam.files import append_line, make_folder, to_json, write_whole
 from unjam.kernels import child_would_be_pinned
-from unjam.learners.algorithm_1 import Driven, Iteration, Validated, algorithm_1, begin
+from unjam.learners.algorithm_1 import Collected, Iteration, Validated, algorithm_1, begin_training
 from unjam.learners.imagination import full_policy
 from unjam.measures.metrics import measure
 from unjam.measures.statistics import Estimate, paired_difference
@@ -152,7 +152,7 @@ class Trainer:
         self.workers = workers
         self.tasks = config.make_tasks()
         self.folders = [folder / task.name for task in self.tasks]
-        self.training = begin(self.tasks, config.policy, config.learner, config.virtual, config.seed)
+        self.training = begin_training(self.tasks, config.policy, config.learner, config.virtual, config.seed)
         self._on_iteration = on_iteration or (lambda row: None)
         total = sum(task.weight for task in self.tasks)
         self._shares = [task.weight / total for task in self.tasks]
@@ -183,7 +183,7 @@ class Trainer:
         """Return the full policy on each road: its expert plus this residual."""
         return [full_policy(task, self.config.policy, network) for task in self.tasks]
 
-    def collect(self, network: Network, iteration: int) -> Driven:
+    def collect(self, network: Network, iteration: int) -> Collected:
         """Return the episodes of an iteration, at least one of each road, as many as its weight asks for."""
         steps = self.config.learner.batch_steps
         counts = [
@@ -243,7 +243,7 @@ class Trainer:
 
     def _drive(
         self, drivers: Sequence[Driver], counts: Sequence[int], seed: tuple[int, ...], explore: bool = False
-    ) -> Driven:
+    ) -> Collected:
         """Run `counts` episodes that cover the range of what each scenario draws; raise where one failed."""
         wanted = []
         for task, driver, count in zip(self.tasks, drivers, counts, strict=True):
