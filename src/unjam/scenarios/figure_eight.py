@@ -11,7 +11,7 @@ from pydantic.dataclasses import dataclass
 from unjam.parameters import STRICT, Count, NotNegative
 from unjam.physics.idm import equilibrium_speed
 from unjam.scenarios.ring import Lap, Loop, Place
-from unjam.scenarios.road import Edge, Line, Network, Node, as_line
+from unjam.scenarios.road import Edge, Line, Node, RoadNetwork, as_line
 from unjam.scenarios.scenario import VEHICLE_LENGTH, Actuation, HumanControl
 
 CROSSING_RADIUS = 3.1
@@ -137,7 +137,7 @@ def _arc(radius: float, center: float, first: float, last: float) -> NDArray[np.
     return radius * np.column_stack([np.cos(angles) + center, np.sin(angles) + center])
 
 
-def _network(radius: float, upper: Line, lower: Line, speed: float) -> Network:
+def _network(radius: float, upper: Line, lower: Line, speed: float) -> RoadNetwork:
     places = {"right": (radius, 0.0), "top": (0.0, radius), "left": (-radius, 0.0), "bottom": (0.0, -radius)}
     center = Node("center", 0.0, 0.0, priority=True, radius=CROSSING_RADIUS)
     nodes = (center, *(Node(f"at_{name}", x, y, priority=True) for name, (x, y) in places.items()))
@@ -150,4 +150,4 @@ def _network(radius: float, upper: Line, lower: Line, speed: float) -> Network:
         Edge("upper_ring", "at_top", "at_right", arc, MAJOR, upper),
         Edge("lower_ring", "at_left", "at_bottom", arc, MAJOR, lower),
     )
-    return Network(nodes, edges, speed, connections=(("bottom", "top"), ("right", "left")))
+    return RoadNetwork(nodes, edges, speed, connections=(("bottom", "top"), ("right", "left")))

@@ -13,7 +13,7 @@ from unjam.parameters import STRICT, Count, CountOrNone, NotNegative, Positive
 from unjam.physics.arrays import at_least
 from unjam.physics.idm import IDMParameters, idm_acceleration
 from unjam.physics.kinematics import next_position, next_speed
-from unjam.scenarios.road import Edge, Entry, MergingRoad, Network, Node, Origin, Route
+from unjam.scenarios.road import Edge, Entry, MergingRoad, Node, Origin, RoadNetwork, Route
 from unjam.scenarios.scenario import VEHICLE_LENGTH, HumanControl, Scenario
 
 INFLOW_EDGE, BEFORE, AFTER, RAMP = 100.0, 500.0, 100.0, 100.0
@@ -103,7 +103,7 @@ class Merge(Scenario):
             entering.append((entry, Origin(ON_RAMP, start)))
         origins = {entry.name: origin for entry, origin in entering}
         return MergingRoad(
-            network=Network(_NODES, _EDGES, self.top_speed),
+            network=RoadNetwork(_NODES, _EDGES, self.top_speed),
             routes=_ROUTES,
             entries=tuple(sorted((entry for entry, _ in entering), key=lambda entry: entry.time)),
             limit_speed=self.limit(),

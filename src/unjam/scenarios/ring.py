@@ -11,7 +11,7 @@ from pydantic.dataclasses import dataclass
 
 from unjam.parameters import STRICT, Count
 from unjam.physics.idm import equilibrium_speed
-from unjam.scenarios.road import ClosedRoad, Edge, Entry, Network, Node, Route, as_line
+from unjam.scenarios.road import ClosedRoad, Edge, Entry, Node, RoadNetwork, Route, as_line
 from unjam.scenarios.scenario import VEHICLE_LENGTH, Scenario
 
 EDGES = 4
@@ -42,7 +42,7 @@ class Lap(NamedTuple):
     """[m]"""
     positions: NDArray[np.float64]
     """of the vehicles, from the last to the first of the queue [m]"""
-    network: Network
+    network: RoadNetwork
     outline: NDArray[np.float64]
     """rows (coordinate along the lap, x, y) [m]"""
     crossings: tuple[tuple[float, float], ...] = ()
@@ -211,7 +211,7 @@ def _on_circle(angles: NDArray[np.float64], length: float) -> NDArray[np.float64
     return length / (2 * np.pi) * np.column_stack([np.cos(angles), np.sin(angles)])
 
 
-def _circle(length: float, speed: float) -> Network:
+def _circle(length: float, speed: float) -> RoadNetwork:
     corners = _on_circle(2 * np.pi * np.arange(EDGES) / EDGES, length)
     nodes = tuple(Node(f"node_{index}", x, y, priority=True) for index, (x, y) in enumerate(corners.tolist()))
     edges = []
@@ -219,4 +219,4 @@ def _circle(length: float, speed: float) -> Network:
         line = _on_circle(2 * np.pi * (index + np.linspace(0, 1, 41)) / EDGES, length)
         begin, end = nodes[index].name, nodes[(index + 1) % EDGES].name
         edges.append(Edge(f"edge_{index}", begin, end, length / EDGES, shape=as_line(line)))
-    return Network(nodes, tuple(edges), speed, links=False)
+    return RoadNetwork(nodes, tuple(edges), speed, links=False)

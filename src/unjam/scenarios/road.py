@@ -47,7 +47,7 @@ class Edge(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Network:
+class RoadNetwork:
     """Nodes and edges."""
 
     nodes: tuple[Node, ...]
@@ -98,7 +98,7 @@ class Road:
 class BuiltRoad(Road):
     """A road that is built for the episode, and who enters it."""
 
-    network: Network
+    network: RoadNetwork
     routes: tuple[Route, ...]
     entries: tuple[Entry, ...]
     """in order of time"""

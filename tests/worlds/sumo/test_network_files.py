@@ -16,12 +16,12 @@ import pytest
 
 from unjam.errors import DiskError, EpisodeError, MissingPartError
 from unjam.scenarios import Ring
-from unjam.scenarios.road import Network
+from unjam.scenarios.road import RoadNetwork
 from unjam.worlds.sumo import files
 from unjam.worlds.sumo.files import cache_folder, network_file, sumo_program
 
 
-def road_of(length: int) -> Network:
+def road_of(length: int) -> RoadNetwork:
     return Ring(length=(length, length)).draw(np.random.default_rng(0)).network
 
 

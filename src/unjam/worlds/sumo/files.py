@@ -18,7 +18,7 @@ import platformdirs
 
 from unjam.errors import DISK_ERRNOS, EpisodeError, MissingPartError, disk_error
 from unjam.physics.idm import IDMParameters
-from unjam.scenarios.road import BuiltRoad, Edge, Network, Node, OwnRoad, Road
+from unjam.scenarios.road import BuiltRoad, Edge, Node, OwnRoad, Road, RoadNetwork
 from unjam.scenarios.scenario import VEHICLE_LENGTH, Scenario
 from unjam.sumo_files import read_lanes
 from unjam.worlds.record import Floats
@@ -203,7 +203,7 @@ def sumo_words(lines: Iterable[str]) -> str:
     return "; ".join(said for line in lines if (said := line.strip()) and said != "Quitting (on error).")
 
 
-def network_file(network: Network) -> Path:
+def network_file(network: RoadNetwork) -> Path:
     """Return SUMO's network file, made with netconvert if this content was never made before.
 
     Raises:
