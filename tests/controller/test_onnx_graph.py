@@ -10,8 +10,8 @@ import torch
 from tests.controller.test_file import residual
 from tests.controller.test_sample import perceived
 from tests.drivers.test_experts import EXPERTS
-from tests.learners.test_sac import make_policy as make_squashed_policy
-from tests.learners.test_trpo_ppo import make_policy, mean_of, shake
+from tests.learners.task import make_policy, shake
+from tests.learners.test_trpo_ppo import mean_of
 from unjam.controller.onnx_graph import onnx_graph
 from unjam.controller.verify import check_graph, replay, run_graph
 from unjam.drivers import (
@@ -70,8 +70,7 @@ def agree(driver: Driver, stay: Trajectory) -> None:
 
 def test_policy_driver_and_graph_agree_on_a_whole_episode_of_the_ring(simulation: Simulation) -> None:
     expert = PISaturation()
-    policy = make_policy(inputs=observation_size(PARTS, expert))
-    assert isinstance(policy, ResidualPolicy)
+    policy = make_policy(ResidualPolicy, inputs=observation_size(PARTS, expert))
     shake(policy, 1)
     driver = driver_of(policy.network(), expert)
     stay = longest_stay(Ring(), driver, simulation)
@@ -86,8 +85,7 @@ def test_policy_driver_and_graph_agree_on_a_whole_episode_of_the_ring(simulation
 @pytest.mark.slow
 def test_policy_driver_and_graph_of_sac_agree_where_vehicles_come_and_go(simulation: Simulation) -> None:
     expert = FollowerStopper(time_step=1.0)
-    policy = make_squashed_policy(inputs=observation_size(PARTS, expert))
-    assert isinstance(policy, SquashedResidualPolicy)
+    policy = make_policy(SquashedResidualPolicy, inputs=observation_size(PARTS, expert))
     shake(policy.actor, 2)
     driver = driver_of(policy.network(), expert, hold=1)
     stay = longest_stay(make_scenario("merge", {"horizon": 150}), driver, simulation)

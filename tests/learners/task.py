@@ -1,15 +1,20 @@
-"""A task without a road, quick to learn: be at the target, which the observation tells."""
+"""A task without a road, quick to learn: be at the target, which the observation tells. And policies."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from stable_baselines3.common.policies import BasePolicy
 
 from unjam.drivers import LocalState, PISaturation
 from unjam.drivers.network import Network
 from unjam.learners.algorithm_1 import Collected, Iteration, Training, Validated, algorithm_1
-from unjam.learners.learner import AgentSpec, make_learner
+from unjam.learners.learner import AgentSpec, make_learner, policy_spaces
 from unjam.learners.settings import (
     LearnerSettings,
     PolicySettings,
@@ -33,6 +38,15 @@ QUICK: dict[str, LearnerSettings] = {
 """settings with which each learner is quick"""
 
 Target = Callable[[np.ndarray], np.ndarray]
+Policy = TypeVar("Policy", bound=BasePolicy)
+of_any_size = given(
+    seed=st.integers(0, 2**31),
+    inputs=st.integers(1, 9),
+    hidden=st.lists(st.integers(1, 64), min_size=1, max_size=3),
+    authority=st.floats(0.1, 2.0),
+    rows=st.integers(1, 40),
+)
+"""gives a test policies of any size, and as many rows for them to see"""
 
 
 def constant_target(observations: np.ndarray) -> np.ndarray:
@@ -122,3 +136,36 @@ def same(one: dict[str, torch.Tensor], other: dict[str, torch.Tensor]) -> bool:
     return one.keys() == other.keys() and all(
         one[name].numpy().tobytes() == other[name].numpy().tobytes() for name in one
     )
+
+
+def make_policy(
+    kind: Callable[..., Policy],
+    settings: PolicySettings | None = None,
+    inputs: int = 5,
+    critic_inputs: int = 0,
+    action_limit: float = 1.0,
+    seed: int = 0,
+) -> Policy:
+    settings = settings or PolicySettings()
+    torch.manual_seed(seed)
+    spaces = policy_spaces(inputs, critic_inputs, settings.authority * action_limit)
+    return kind(*spaces, lambda _: 1e-3, settings=settings, inputs=inputs, action_limit=action_limit)
+
+
+def residual_of(policy: Any, rows: np.ndarray) -> np.ndarray:
+    """The deterministic residual [m/s2] of a squashed policy, as SB3 unscales it from [-1, 1]."""
+    with torch.no_grad():
+        return policy.unscale_action(policy._predict(torch.as_tensor(rows), deterministic=True).numpy())[:, 0]
+
+
+def shake(policy: torch.nn.Module, seed: int, scale: float = 1.0) -> None:
+    """Give every weight a random value that keeps the units of a layer about as large as its inputs."""
+    generator = torch.Generator().manual_seed(seed)
+    with torch.no_grad():
+        for parameter in policy.parameters():
+            fan_in = parameter.shape[-1] if parameter.dim() == 2 else 4
+            parameter.copy_(torch.randn(parameter.shape, generator=generator) * scale / math.sqrt(fan_in))
+
+
+def random_rows(rows: int, inputs: int, seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).uniform(-2.0, 2.0, size=(rows, inputs)).astype(np.float32)

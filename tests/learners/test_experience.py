@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from stable_baselines3.common.buffers import ReplayBuffer, RolloutBuffer
 
-from tests.learners.test_trpo_ppo import make_policy, shake
+from tests.learners.task import make_policy, shake
 from unjam.drivers import LocalState
 from unjam.learners.experience import (
     Experience,
@@ -47,7 +47,7 @@ def make_trajectory(seed: int, decisions: int, hold: int = 1, terminated: bool =
 
 
 def random_policy(critic_inputs: int = 0, seed: int = 0) -> ResidualPolicy:
-    policy = make_policy(inputs=INPUTS, critic_inputs=critic_inputs)
+    policy = make_policy(ResidualPolicy, inputs=INPUTS, critic_inputs=critic_inputs)
     shake(policy, seed)
     policy.scale_value(3.0, 2.0)
     return policy

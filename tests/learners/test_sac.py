@@ -1,41 +1,17 @@
 import math
+from functools import partial
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
 
-from tests.learners.task import INPUTS, Toy
-from tests.learners.test_trpo_ppo import random_rows, shake
-from unjam.learners.learner import policy_spaces
+from tests.learners.task import INPUTS, Toy, make_policy, of_any_size, random_rows, residual_of, shake
 from unjam.learners.sac import SquashedResidualPolicy, uniform_network
 from unjam.learners.settings import PolicySettings, SACSettings
 
 torch.set_num_threads(1)  # more would fight for the cores over matrices of this size
-
-
-def make_policy(
-    settings: PolicySettings | None = None,
-    inputs: int = 5,
-    critic_inputs: int = 0,
-    action_limit: float = 1.0,
-) -> SquashedResidualPolicy:
-    settings = settings or PolicySettings()
-    return SquashedResidualPolicy(
-        *policy_spaces(inputs, critic_inputs, settings.authority * action_limit),
-        lambda _: 1e-3,
-        settings=settings,
-        inputs=inputs,
-        action_limit=action_limit,
-    )
-
-
-def residual_of(policy: SquashedResidualPolicy, rows: np.ndarray) -> np.ndarray:
-    """The deterministic residual [m/s2], as SB3 unscales it from [-1, 1]."""
-    with torch.no_grad():
-        return policy.unscale_action(policy._predict(torch.as_tensor(rows), deterministic=True).numpy())[:, 0]
+fresh = partial(make_policy, SquashedResidualPolicy)
 
 
 def values_of(policy: SquashedResidualPolicy, rows: np.ndarray) -> np.ndarray:
@@ -45,7 +21,7 @@ def values_of(policy: SquashedResidualPolicy, rows: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize(("std", "authority"), [(0.1, 1.0), (0.3, 0.5)])
 def test_a_fresh_policy_adds_nothing_but_a_little_noise(std: float, authority: float) -> None:
-    policy = make_policy(PolicySettings(exploration_std=std, authority=authority), action_limit=2.0)
+    policy = fresh(PolicySettings(exploration_std=std, authority=authority), action_limit=2.0)
     network, rows = policy.network(), random_rows(20_000, 5)
     assert (residual_of(policy, rows) == 0.0).all()
     assert (network(rows.astype(float)) == 0.0).all()
@@ -55,17 +31,11 @@ def test_a_fresh_policy_adds_nothing_but_a_little_noise(std: float, authority: f
     np.testing.assert_allclose(explored, bound * np.tanh(2.0 * std / bound * noise), atol=1e-6)
 
 
-@given(
-    seed=st.integers(0, 2**31),
-    inputs=st.integers(1, 9),
-    hidden=st.lists(st.integers(1, 64), min_size=1, max_size=3),
-    authority=st.floats(0.1, 2.0),
-    rows=st.integers(1, 40),
-)
+@of_any_size
 def test_the_numpy_twin_gives_the_residual_and_the_noise_of_the_torch_policy(
     seed: int, inputs: int, hidden: list[int], authority: float, rows: int
 ) -> None:
-    policy = make_policy(PolicySettings(hidden=tuple(hidden), authority=authority), inputs, critic_inputs=2)
+    policy = fresh(PolicySettings(hidden=tuple(hidden), authority=authority), inputs, critic_inputs=2)
     shake(policy.actor, seed)
     seen = random_rows(rows, inputs + 2, seed)
     network = policy.network()
@@ -81,7 +51,7 @@ def test_the_numpy_twin_gives_the_residual_and_the_noise_of_the_torch_policy(
 
 @pytest.mark.parametrize(("log_std", "clipped"), [(5.0, 2.0), (-30.0, -20.0)])
 def test_the_twins_noise_has_the_bounds_of_the_policys(log_std: float, clipped: float) -> None:
-    policy = make_policy()
+    policy = fresh()
     with torch.no_grad():
         policy.actor.get_parameter("log_std.bias").fill_(log_std)
     found = policy.network().explore(np.zeros((1, 5)), np.array([1e-2]))
@@ -89,7 +59,7 @@ def test_the_twins_noise_has_the_bounds_of_the_policys(log_std: float, clipped: 
 
 
 def test_the_twin_keeps_its_weights_when_the_policy_learns_on() -> None:
-    policy = make_policy()
+    policy = fresh()
     network, rows = policy.network(), random_rows(10, 5).astype(float)
     shake(policy.actor, 2)
     assert (network(rows) == 0.0).all()
@@ -97,7 +67,7 @@ def test_the_twin_keeps_its_weights_when_the_policy_learns_on() -> None:
 
 
 def test_what_the_critic_alone_sees_moves_the_value_and_not_the_residual() -> None:
-    policy = make_policy(critic_inputs=2)
+    policy = fresh(critic_inputs=2)
     shake(policy, 4)
     rows = random_rows(50, 7)
     other = rows.copy()
@@ -107,7 +77,7 @@ def test_what_the_critic_alone_sees_moves_the_value_and_not_the_residual() -> No
 
 
 def test_the_target_starts_as_the_critic() -> None:
-    policy = make_policy(critic_inputs=1)
+    policy = fresh(critic_inputs=1)
     rows = torch.as_tensor(random_rows(5, 6))
     for found, target in zip(
         policy.critic(rows, torch.ones(5, 1)), policy.critic_target(rows, torch.ones(5, 1)), strict=True
@@ -116,7 +86,7 @@ def test_the_target_starts_as_the_critic() -> None:
 
 
 def test_critics_promise_no_more_far_from_all_data() -> None:
-    policy = make_policy(critic_inputs=1)
+    policy = fresh(critic_inputs=1)
     rows = random_rows(200, 6)
     near, far = values_of(policy, rows), values_of(policy, 1000.0 * rows)
     assert np.abs(far).max() < 3.0 * np.abs(near).max()

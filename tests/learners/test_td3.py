@@ -1,45 +1,21 @@
+from functools import partial
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
 
-from tests.learners.task import INPUTS, Toy
-from tests.learners.test_trpo_ppo import random_rows, shake
-from unjam.learners.learner import policy_spaces
+from tests.learners.task import INPUTS, Toy, make_policy, of_any_size, random_rows, residual_of, shake
 from unjam.learners.settings import PolicySettings, TD3Settings
 from unjam.learners.td3 import DeterministicResidualPolicy
 
 torch.set_num_threads(1)  # more would fight for the cores over matrices of this size
-
-
-def make_policy(
-    settings: PolicySettings | None = None,
-    inputs: int = 5,
-    critic_inputs: int = 0,
-    action_limit: float = 1.0,
-) -> DeterministicResidualPolicy:
-    settings = settings or PolicySettings()
-    return DeterministicResidualPolicy(
-        *policy_spaces(inputs, critic_inputs, settings.authority * action_limit),
-        lambda _: 1e-3,
-        settings=settings,
-        inputs=inputs,
-        action_limit=action_limit,
-    )
-
-
-def residual_of(policy: DeterministicResidualPolicy, rows: np.ndarray) -> np.ndarray:
-    """The deterministic residual [m/s2], as SB3 unscales it from [-1, 1]."""
-    with torch.no_grad():
-        return policy.unscale_action(policy._predict(torch.as_tensor(rows)).numpy())[:, 0]
+fresh = partial(make_policy, DeterministicResidualPolicy)
 
 
 @pytest.mark.parametrize(("std", "authority"), [(0.1, 1.0), (0.3, 0.5)])
 def test_a_fresh_policy_adds_nothing_but_noise_of_the_asked_size(std: float, authority: float) -> None:
-    policy = make_policy(PolicySettings(exploration_std=std, authority=authority), action_limit=2.0)
+    policy = fresh(PolicySettings(exploration_std=std, authority=authority), action_limit=2.0)
     network, rows = policy.network(), random_rows(200, 5)
     assert (residual_of(policy, rows) == 0.0).all()
     assert (network(rows.astype(float)) == 0.0).all()
@@ -47,17 +23,11 @@ def test_a_fresh_policy_adds_nothing_but_noise_of_the_asked_size(std: float, aut
     np.testing.assert_allclose(network.explore(rows.astype(float), noise), 2.0 * std * noise, atol=1e-12)
 
 
-@given(
-    seed=st.integers(0, 2**31),
-    inputs=st.integers(1, 9),
-    hidden=st.lists(st.integers(1, 64), min_size=1, max_size=3),
-    authority=st.floats(0.1, 2.0),
-    rows=st.integers(1, 40),
-)
+@of_any_size
 def test_the_numpy_twin_gives_the_residual_of_the_torch_policy(
     seed: int, inputs: int, hidden: list[int], authority: float, rows: int
 ) -> None:
-    policy = make_policy(PolicySettings(hidden=tuple(hidden), authority=authority), inputs, critic_inputs=2)
+    policy = fresh(PolicySettings(hidden=tuple(hidden), authority=authority), inputs, critic_inputs=2)
     shake(policy.actor, seed)
     seen = random_rows(rows, inputs + 2, seed)
     found = policy.network()(seen[:, :inputs].astype(float))
@@ -65,7 +35,7 @@ def test_the_numpy_twin_gives_the_residual_of_the_torch_policy(
 
 
 def test_targets_start_as_what_they_follow() -> None:
-    policy, rows = make_policy(critic_inputs=1), torch.as_tensor(random_rows(5, 6))
+    policy, rows = fresh(critic_inputs=1), torch.as_tensor(random_rows(5, 6))
     action = torch.ones(5, 1)
     assert torch.equal(policy.actor(rows), policy.actor_target(rows))
     for found, target in zip(policy.critic(rows, action), policy.critic_target(rows, action), strict=True):

@@ -1,14 +1,12 @@
-import math
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
 
-from tests.learners.task import INPUTS, Toy, same
+from tests.learners.task import INPUTS, Toy, make_policy, of_any_size, random_rows, same, shake
 from unjam.drivers import PISaturation, ResidualDriver
 from unjam.drivers.network import Network
 from unjam.drivers.observation import observation_size
@@ -21,37 +19,7 @@ from unjam.worlds.episode import run_episode
 from unjam.worlds.sumo.simulation import Simulation
 
 torch.set_num_threads(1)  # more would fight for the cores over matrices of this size
-
-
-def make_policy(
-    settings: PolicySettings | None = None,
-    inputs: int = 5,
-    critic_inputs: int = 0,
-    action_limit: float = 1.0,
-    seed: int = 0,
-) -> ResidualPolicy:
-    settings = settings or PolicySettings()
-    torch.manual_seed(seed)
-    return ResidualPolicy(
-        *policy_spaces(inputs, critic_inputs, settings.authority * action_limit),
-        lambda _: 1e-3,
-        settings=settings,
-        inputs=inputs,
-        action_limit=action_limit,
-    )
-
-
-def shake(policy: torch.nn.Module, seed: int, scale: float = 1.0) -> None:
-    """Give every weight a random value that keeps the units of a layer about as large as its inputs."""
-    generator = torch.Generator().manual_seed(seed)
-    with torch.no_grad():
-        for parameter in policy.parameters():
-            fan_in = parameter.shape[-1] if parameter.dim() == 2 else 4
-            parameter.copy_(torch.randn(parameter.shape, generator=generator) * scale / math.sqrt(fan_in))
-
-
-def random_rows(rows: int, inputs: int, seed: int = 0) -> np.ndarray:
-    return np.random.default_rng(seed).uniform(-2.0, 2.0, size=(rows, inputs)).astype(np.float32)
+fresh = partial(make_policy, ResidualPolicy)
 
 
 def mean_of(policy: ResidualPolicy, rows: np.ndarray) -> np.ndarray:
@@ -66,7 +34,7 @@ def value_of(policy: ResidualPolicy, rows: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("seed", range(5))
 def test_the_residual_of_a_fresh_policy_is_exactly_zero(seed: int) -> None:
-    policy, rows = make_policy(seed=seed), random_rows(200, 5, seed)
+    policy, rows = fresh(seed=seed), random_rows(200, 5, seed)
     assert (mean_of(policy, rows) == 0.0).all()
     assert (policy.network()(rows.astype(float)) == 0.0).all()
 
@@ -76,7 +44,7 @@ def test_the_residual_of_a_fresh_policy_is_exactly_zero(seed: int) -> None:
 def test_a_fresh_policy_drives_exactly_as_its_expert(hold: int, cavs: int, simulation: Simulation) -> None:
     ring = Ring(length=(230, 230), horizon=200, warmup=100, cavs=cavs)
     expert, parts = PISaturation(), PolicySettings().observe
-    network = make_policy(inputs=observation_size(parts, expert)).network()
+    network = fresh(inputs=observation_size(parts, expert)).network()
     driver = ResidualDriver(expert, network, ring.action_limit, parts, hold)
     alone = run_episode(ring, expert, (3,), simulation=simulation)
     together = run_episode(ring, driver, (3,), simulation=simulation)
@@ -88,17 +56,11 @@ def test_a_fresh_policy_drives_exactly_as_its_expert(hold: int, cavs: int, simul
     assert np.abs(alone.trajectories[0].applied).max() > 0.1
 
 
-@given(
-    seed=st.integers(0, 2**31),
-    inputs=st.integers(1, 9),
-    hidden=st.lists(st.integers(1, 64), min_size=1, max_size=3),
-    authority=st.floats(0.1, 2.0),
-    rows=st.integers(1, 40),
-)
+@of_any_size
 def test_the_numpy_twin_gives_the_residual_of_the_torch_policy(
     seed: int, inputs: int, hidden: list[int], authority: float, rows: int
 ) -> None:
-    policy = make_policy(PolicySettings(hidden=tuple(hidden), authority=authority), inputs, critic_inputs=2)
+    policy = fresh(PolicySettings(hidden=tuple(hidden), authority=authority), inputs, critic_inputs=2)
     shake(policy, seed)
     seen = random_rows(rows, inputs + 2, seed)
     found = policy.network()(seen[:, :inputs].astype(float))
@@ -106,7 +68,7 @@ def test_the_numpy_twin_gives_the_residual_of_the_torch_policy(
 
 
 def test_the_twin_keeps_its_weights_when_the_policy_learns_on() -> None:
-    policy = make_policy()
+    policy = fresh()
     shake(policy, 1)
     network, rows = policy.network(), random_rows(10, 5).astype(float)
     before = network(rows)
@@ -116,7 +78,7 @@ def test_the_twin_keeps_its_weights_when_the_policy_learns_on() -> None:
 
 
 def test_actor_and_critic_learn_at_rates_of_their_own() -> None:
-    policy = make_policy(critic_inputs=2)
+    policy = fresh(critic_inputs=2)
     policy.set_rates(actor=0.1, critic=0.2)
     rates = {
         id(parameter): group["lr"] for group in policy.optimizer.param_groups for parameter in group["params"]
@@ -128,7 +90,7 @@ def test_actor_and_critic_learn_at_rates_of_their_own() -> None:
 
 @pytest.mark.parametrize(("authority", "action_limit"), [(1.0, 1.0), (0.3, 1.0), (0.5, 2.0)])
 def test_the_mean_reaches_its_authority_and_never_exceeds_it(authority: float, action_limit: float) -> None:
-    policy = make_policy(PolicySettings(authority=authority), action_limit=action_limit)
+    policy = fresh(PolicySettings(authority=authority), action_limit=action_limit)
     shake(policy, 3, scale=30.0)
     rows, bound = random_rows(300, 5), authority * action_limit
     for found in (mean_of(policy, rows), policy.network()(rows.astype(float))):
@@ -139,7 +101,7 @@ def test_the_mean_reaches_its_authority_and_never_exceeds_it(authority: float, a
 
 
 def test_what_the_critic_alone_sees_moves_the_value_and_not_the_residual() -> None:
-    policy = make_policy(critic_inputs=2)
+    policy = fresh(critic_inputs=2)
     shake(policy, 4)
     rows = random_rows(50, 7)
     other = rows.copy()
@@ -149,7 +111,7 @@ def test_what_the_critic_alone_sees_moves_the_value_and_not_the_residual() -> No
 
 
 def test_the_critic_also_sees_what_the_actor_sees() -> None:
-    policy = make_policy(critic_inputs=2)
+    policy = fresh(critic_inputs=2)
     shake(policy, 5)
     rows = random_rows(50, 7)
     other = rows.copy()
@@ -160,7 +122,7 @@ def test_the_critic_also_sees_what_the_actor_sees() -> None:
 @pytest.mark.parametrize("learned", [True, False])
 def test_explores_at_the_start_with_the_standard_deviation_that_was_set(learned: bool) -> None:
     settings = PolicySettings(exploration_std=0.25, learn_exploration=learned)
-    policy = make_policy(settings, action_limit=2.0)
+    policy = fresh(settings, action_limit=2.0)
     assert policy.network().exploration_std == pytest.approx(0.5, rel=1e-6)
     torch.manual_seed(0)
     drawn = policy.get_distribution(torch.zeros(20_000, 5)).sample().detach()
@@ -169,7 +131,7 @@ def test_explores_at_the_start_with_the_standard_deviation_that_was_set(learned:
 
 @pytest.mark.parametrize("learned", [True, False])
 def test_exploration_is_among_the_parameters_only_where_it_is_learned(learned: bool) -> None:
-    policy = make_policy(PolicySettings(learn_exploration=learned))
+    policy = fresh(PolicySettings(learn_exploration=learned))
     assert ("log_std" in dict(policy.named_parameters())) is learned
     optimised = {id(parameter) for group in policy.optimizer.param_groups for parameter in group["params"]}
     assert (id(policy.log_std) in optimised) is learned
@@ -177,13 +139,13 @@ def test_exploration_is_among_the_parameters_only_where_it_is_learned(learned: b
 
 
 def test_the_optimiser_holds_every_parameter_of_the_finished_policy() -> None:
-    policy = make_policy(critic_inputs=1)
+    policy = fresh(critic_inputs=1)
     optimised = {id(parameter) for group in policy.optimizer.param_groups for parameter in group["params"]}
     assert optimised == {id(parameter) for parameter in policy.parameters()}
 
 
 def test_the_value_is_in_the_units_that_it_is_given() -> None:
-    policy, rows = make_policy(), random_rows(20, 5)
+    policy, rows = fresh(), random_rows(20, 5)
     before = value_of(policy, rows)
     policy.scale_value(150.0, 20.0)
     np.testing.assert_allclose(value_of(policy, rows), 150.0 + 20.0 * before, rtol=1e-6)
@@ -191,7 +153,7 @@ def test_the_value_is_in_the_units_that_it_is_given() -> None:
 
 
 def test_units_of_the_value_are_kept_with_the_weights_and_never_learned() -> None:
-    policy, other = make_policy(seed=1), make_policy(seed=2)
+    policy, other = fresh(seed=1), fresh(seed=2)
     policy.scale_value(150.0, 20.0)
     other.load_state_dict(policy.state_dict())
     rows = random_rows(20, 5)
