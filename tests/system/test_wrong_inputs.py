@@ -38,6 +38,10 @@ WRONG: dict[str, tuple[str, list[str]]] = {
     "people that are missing": ("does not exist", ["drive ring --driver pi --humans none.json"]),
     "people that are none": ("not a population", ["drive ring --driver pi --humans mine.py"]),
     "trajectories that are missing": ("does not exist", ["fit-drivers none.csv"]),
+    "trajectories chosen by a word": (
+        "--only: 'bad' is not allowed; allowed: key=value",
+        ["fit-drivers none.csv --only bad"],
+    ),
     "unknown reward": ("released, released-merge, eq16", ["drive ring --driver pi --reward gold"]),
     "reward that is not in the file": ("has no 'ghost'", ["drive ring --driver pi --reward mine.py:ghost"]),
     "reward that is NaN": (

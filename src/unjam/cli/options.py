@@ -151,9 +151,9 @@ def parse_range(name: str, text: str | None) -> tuple[int, int] | None:
     return int(parts[0]), int(parts[-1])
 
 
-def assignments(texts: list[str] | None) -> dict[str, Any]:
-    """Return what `--set key=value` options say."""
-    return parse_assignments(texts or [], "--set")
+def assignments(texts: list[str] | None, option: str = "--set") -> dict[str, Any]:
+    """Return what options like `--set key=value` say; `option` is named where one is wrong."""
+    return parse_assignments(texts or [], option)
 
 
 def new_folder(out: Path | None, name: str) -> Path:

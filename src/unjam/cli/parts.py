@@ -226,7 +226,7 @@ def fit_drivers(
 
     changes: dict[str, Any] = {"residual": residual, "seed": seed, **assignments(settings)}
     columns = tuple(name for name in driver.split(",") if name)
-    chosen = {name: str(value) for name, value in assignments(only).items()}
+    chosen = {name: str(value) for name, value in assignments(only, "--only").items()}
     with Counted("calibrating drivers") as counted:
         found = fit_from_files(data, changes, format, cut_bad, columns, chosen, out, counted)
     write_population(out, found.population)
