@@ -19,6 +19,7 @@ Array: TypeAlias = Any
 
 _FLOATS = SimpleNamespace(
     minimum=min,
+    floor=math.floor,
     isnan=math.isnan,
     cos=math.cos,
     sin=math.sin,
@@ -28,7 +29,7 @@ _FLOATS = SimpleNamespace(
 
 
 def namespace(array: Array) -> Any:
-    """Return what has `where`, `minimum`, `isnan`, `cos` and `sin` for this kind of number.
+    """Return what has `where`, `minimum`, `floor`, `isnan`, `cos` and `sin` for this kind of number.
 
     That is `numpy`, `torch`, or their like for plain floats.
     """
@@ -51,6 +52,13 @@ def at_least(array: Array, floor: Array) -> Array:
     if type(array) is float:
         return floor if array < floor else array
     return array.clip(floor, None)
+
+
+def at_most(array: Array, ceiling: Array) -> Array:
+    """Return the smaller of each entry and `ceiling`."""
+    if type(array) is float:
+        return ceiling if array > ceiling else array
+    return array.clip(None, ceiling)
 
 
 def square_root(array: Array) -> Array:

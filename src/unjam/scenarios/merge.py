@@ -1,5 +1,6 @@
 """The merge: a highway that a ramp joins, with one lane each, where vehicles come and go."""
 
+from dataclasses import field
 from functools import lru_cache
 from math import cos, inf, pi
 from typing import Annotated, ClassVar, Literal
@@ -9,6 +10,7 @@ from pydantic import Field, model_validator
 from pydantic.dataclasses import dataclass
 
 from unjam.drivers.car_following import SMALLEST_GAP
+from unjam.drivers.safety import SafetyFilter
 from unjam.parameters import STRICT, Count, CountOrNone, NotNegative, Positive
 from unjam.physics.arrays import at_least
 from unjam.physics.idm import IDMParameters, idm_acceleration
@@ -67,6 +69,9 @@ class Merge(Scenario):
     """decisions in an episode"""
     human_control: HumanControl = "commanded"
     right_of_way: bool = False
+    safety: SafetyFilter = field(default_factory=lambda: SafetyFilter(active=False, time_headway=0.0))
+    """none: the road is as it was published"""
+    bounded: bool = False
 
     @model_validator(mode="after")
     def _fits(self) -> "Merge":

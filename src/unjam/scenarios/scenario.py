@@ -9,7 +9,9 @@ import numpy as np
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
+from unjam.drivers.actuator import Actuator
 from unjam.drivers.command import Limits
+from unjam.drivers.safety import SafetyFilter
 from unjam.parameters import STRICT, Count, CountOrNone, NotNegative, Positive
 from unjam.physics.idm import IDMParameters
 from unjam.scenarios.population import Population, read_population
@@ -65,6 +67,12 @@ class Scenario:
     actuation: Actuation = "shielded"
     """how SUMO carries out a CAV's command: `shielded` exactly until it is unsafe, then SUMO brakes; `raw`
     exactly; `flow` bound by the human IDM"""
+    safety: SafetyFilter = field(default_factory=SafetyFilter)
+    """the filter between driver and road, of every CAV, in every simulation step"""
+    actuator: Actuator = field(default_factory=Actuator)
+    """how late a CAV does what it is told"""
+    bounded: bool = True
+    """whether commanded people keep to what brakes and engine can do, in an emergency too"""
     humans: IDMParameters = field(default_factory=IDMParameters)
     """how people drive"""
     population: str = ""

@@ -12,6 +12,7 @@ from unjam.drivers.check import check_acceleration
 from unjam.drivers.driver import Driver, Memory
 from unjam.drivers.from_file import is_file_reference
 from unjam.drivers.local_state import LocalState
+from unjam.drivers.safety import Ahead
 from unjam.physics.kinematics import distance_driven
 from unjam.scenarios.scenario import Scenario
 from unjam.tree import mapped
@@ -139,8 +140,9 @@ class VirtualDynamics:
         self._reward = reward_on_tensors(reward or scenario.reward)
 
     def step(self, state: LocalState, applied: Tensor, drawn: Tensor) -> Outcomes:
-        """Return what `applied` leads to: next state, reward, and whether that is a crash."""
+        """Return what `applied` leads to once it is filtered: next state, reward, whether that is a crash."""
         scenario = self._scenario
+        applied = scenario.safety.keep(applied, Ahead(*state[:3]), scenario.decision_step)
         known = base_step(self._model.base, scenario, state, applied)
         expected = torch.stack([getattr(known, name) for name in NUMBERS])
         residual = self._residual(state, applied, drawn, expected[GAP_ROWS]).T

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from unjam.drivers.local_state import LocalState
+from unjam.worlds.audit import Audit
 from unjam.worlds.reward import Outcome, time_headway
 from unjam.worlds.world import Driven
 
@@ -32,7 +33,10 @@ class Trajectory:
     residual: Floats
     """the network's residual with its exploration noise, not clipped [m/s2]; zero without one"""
     applied: Floats
-    """the acceleration that was commanded, within the action limit [m/s2]"""
+    """the acceleration that was commanded, within the action limit, or harder braking where the safety filter
+    demanded it; the mean over the decision [m/s2]"""
+    filtered: Floats
+    """the most that the safety filter took from what the driver wanted [m/s2]; zero where it let it pass"""
     shield: Floats
     """braking that SUMO's safety check added to the command [m/s2]; zero where it let it pass"""
     memory: dict[str, Any]
@@ -69,6 +73,7 @@ def trajectory(
     rows: NDArray[np.intp] | None,
     states: LocalState,
     applied: Floats,
+    filtered: Floats,
     shield: Floats,
     terminated: bool,
     driven: Driven,
@@ -82,6 +87,7 @@ def trajectory(
         rows: its row among the CAVs at each moment, shape (T + 1,); None: decisions are plain numbers.
         states: what it perceived, shape (T + 1,).
         applied: its commands; of humans what they did [m/s2], shape (T,).
+        filtered: most that the safety filter took from each [m/s2], shape (T,).
         shield: hardest braking that was added to each command [m/s2], shape (T,).
         terminated: whether a collision ended it.
         driven: all that the driver decided.
@@ -89,7 +95,7 @@ def trajectory(
     about = (vehicle, start, states)
     if not driven.decisions:
         nothing = np.zeros((1, 0)), applied, np.zeros_like(applied)
-        return Trajectory(*about, *nothing, applied, shield, {}, 1, terminated)
+        return Trajectory(*about, *nothing, applied, filtered, shield, {}, 1, terminated)
 
     def own(values: Sequence[Any], steps: Sequence[int]) -> Floats:
         """Return this CAV's of all values at some steps."""
@@ -102,7 +108,8 @@ def trajectory(
     choices = [*steps[:: driven.hold], steps.stop]
     observations = own([*seen, driven.last_observation], choices).astype(np.float64).reshape(len(choices), -1)
     decided = observations, own(experts, steps), own(residuals, steps)
-    return Trajectory(*about, *decided, applied, shield, driven.memories[number], driven.hold, terminated)
+    commanded = applied, filtered, shield
+    return Trajectory(*about, *decided, *commanded, driven.memories[number], driven.hold, terminated)
 
 
 @dataclass(frozen=True)
@@ -156,6 +163,7 @@ class Episode:
     terms: dict[str, Floats] = field(default_factory=dict)
     """terms of the reward by name, shape (T,)"""
     trajectories: tuple[Trajectory, ...] = ()
+    audit: Audit = field(default_factory=Audit)
 
     @property
     def reward(self) -> Floats:

@@ -15,6 +15,7 @@ import numpy as np
 from unjam.drivers.car_following import SMALLEST_GAP
 from unjam.drivers.command import Command
 from unjam.drivers.local_state import LocalState
+from unjam.drivers.safety import Ahead
 from unjam.errors import EpisodeError
 from unjam.physics.arrays import Array, at_least
 from unjam.physics.idm import idm_acceleration
@@ -22,6 +23,7 @@ from unjam.physics.kinematics import gap_on_loop, next_position, next_speed
 from unjam.scenarios.population import as_calibrated
 from unjam.scenarios.road import ClosedRoad
 from unjam.scenarios.scenario import VEHICLE_LENGTH, Scenario
+from unjam.worlds.audit import Audit, brakings, following
 from unjam.worlds.record import Episode, Floats, trajectory
 from unjam.worlds.sumo.neighbours import loop_neighbours, loop_state, places_along
 from unjam.worlds.sumo.simulation import LEAVE_TO_SUMO, Simulation
@@ -54,7 +56,7 @@ class ClosedTraffic(Traffic[ClosedRoad]):
         self._near_positions = {place: float(road.start_positions[place]) for place in needed}
         self._be_human(road.vehicle_ids)
         if self._commanded:
-            simulation.command_people(road.vehicle_ids, scenario.right_of_way)
+            simulation.command_people(road.vehicle_ids, scenario.right_of_way, scenario.bounded)
         self._exploration: Any = None
         self.speeds = simulation.speeds(road.vehicle_ids)
         self._expect_all()
@@ -73,7 +75,8 @@ class ClosedTraffic(Traffic[ClosedRoad]):
         self._log_speeds = array("d", self.speeds)
         self._started = self._simulation.distances(self.road.vehicle_ids)
         self.log_fuel = []
-        self._log_applied = array("d")
+        self._log_wanted = array("d")
+        self._log_told = array("d")  # of each CAV in each simulation step
         self._log_commanded = array("d")
 
     def start(self, controlled: bool, on_progress: OnProgress | None = None) -> LocalState | None:
@@ -114,19 +117,30 @@ class ClosedTraffic(Traffic[ClosedRoad]):
 
     def advance(self, command: Command | None) -> None:
         """Simulate one decision, held over its simulation steps; None: the CAVs stay human."""
-        scenario, step = self.scenario, self.scenario.simulation_step
-        applied = self._told(command) if self._controlled else []
-        self._log_applied.fromlist(applied)
-        for _ in range(scenario.steps_per_decision):
+        wanted = self._told(command) if self._controlled else []
+        self._log_wanted.fromlist(wanted)
+        for _ in range(self.scenario.steps_per_decision):
             if self._controlled:
-                told = zip(self._places, applied, strict=True)
-                commanded = [next_speed(self.speeds[place], wanted, step) for place, wanted in told]
-                self._log_commanded.fromlist(commanded)
-                self._simulation.command_speeds(self.cavs, commanded)
+                self._drive_cavs(wanted)
             self._simulate()
         self.decisions += 1
         if self.full:
             self.log_fuel.append(self._simulation.fuel(self.road.vehicle_ids))
+
+    def _drive_cavs(self, wanted: list[float]) -> None:
+        """Ask for the speeds that the CAVs' accelerations lead to in this step, once they are filtered."""
+        speeds, near, step = self.speeds, self._near_positions, self.scenario.simulation_step
+        loop, last, carry_out = self.road.loop_length, len(speeds) - 1, self._cars.carry_out
+        told, commanded = [], []
+        for name, place, acceleration in zip(self.cavs, self._places, wanted, strict=True):
+            speed, leader = speeds[place], place + 1 if place < last else 0
+            gap = gap_on_loop(near[place], near[leader], loop, VEHICLE_LENGTH)
+            allowed, done = carry_out(name, acceleration, Ahead(speed, speeds[leader], gap))
+            told.append(allowed)
+            commanded.append(next_speed(speed, done, step))
+        self._log_told.fromlist(told)
+        self._log_commanded.fromlist(commanded)
+        self._simulation.command_speeds(self.cavs, commanded)
 
     def _simulate(self) -> None:
         """Simulate one step, and add the humans' noise to their speeds.
@@ -222,10 +236,11 @@ class ClosedTraffic(Traffic[ClosedRoad]):
     def record(self, driven: Driven) -> Episode:
         """Return what happened since the start."""
         road, each = self.road, self.scenario.steps_per_decision
-        speeds, positions = (values[:, ::each] for values in self.speeds_and_positions())
+        moments = self.speeds_and_positions()
+        speeds, positions = (values[:, ::each] for values in moments)
         gaps = gap_on_loop(positions, np.roll(positions, -1, axis=0), road.loop_length, VEHICLE_LENGTH)
         states = loop_state(speeds, positions, self._near, road.loop_length)
-        applied, shield = self._applied(), self._shield()
+        (applied, filtered), shield = self._applied(), self._shield()
         trajectories = tuple(
             trajectory(
                 vehicle=name,
@@ -234,6 +249,7 @@ class ClosedTraffic(Traffic[ClosedRoad]):
                 rows=None if self.single else np.full(self.decisions + 1, row),
                 states=states.each(lambda values: np.ascontiguousarray(values[row])),  # noqa: B023
                 applied=np.ascontiguousarray(applied[:, row]),
+                filtered=np.ascontiguousarray(filtered[:, row]),
                 shield=np.ascontiguousarray(shield[:, row]),
                 terminated=self.crashed,
                 driven=driven,
@@ -252,7 +268,19 @@ class ClosedTraffic(Traffic[ClosedRoad]):
             crossings=road.crossings,
             outline=road.outline,
             trajectories=trajectories,
+            audit=self._audit(*moments),
         )
+
+    def _audit(self, speeds: Floats, positions: Floats) -> Audit:
+        """Return the physics of every simulation step; arrays of shape (vehicles, moments)."""
+        step, places = self.scenario.simulation_step, self._places
+        accelerations = np.diff(speeds, axis=1) / step
+        states = loop_state(speeds, positions, self._near, self.road.loop_length)
+        followed = following(states.speed.T, states.leader_speed.T, states.leader_gap.T, step)
+        if not self._controlled:
+            return Audit(brakings(accelerations), following=followed, floor=self._floor)
+        people = np.delete(accelerations, places, axis=0)
+        return Audit(brakings(people), brakings(accelerations[places]), followed, self._floor)
 
     def scene(self) -> Scene:
         """Return this moment as pictures show it."""
@@ -261,12 +289,19 @@ class ClosedTraffic(Traffic[ClosedRoad]):
         cavs = np.isin(np.arange(len(self.speeds)), self._places)
         return Scene(outline[:, 1:], places_along(outline, driven, loop), np.array(self.speeds), cavs)
 
-    def _applied(self) -> Floats:
-        """Return the CAVs' commands within the action limit, of humans what they did [m/s2], (T, CAVs)."""
-        if self._log_applied:
-            return np.array(self._log_applied).reshape(-1, len(self.cavs))
+    def _applied(self) -> tuple[Floats, Floats]:
+        """Return what CAVs were told, and how much the filter took from it at most [m/s2], (T, CAVs) each.
+
+        Of humans it is what they did.
+        """
+        each, cavs = self.scenario.steps_per_decision, len(self.cavs)
+        if self._log_wanted:
+            wanted = np.array(self._log_wanted).reshape(-1, cavs)
+            taken = wanted[:, None] - np.array(self._log_told).reshape(-1, each, cavs)
+            return wanted - taken.mean(1), taken.max(1)
         speeds = self._of_cavs(self._log_speeds)
-        return np.diff(speeds[:: self.scenario.steps_per_decision], axis=0) / self.scenario.decision_step
+        did = np.diff(speeds[::each], axis=0) / self.scenario.decision_step
+        return did, np.zeros_like(did)
 
     def _shield(self) -> Floats:
         """Return the hardest braking that SUMO added to each command, zero if it let it pass, (T, CAVs)."""

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from unjam.drivers.car_following import SMALLEST_GAP
 from unjam.drivers.local_state import LARGEST_GAP, LocalState
+from unjam.drivers.safety import Ahead
 from unjam.errors import EpisodeError
 from unjam.physics.idm import idm_acceleration, parameter_rows
 from unjam.physics.kinematics import next_position, next_speed
@@ -144,7 +145,7 @@ class MergingTraffic(OpenTraffic[MergingRoad]):
         streams, simulation = self._streams, self._simulation
         streams.leave(left)
         streams.move(simulation.speeds(streams.names), self.scenario.simulation_step)
-        simulation.command_people(entered, self.scenario.right_of_way)
+        simulation.command_people(entered, self.scenario.right_of_way, self.scenario.bounded)
         origins = self.road.origins
         for name in sorted(entered, key=lambda name: -origins[name].position):  # the foremost first
             streams.enter(name, origins[name], simulation.speeds([name])[0])
@@ -187,6 +188,13 @@ class MergingTraffic(OpenTraffic[MergingRoad]):
         entered = np.array([self.road.origins[name].position for name in streams.names])
         self._check_odometer(streams.names, entered, streams.positions)
         return super().record(driven)
+
+    def _ahead(self, names: Sequence[str]) -> list[Ahead]:
+        if not self.scenario.safety.active:
+            return super()._ahead(names)
+        states, place_of = self._streams.states(), self._streams.names.index
+        near = list(zip(*(values.tolist() for values in states[:3]), strict=True))
+        return [Ahead(*near[place_of(name)]) for name in names]
 
     def _lines(self) -> Floats:
         return network_lines(network_file(self.road.network))

@@ -1,14 +1,18 @@
 """Traffic on roads with ends: vehicles come and go, and each stay of a CAV is a trajectory of its own."""
 
+from array import array
 from collections import defaultdict
 from collections.abc import Sequence
+from math import inf
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from unjam.drivers.command import Command
-from unjam.drivers.local_state import LocalState
+from unjam.drivers.local_state import LARGEST_GAP, LocalState
+from unjam.drivers.safety import Ahead
 from unjam.physics.kinematics import next_speed
+from unjam.worlds.audit import Audit, brakings, following
 from unjam.worlds.record import Episode, Floats, Trajectory, trajectory
 from unjam.worlds.sumo.traffic import RoadKind, Scene, Traffic
 from unjam.worlds.world import Driven, OnProgress
@@ -53,6 +57,14 @@ class OpenTraffic(Traffic[RoadKind]):
         """Return what CAVs perceive now."""
         raise NotImplementedError
 
+    def _ahead(self, names: Sequence[str]) -> list[Ahead]:
+        """Return what these CAVs' filters know now."""
+        speeds = self._simulation.speeds(names)
+        if not self.scenario.safety.active:
+            return [Ahead(speed, speed, inf) for speed in speeds]
+        near = (self._simulation.neighbours(name, LARGEST_GAP) for name in names)
+        return [Ahead(speed, ahead, gap) for speed, (ahead, gap, *_) in zip(speeds, near, strict=True)]
+
     def _lines(self) -> Floats:
         """Return the road's lines as `Scene` has them."""
         raise NotImplementedError
@@ -81,6 +93,7 @@ class OpenTraffic(Traffic[RoadKind]):
         self._on_road: dict[str, bool] = {}
         """who is there, in order of entry; true: to be driven by the driver"""
         self.cavs, self._arrived = [], 0
+        self._forget()
         self._follow()
         self._warm_up(lambda: self._simulate({}), on_progress)
         self._controlled = controlled
@@ -88,11 +101,19 @@ class OpenTraffic(Traffic[RoadKind]):
         self._log_cavs: list[Sequence[str]] = []
         self._log_states: list[LocalState] = []
         self._log_applied: list[list[float]] = []
+        self._log_filtered: list[list[float]] = []
         self._log_shield: list[list[float]] = []
         self._log_places: list[Floats] = []
         self._waiting: list[int] = []
         self._arrived = 0
+        self._forget()
         self._look()
+
+    def _forget(self) -> None:
+        """Begin the log of everybody's accelerations anew."""
+        self._last_speeds: dict[str, float] = {}
+        self._changes, self._changed = array("d"), bytearray()
+        """everybody's changes of speed in each simulation step [m/s], and whether a CAV's"""
 
     def perceive(self) -> LocalState:
         """Return what the CAVs perceive now: arrays of shape (CAVs,)."""
@@ -102,17 +123,13 @@ class OpenTraffic(Traffic[RoadKind]):
         """Simulate one decision, held over its simulation steps; None: the CAVs stay human."""
         scenario, names = self.scenario, self.cavs
         step = scenario.simulation_step
-        applied = self._told(command) if self._controlled else []
+        wanted = self._told(command) if self._controlled else []
         before = self._log_states[-1].speed
         shield = dict.fromkeys(names, 0.0)
+        taken: dict[str, list[float]] = {name: [] for name in names}
         for _ in range(scenario.steps_per_decision):
-            told = {name: value for name, value in zip(names, applied, strict=False) if name in self._on_road}
-            speeds = self._simulation.speeds(list(told))
-            wanted = {
-                name: next_speed(speed, value, step)
-                for (name, value), speed in zip(told.items(), speeds, strict=True)
-            }
-            commanded = self._legal(wanted)
+            asked = {name: value for name, value in zip(names, wanted, strict=False) if name in self._on_road}
+            commanded = self._legal(self._carried_out(asked, taken))
             self._simulate(commanded)
             still = [name for name in commanded if name in self._on_road]
             for name, moved in zip(still, self._simulation.speeds(still), strict=True):
@@ -124,11 +141,25 @@ class OpenTraffic(Traffic[RoadKind]):
         if not self._controlled:
             after = dict(zip(self._log_moments[-1].names, self.speeds, strict=True))
             changes = (after.get(name, speed) - speed for name, speed in zip(names, before, strict=True))
-            applied = [change / scenario.decision_step for change in changes]
-        self._log_applied.append(applied)
+            wanted = [change / scenario.decision_step for change in changes]
+        less = [sum(values) / scenario.steps_per_decision for values in taken.values()]
+        self._log_applied.append([asked - part for asked, part in zip(wanted, less, strict=True)])
+        self._log_filtered.append([max(values, default=0.0) for values in taken.values()])
         self._log_shield.append(list(shield.values()))
         if self.full:
             self.log_fuel.append(self._simulation.fuel(self._log_moments[-1].names))
+
+    def _carried_out(self, wanted: dict[str, float], taken: dict[str, list[float]]) -> dict[str, float]:
+        """Return the speeds that CAVs' accelerations lead to in this step, once they are filtered [m/s].
+
+        What the filter takes from each is added to `taken` [m/s2].
+        """
+        names, found, step = list(wanted), {}, self.scenario.simulation_step
+        for name, ahead in zip(names, self._ahead(names), strict=True):
+            told, done = self._cars.carry_out(name, wanted[name], ahead)
+            taken[name].append(wanted[name] - told)
+            found[name] = next_speed(ahead.speed, done, step)
+        return found
 
     def _simulate(self, commanded: dict[str, float]) -> None:
         """Simulate one step after which these CAVs shall have these speeds [m/s]."""
@@ -136,6 +167,7 @@ class OpenTraffic(Traffic[RoadKind]):
         self._simulation.command_speeds(commanded.keys(), commanded.values())
         self._simulation.step()
         self._follow()
+        self._watch()
         colliding = self._simulation.colliding()
         if colliding:
             self.collisions = max(self.collisions, len(colliding))
@@ -150,6 +182,17 @@ class OpenTraffic(Traffic[RoadKind]):
         self._moved(left, entered)
         for name in entered:
             self._on_road[name] = self._is_cav(name)
+
+    def _watch(self) -> None:
+        """Note how everybody's speed has changed in this step: people's and CAVs' apart."""
+        names = list(self._on_road)
+        speeds = self._simulation.speeds(names)
+        before = self._last_speeds
+        changes = [speed - before.get(name, speed) for name, speed in zip(names, speeds, strict=True)]
+        self._last_speeds = dict(zip(names, speeds, strict=True))
+        self._changes.fromlist(changes)
+        driven = set(self.cavs) if self._controlled else ()
+        self._changed.extend(map(driven.__contains__, names))
 
     def _look(self) -> None:
         """Note who is where after a decision, and take control of the CAVs that have entered."""
@@ -200,7 +243,22 @@ class OpenTraffic(Traffic[RoadKind]):
             lines=self._lines() if self.full else np.zeros((0, 2)),
             places=places,
             trajectories=trajectories,
+            audit=self._audit(trajectories),
         )
+
+    def _audit(self, trajectories: Sequence[Trajectory]) -> Audit:
+        """Return the physics of every simulation step; how CAVs followed, of every decision."""
+        most = max((len(each.states.speed) for each in trajectories), default=0)
+        speed, leader, gap = np.full((3, most, len(trajectories)), np.nan)
+        for column, each in enumerate(trajectories):
+            rows = slice(len(each.states.speed))
+            speed[rows, column] = each.states.speed
+            leader[rows, column], gap[rows, column] = each.states.leader_speed, each.states.leader_gap
+        followed = following(speed, leader, gap, self.scenario.decision_step)
+        accelerations = np.array(self._changes) / self.scenario.simulation_step
+        of_cav = np.array(self._changed, bool)
+        people, cavs = brakings(accelerations[~of_cav]), brakings(accelerations[of_cav])
+        return Audit(people, cavs, followed, self._floor)
 
     def _trajectories(self, driven: Driven) -> tuple[Trajectory, ...]:
         """Return the stays of at least one decision, in order of entry."""
@@ -225,6 +283,7 @@ class OpenTraffic(Traffic[RoadKind]):
                         *(np.array([values[time][row] for time, row in places]) for values in states)
                     ),
                     applied=np.array([self._log_applied[time][row] for time, row in places[:-1]]),
+                    filtered=np.array([self._log_filtered[time][row] for time, row in places[:-1]]),
                     shield=np.array([self._log_shield[time][row] for time, row in places[:-1]]),
                     terminated=self.crashed and start + steps == self.decisions,
                     driven=driven,

@@ -27,6 +27,8 @@ SPEED_MODES = {"shielded": 31, "raw": 30, "flow": 25}
 WITHOUT_RIGHT_OF_WAY = 1
 """the bit that stays where vehicles need not obey the right of way: who is surprised on a junction then stops
 as fast as it must, and so must who follows"""
+LIMITS_OF_ACCELERATION = 2 | 4
+"""the bits by which vehicles keep to the acceleration and the braking of their type"""
 LEAVE_TO_SUMO = -1.0
 """the commanded speed that stands for none"""
 
@@ -209,9 +211,10 @@ class Simulation:
         """Give `ids` other current speeds [m/s], plain floats: how noise enters."""
         _exhaust(map(self._set_previous_speed, ids, speeds))
 
-    def command_people(self, ids: Iterable[str], right_of_way: bool) -> None:
-        """Let SUMO keep `ids` safe and to the right of way, but not to limits of acceleration."""
+    def command_people(self, ids: Iterable[str], right_of_way: bool, bounded: bool) -> None:
+        """Let SUMO keep `ids` safe and to the right of way and, if `bounded`, to limits of acceleration."""
         mode = SPEED_MODES["flow"] if right_of_way else SPEED_MODES["flow"] & WITHOUT_RIGHT_OF_WAY
+        mode |= LIMITS_OF_ACCELERATION if bounded else 0
         for name in ids:
             self._sumo.vehicle.setSpeedMode(name, mode)
 

@@ -12,6 +12,7 @@ from unjam.physics.arrays import Array
 from unjam.physics.idm import IDMParameters
 from unjam.scenarios.road import Road
 from unjam.scenarios.scenario import Scenario
+from unjam.worlds.cars import Cars
 from unjam.worlds.record import Episode, Floats
 from unjam.worlds.sumo.files import files_of
 from unjam.worlds.sumo.simulation import Simulation
@@ -77,6 +78,8 @@ class Traffic(World[Episode], Generic[RoadKind]):
         """whether fuel and, on roads with ends, places are recorded"""
         self.log_fuel: list[list[float]] = []
         self._controlled = False
+        self._cars = Cars(scenario.safety, scenario.actuator, scenario.simulation_step)
+        self._floor = scenario.safety.time_headway
         self._noise_generator = np.random.default_rng(noise_seed)
         self._exploration_generator = np.random.default_rng(exploration_seed)
         self._simulation = simulation

@@ -1,0 +1,84 @@
+"""Could cars and people have done that? The physics of an episode, in every simulation step of every vehicle."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+BEYOND = (3.5, 4.5, 9.0)
+"""brakings that are counted [m/s2]: ISO 15622's above 20 m/s, a hard one, and what dry asphalt allows"""
+MOVING_SPEED = 1.0
+"""speed above which a time headway is a matter of safety [m/s]"""
+SHORT_HEADWAY = 1.0
+"""[s]"""
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Brakings:
+    """How hard some vehicles braked; a moment is one vehicle in one simulation step."""
+
+    hardest: float = 0.0
+    """[m/s2]; zero where nobody braked"""
+    beyond: tuple[int, ...] = (0,) * len(BEYOND)
+    """moments with more than each of BEYOND"""
+    moments: int = 0
+
+
+@dataclass(frozen=True)
+class Following:
+    """How the CAVs followed those ahead, over all simulation steps."""
+
+    headway: float = np.inf
+    """smallest time headway while faster than 1 m/s [s]"""
+    time_to_collision: float = np.inf
+    """smallest gap over closing speed [s]"""
+    needed_braking: float = 0.0
+    """largest deceleration rate to avoid a crash, closing speed squared over twice the gap [m/s2]"""
+    share_short: float = 0.0
+    """share of the time faster than 1 m/s with a time headway below one second"""
+    jerk: float = 0.0
+    """largest change of acceleration over time [m/s3]"""
+
+
+@dataclass(frozen=True)
+class Audit:
+    """The physics of an episode."""
+
+    people: Brakings = field(default_factory=Brakings)
+    cavs: Brakings = field(default_factory=Brakings)
+    following: Following = field(default_factory=Following)
+    floor: float = 0.0
+    """time headway that was demanded of CAVs [s]"""
+
+
+def brakings(accelerations: Any) -> Brakings:
+    """Return how hard vehicles braked whose accelerations those are [m/s2], any shape."""
+    all_of_them = np.asarray(accelerations, np.float64).ravel()
+    if not all_of_them.size:
+        return Brakings()
+    hard = all_of_them[all_of_them < -BEYOND[0]]
+    beyond = tuple(int((hard < -limit).sum()) for limit in BEYOND)
+    return Brakings(float(max(0.0, -all_of_them.min())), beyond, all_of_them.size)
+
+
+def following(speed: Floats, leader_speed: Floats, gap: Floats, step: float) -> Following:
+    """Return how CAVs followed; arrays of shape (moments, CAVs) one `step` apart, NaN where one is not there.
+
+    Sources: TTC after Hayward 1972; DRAC after Almqvist et al. 1991; SAE J2944.
+    """
+    with np.errstate(invalid="ignore", divide="ignore"):
+        moving, closing = speed > MOVING_SPEED, speed - leader_speed
+        headways = (gap / speed)[moving]
+        nearing = (closing > 0) & (gap > 0)
+        times, needed = (gap / closing)[nearing], (closing**2 / (2.0 * gap))[nearing]
+        jerks = np.abs(np.diff(speed, 2, axis=0)) / step**2
+    return Following(
+        headway=float(headways.min(initial=np.inf)),
+        time_to_collision=0.0 if (gap <= 0).any() else float(times.min(initial=np.inf)),
+        needed_braking=float(needed.max(initial=0.0)),
+        share_short=float((headways < SHORT_HEADWAY).mean()) if headways.size else 0.0,
+        jerk=float(np.nanmax(jerks, initial=0.0)),
+    )
