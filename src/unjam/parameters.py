@@ -85,12 +85,12 @@ def _split_commas(text: str) -> list[str]:
     return [*parts, text[start:]]
 
 
-def merge(values: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
+def changed(values: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
     """Return `values` with `changes`; tables are merged key by key."""
     merged = dict(values)
     for key, value in changes.items():
         both = isinstance(value, dict) and isinstance(merged.get(key), dict)
-        merged[key] = merge(merged[key], value) if both else value
+        merged[key] = changed(merged[key], value) if both else value
     return merged
 
 
@@ -101,5 +101,5 @@ def nested(changes: dict[str, Any]) -> dict[str, Any]:
         inner: Any = value
         for part in reversed(key.split(".")):
             inner = {part: inner}
-        tables = merge(tables, inner)
+        tables = changed(tables, inner)
     return tables

@@ -74,6 +74,7 @@ def episode_of(network: Network, seed: tuple[int, ...], hold: int, target: Targe
         expert=nothing,
         residual=residual,
         applied=residual,
+        filtered=nothing,
         shield=nothing,
         terms={"near": -((residual - wanted) ** 2)},
         memory={},

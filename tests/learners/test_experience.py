@@ -38,6 +38,7 @@ def make_trajectory(seed: int, decisions: int, hold: int = 1, terminated: bool =
         expert=nothing,
         residual=np.repeat(generator.normal(size=choices), hold)[:decisions],
         applied=nothing,
+        filtered=nothing,
         shield=nothing,
         terms={"one": generator.normal(size=decisions), "other": generator.uniform(size=decisions)},
         memory={},

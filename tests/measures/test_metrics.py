@@ -30,6 +30,7 @@ def trajectory_of(states: LocalState, applied: ArrayLike = 0.0, **changes: Any) 
         "expert": np.zeros(steps),
         "residual": np.zeros(steps),
         "applied": np.zeros(steps) + np.asarray(applied),
+        "filtered": np.zeros(steps),
         "shield": np.zeros(steps),
         "terms": {"reward": np.zeros(steps)},
         "memory": {},

@@ -9,7 +9,7 @@ from unjam.drivers import PISaturation
 from unjam.drivers.car_following import Constant
 from unjam.errors import InputError
 from unjam.learners.settings import AGENTS, PolicySettings, TRPOSettings
-from unjam.parameters import merge
+from unjam.parameters import changed
 from unjam.training.config import EvaluationSettings, RunConfig, load_config, read_toml, to_toml
 from unjam.training.evaluate import HELD_OUT, VALIDATION
 from unjam.training.presets import PRESETS
@@ -60,7 +60,7 @@ def test_presets_are_not_changed_by_their_use() -> None:
 
 def test_merging_changes_neither_side() -> None:
     values, changes = {"a": {"b": 1, "c": 2}, "d": 3}, {"a": {"b": 5}, "d": {"e": 6}}
-    assert merge(values, changes) == {"a": {"b": 5, "c": 2}, "d": {"e": 6}}
+    assert changed(values, changes) == {"a": {"b": 5, "c": 2}, "d": {"e": 6}}
     assert (values, changes) == ({"a": {"b": 1, "c": 2}, "d": 3}, {"a": {"b": 5}, "d": {"e": 6}})
 
 

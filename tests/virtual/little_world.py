@@ -111,7 +111,19 @@ def recording(
     """Return a recording of which nobody asks what the driver saw and decided."""
     nothing = np.zeros_like(applied)
     return Recording(
-        *("cav", 0, states, np.zeros((1, 0)), applied, nothing, applied, nothing, memory or {}, hold),
+        *(
+            "cav",
+            0,
+            states,
+            np.zeros((1, 0)),
+            applied,
+            nothing,
+            applied,
+            nothing,
+            nothing,
+            memory or {},
+            hold,
+        ),
         terminated=terminated,
         terms={"reward": reward},
         drawn=np.zeros(0) if drawn is None else drawn,

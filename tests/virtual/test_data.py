@@ -29,6 +29,7 @@ def trajectory(number: int, decisions: int, hold: int = 1, terminated: bool = Fa
         expert=nothing,
         residual=nothing,
         applied=steps[:-1] / 1e6,
+        filtered=nothing,
         shield=nothing,
         terms={"one": steps[:-1], "two": nothing + 1},
         memory={"number": np.array(float(number))},

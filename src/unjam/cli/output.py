@@ -39,11 +39,13 @@ def new_table(words: Sequence[str] = (), numbers: Sequence[str] = (), style: str
 
 
 def metrics_table(rows_by_driver: dict[str, list[dict[str, Any]]]) -> Table:
-    """Return the table of all metrics: mean and 95 % bootstrap interval over the episodes."""
+    """Return the table of the verdict and all metrics: mean and 95 % bootstrap interval over episodes."""
+    from unjam.measures.drivable import verdicts
     from unjam.measures.metrics import METRICS
     from unjam.measures.statistics import estimate
 
     table = new_table(("metric", "unit"), list(rows_by_driver))
+    table.add_row("could a car drive so?", "", *(said or "–" for said in verdicts(rows_by_driver).values()))
     for name, metric in METRICS.items():
         cells = []
         for rows in rows_by_driver.values():

@@ -144,7 +144,7 @@ class SteppedRoad:
         kept = list(range(len(before)) if traffic.kept is None else traffic.kept)
         speeds, state = np.array(traffic.speeds), traffic.perceive()
         headways = time_headway(state.leader_gap, state.speed)[: len(kept)]
-        applied = np.asarray(done.command.acceleration)[kept]
+        applied = traffic.last_applied()[kept]
         outcome = Outcome(speeds[None], applied[None], headways[None], np.array([traffic.crashed]))
         terms = {name: float(values[0]) for name, values in self._reward(outcome).items()}
         left = {name: seen[row] for row, name in enumerate(before) if row not in kept}

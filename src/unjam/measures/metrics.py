@@ -6,6 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from unjam.measures.drivable import drivable
+from unjam.worlds.audit import BEYOND, Brakings
 from unjam.worlds.record import Episode, Floats, outcome_of
 from unjam.worlds.reward import eq16
 
@@ -19,8 +21,6 @@ CALM_SECONDS = 60.0
 """how long traffic must stay calm before its wave counts as dissolved"""
 PETROL_DENSITY = 742.0
 """[mg/ml], as in SUMO's PollutantsInterface"""
-MOVING_SPEED = 1.0
-"""speed above which a time headway is a matter of safety [m/s]"""
 CELLS = 512
 """places along the road at which the speed is looked at"""
 LATER = 8.0
@@ -163,13 +163,97 @@ def min_ttc(episode: Episode) -> float:
 
 
 def min_headway(episode: Episode) -> float:
-    """Smallest time headway of the CAV, gap over speed, while it drives faster than 1 m/s [s]."""
-    smallest = np.inf
-    for trajectory in episode.trajectories:
-        moving = trajectory.states.speed > MOVING_SPEED
-        headway = trajectory.states.leader_gap[moving] / trajectory.states.speed[moving]
-        smallest = min(smallest, float(headway.min(initial=np.inf)))
-    return smallest
+    """Smallest time headway of the CAV, gap over speed, while it drives faster than 1 m/s [s].
+
+    In any simulation step, as all that follows of the audit.
+    """
+    return episode.audit.following.headway
+
+
+def share_short_headway(episode: Episode) -> float:
+    """Share of the CAV's time faster than 1 m/s with a time headway below one second."""
+    return episode.audit.following.share_short
+
+
+def cav_min_ttc(episode: Episode) -> float:
+    """Smallest time to collision of the CAV with the vehicle ahead [s], gap over closing speed."""
+    return episode.audit.following.time_to_collision
+
+
+def max_drac(episode: Episode) -> float:
+    """Largest deceleration rate to avoid a crash of the CAV, closing speed squared over twice the gap [m/s2].
+
+    Almqvist, Hyden and Risser 1991.
+    """
+    return episode.audit.following.needed_braking
+
+
+def max_jerk(episode: Episode) -> float:
+    """Largest change of the CAV's acceleration over time [m/s3]."""
+    return episode.audit.following.jerk
+
+
+def cav_max_braking(episode: Episode) -> float:
+    """Hardest braking of a CAV [m/s2]; NaN where nobody is automated."""
+    return episode.audit.cavs.hardest if episode.audit.cavs.moments else float("nan")
+
+
+def people_max_braking(episode: Episode) -> float:
+    """Hardest braking of people [m/s2]."""
+    return episode.audit.people.hardest
+
+
+def _beyond(brakings: Brakings, limit: float) -> float:
+    moments = brakings.moments
+    return 1e6 * brakings.beyond[BEYOND.index(limit)] / moments if moments else float("nan")
+
+
+def cav_beyond_3_5(episode: Episode) -> float:
+    """CAVs' moments (vehicles times simulation steps) of braking beyond 3.5 m/s2, in a million.
+
+    ISO 15622 allows no more above 20 m/s.
+    """
+    return _beyond(episode.audit.cavs, 3.5)
+
+
+def cav_beyond_4_5(episode: Episode) -> float:
+    """CAVs' moments of braking beyond 4.5 m/s2, in a million."""
+    return _beyond(episode.audit.cavs, 4.5)
+
+
+def cav_beyond_9(episode: Episode) -> float:
+    """CAVs' moments of braking beyond 9 m/s2, in a million: more than dry asphalt allows."""
+    return _beyond(episode.audit.cavs, 9.0)
+
+
+def people_beyond_3_5(episode: Episode) -> float:
+    """People's moments (vehicles times simulation steps) of braking beyond 3.5 m/s2, in a million."""
+    return _beyond(episode.audit.people, 3.5)
+
+
+def people_beyond_4_5(episode: Episode) -> float:
+    """People's moments of braking beyond 4.5 m/s2, in a million."""
+    return _beyond(episode.audit.people, 4.5)
+
+
+def people_beyond_9(episode: Episode) -> float:
+    """People's moments of braking beyond 9 m/s2, in a million: more than dry asphalt allows."""
+    return _beyond(episode.audit.people, 9.0)
+
+
+def filter_share(episode: Episode) -> float:
+    """Share of the CAV's decisions in which the safety filter braked harder than its driver."""
+    return _over_cavs([(trajectory.filtered > 0).mean() for trajectory in episode.trajectories])
+
+
+def overridden(episode: Episode) -> float:
+    """Share of commands that SUMO's safety check changed, but for the right of way."""
+    return episode.audit.following.overridden
+
+
+def yielded(episode: Episode) -> float:
+    """Share of commands that SUMO changed near a crossing, where vehicles yield."""
+    return episode.audit.following.yielded
 
 
 def collisions(episode: Episode) -> float:
@@ -245,6 +329,21 @@ METRICS: dict[str, Metric] = {
     "mean_abs_jerk": Metric(mean_abs_jerk, "CAV's mean |jerk|", "m/s3", 3),
     "min_ttc": Metric(min_ttc, "smallest time to collision", "s"),
     "min_headway": Metric(min_headway, "smallest time headway", "s"),
+    "cav_min_ttc": Metric(cav_min_ttc, "CAV's smallest time to collision", "s"),
+    "share_short_headway": Metric(share_short_headway, "CAV's share of time below one second", "", 4),
+    "max_drac": Metric(max_drac, "CAV's largest braking needed (DRAC)", "m/s2"),
+    "max_jerk": Metric(max_jerk, "CAV's largest jerk", "m/s3", 1),
+    "cav_max_braking": Metric(cav_max_braking, "CAV's hardest braking", "m/s2"),
+    "cav_beyond_3_5": Metric(cav_beyond_3_5, "CAV's brakings beyond 3.5 m/s2", "per million", 0),
+    "cav_beyond_4_5": Metric(cav_beyond_4_5, "CAV's brakings beyond 4.5 m/s2", "per million", 0),
+    "cav_beyond_9": Metric(cav_beyond_9, "CAV's brakings beyond 9 m/s2", "per million", 0),
+    "people_max_braking": Metric(people_max_braking, "people's hardest braking", "m/s2"),
+    "people_beyond_3_5": Metric(people_beyond_3_5, "people's brakings beyond 3.5 m/s2", "per million", 0),
+    "people_beyond_4_5": Metric(people_beyond_4_5, "people's brakings beyond 4.5 m/s2", "per million", 0),
+    "people_beyond_9": Metric(people_beyond_9, "people's brakings beyond 9 m/s2", "per million", 0),
+    "filter_share": Metric(filter_share, "decisions in which the filter braked", "", 4),
+    "overridden": Metric(overridden, "commands overridden in following", "", 4),
+    "yielded": Metric(yielded, "commands overridden at a crossing", "", 4),
     "collisions": Metric(collisions, "vehicles in collisions", "", 0),
     "shield_override_share": Metric(shield_override_share, "commands overridden", "", 4),
     "shield_max_braking": Metric(shield_max_braking, "hardest braking added", "m/s2"),
@@ -255,19 +354,21 @@ METRICS: dict[str, Metric] = {
 
 
 def measure(episode: Episode) -> dict[str, Any]:
-    """Return the row of an episode: seed, status, steps, what was drawn, and every metric by name.
+    """Return the row of an episode: seed, status, steps, what was drawn, every metric by name, the verdict.
 
     The metrics of a failed episode are NaN, and its row has the reason.
     """
-    return {
+    row = {
         "seed": episode.seed[0] if len(episode.seed) == 1 else list(episode.seed),
         "status": episode.status,
         "reason": episode.reason,
         "error": episode.error,
         "steps": episode.steps,
         **episode.drawn,
+        "floor": episode.audit.floor,
         **{name: metric.function(episode) if episode.ok else np.nan for name, metric in METRICS.items()},
     }
+    return {**row, "drivable": drivable(row)}
 
 
 def wave_speed(episode: Episode) -> float:

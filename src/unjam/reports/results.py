@@ -13,6 +13,7 @@ from safetensors import SafetensorError
 from safetensors.numpy import load_file
 
 from unjam.errors import InputError
+from unjam.measures.metrics import METRICS
 
 Floats = NDArray[np.float32]
 
@@ -113,10 +114,11 @@ def read_results(folder: Path) -> Results:
 
 
 def rows_by_driver(rows: list[dict[str, Any]]) -> dict[str, list[dict[str, Any]]]:
-    """Return the rows of an `evaluation.json` by driver, NaN where it has null."""
+    """Return the rows of an `evaluation.json` by driver, NaN where it has null or no such metric."""
+    unknown = dict.fromkeys(METRICS, float("nan"))
     found: dict[str, list[dict[str, Any]]] = {}
     for row in rows:
-        found.setdefault(row["driver"], []).append(_with_nan(row))
+        found.setdefault(row["driver"], []).append({**unknown, **_with_nan(row)})
     return found
 
 

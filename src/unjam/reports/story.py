@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from unjam.measures.metrics import METRICS
+from unjam.measures.drivable import verdicts
+from unjam.measures.metrics import METRICS, Metric
 from unjam.measures.statistics import Estimate, estimate_of, paired_difference
 from unjam.reports.results import Results, Shown
 
@@ -184,18 +185,26 @@ def cards_of(result: Results) -> list[dict[str, str]]:
 
 
 def table_of(columns: Sequence[Column]) -> list[dict[str, Any]]:
-    """Return the table of all metrics: a row per metric, a cell per column, mean and 95 % interval."""
-    return [
-        {
-            "label": metric.label,
-            "unit": metric.unit,
-            "about": " ".join((metric.function.__doc__ or "").split()),
-            "cells": [
-                cell_of(estimate_of(column.rows, name), metric.digits, len(column.rows)) for column in columns
-            ],
-        }
-        for name, metric in METRICS.items()
-    ]
+    """Return the table of all metrics: a row per metric, a cell per column, mean and 95 % interval.
+
+    First the verdict: could a car drive so?
+    """
+    found = verdicts({column.name: column.rows for column in columns})
+    said = [{"mean": found[column.name] or "–", "interval": ""} for column in columns]
+    about = "The first reason against it; docs: What a car can drive."
+    verdict = {"label": "could a car drive so?", "unit": "", "about": about, "cells": said}
+    return [verdict, *(_row_of(columns, name, metric) for name, metric in METRICS.items())]
+
+
+def _row_of(columns: Sequence[Column], name: str, metric: Metric) -> dict[str, Any]:
+    return {
+        "label": metric.label,
+        "unit": metric.unit,
+        "about": " ".join((metric.function.__doc__ or "").split()),
+        "cells": [
+            cell_of(estimate_of(column.rows, name), metric.digits, len(column.rows)) for column in columns
+        ],
+    }
 
 
 def cell_of(found: Estimate, digits: int, wanted: int) -> dict[str, str]:

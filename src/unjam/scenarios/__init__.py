@@ -4,7 +4,7 @@ from dataclasses import asdict
 from typing import Any
 
 from unjam.errors import wrong
-from unjam.parameters import build
+from unjam.parameters import build, changed, nested
 from unjam.scenarios.figure_eight import FigureEight
 from unjam.scenarios.merge import Merge
 from unjam.scenarios.own_network import OwnNetwork, own_network
@@ -31,10 +31,12 @@ KINDS = {kind.title: kind for kind in (Ring, FigureEight, Merge, OwnNetwork)}
 def make_scenario(name: str, changes: dict[str, Any] | None = None) -> Scenario:
     """Return the scenario `name`, or that of a .sumocfg file, with `changes` to its parameters.
 
+    A dot in a name leads into a group of parameters: `{"safety.time_headway": 1.5}`.
+
     Raises:
         InputError: unknown scenario or parameter, or a value out of range.
     """
-    changes = _named_as_now(changes or {})
+    changes = nested(_named_as_now(changes or {}))
     if name.endswith(".sumocfg"):
         return own_network(name, changes)
     if name not in SCENARIOS:
@@ -44,7 +46,7 @@ def make_scenario(name: str, changes: dict[str, Any] | None = None) -> Scenario:
         return scenario
     if changes.get("population"):
         changes = {**_of_population(str(changes["population"])), **changes}
-    return build(type(scenario), {**asdict(scenario), **changes}, f"scenario {name}")
+    return build(type(scenario), changed(asdict(scenario), changes), f"scenario {name}")
 
 
 def _named_as_now(values: dict[str, Any]) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from unjam.parameters import STRICT, Count, NotNegative
 from unjam.physics.idm import equilibrium_speed
 from unjam.scenarios.ring import Lap, Loop, Place
 from unjam.scenarios.road import Edge, Line, Node, RoadNetwork, as_line
-from unjam.scenarios.scenario import VEHICLE_LENGTH, Actuation, HumanControl
+from unjam.scenarios.scenario import VEHICLE_LENGTH, HumanControl
 
 CROSSING_RADIUS = 3.1
 """of the node where the ways of a figure eight cross [m], as Flow's"""
@@ -61,7 +61,6 @@ class FigureEight(Loop):
     """road left free ahead of the first vehicle at the start [m]; Flow's `bunching`"""
     horizon: Count = 1500
     """decisions in an episode"""
-    actuation: Actuation = "flow"
     human_control: HumanControl = "commanded"
     impatience: Annotated[float, Field(ge=0, le=1)] = 0.5
 

@@ -14,7 +14,7 @@ from unjam.drivers.driver import Driver
 from unjam.drivers.observation import observed
 from unjam.errors import InputError
 from unjam.learners.settings import Agents, PolicySettings
-from unjam.parameters import STRICT, Count, CountOrNone, Positive, build, merge, nested
+from unjam.parameters import STRICT, Count, CountOrNone, Positive, build, changed, nested
 from unjam.scenarios import make_scenario
 from unjam.scenarios.scenario import Scenario
 from unjam.training.presets import preset_values
@@ -109,7 +109,7 @@ class RunConfig(Agents):
             found[name] = replace(
                 self,
                 scenario=scenario,
-                road=merge(self.road, task.road),
+                road=changed(self.road, task.road),
                 expert=task.expert or self.expert,
                 reward=task.reward or self.reward,
                 tasks=(),
@@ -167,12 +167,12 @@ def load_config(
     Raises:
         InputError: an unknown key or preset, a value out of range, an unreadable file.
     """
-    given = merge(read_toml(file) if file is not None else {}, nested(changes or {}))
+    given = changed(read_toml(file) if file is not None else {}, nested(changes or {}))
     values: dict[str, Any] = {}
     if preset:
         started = preset_values(preset, str(given.get("scenario", RunConfig.scenario)))
         values = {**started, "preset": preset}
-    return build(RunConfig, merge(values, given), "")
+    return build(RunConfig, changed(values, given), "")
 
 
 def read_toml(path: Path) -> dict[str, Any]:

@@ -19,6 +19,7 @@ from unjam.drivers.registry import driver_names, free_label
 from unjam.errors import InputError, wrong
 from unjam.files import make_folder, to_json, write_whole
 from unjam.manifest import manifest
+from unjam.measures.drivable import verdicts
 from unjam.measures.metrics import METRICS, measure
 from unjam.measures.statistics import Estimate, summarise
 from unjam.reports.html import write_report
@@ -208,6 +209,7 @@ class DriveResult:
         return {
             "scenario": self.scenario,
             "driver": driver,
+            "drivable": verdicts(self.rows)[driver],
             "episodes": self.rows[driver],
             "mean": {name: summary[name].mean for name in METRICS},
             "interval": {name: [summary[name].low, summary[name].high] for name in METRICS},

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 from unjam.errors import InputError, MissingPartError, UnjamError, wrong
 from unjam.files import make_folder, to_json, write_whole
 from unjam.manifest import manifest
-from unjam.parameters import merge, nested, parse_value
+from unjam.parameters import changed, nested, parse_value
 from unjam.reports.results import read_progress
 from unjam.training.config import RunConfig, load_config, to_toml
 from unjam.training.executors import CommandLine, Executor, OnLine, running, training_command
@@ -111,7 +111,7 @@ def check_space(base: RunConfig, space: Space) -> None:
 
 def trial_config(base: RunConfig, values: dict[str, Any]) -> RunConfig:
     """Return a configuration with some values changed; keys may have dots."""
-    return load_config(changes=merge(asdict(base), nested(values)))
+    return load_config(changes=changed(asdict(base), nested(values)))
 
 
 @dataclass(frozen=True)

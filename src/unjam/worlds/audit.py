@@ -1,4 +1,4 @@
-"""Could cars and people have done that? The physics of an episode, in every simulation step of every vehicle."""
+"""Could cars and people have done that? The physics of all vehicles, in every simulation step."""
 
 from dataclasses import dataclass, field
 from typing import Any
@@ -8,6 +8,10 @@ from numpy.typing import NDArray
 
 BEYOND = (3.5, 4.5, 9.0)
 """brakings that are counted [m/s2]: ISO 15622's above 20 m/s, a hard one, and what dry asphalt allows"""
+ROUNDING = 1e-6
+"""of a braking [m/s2]"""
+SHIELD_ROUNDING = 1e-6
+"""by how much SUMO changes a speed that it lets pass [m/s]"""
 MOVING_SPEED = 1.0
 """speed above which a time headway is a matter of safety [m/s]"""
 SHORT_HEADWAY = 1.0
@@ -41,6 +45,10 @@ class Following:
     """share of the time faster than 1 m/s with a time headway below one second"""
     jerk: float = 0.0
     """largest change of acceleration over time [m/s3]"""
+    overridden: float = 0.0
+    """share of the commands that SUMO's safety check changed, but for the right of way"""
+    yielded: float = 0.0
+    """share of the commands that SUMO changed near a crossing, where vehicles yield"""
 
 
 @dataclass(frozen=True)
@@ -60,13 +68,16 @@ def brakings(accelerations: Any) -> Brakings:
     if not all_of_them.size:
         return Brakings()
     hard = all_of_them[all_of_them < -BEYOND[0]]
-    beyond = tuple(int((hard < -limit).sum()) for limit in BEYOND)
+    beyond = tuple(int((hard < -limit - ROUNDING).sum()) for limit in BEYOND)
     return Brakings(float(max(0.0, -all_of_them.min())), beyond, all_of_them.size)
 
 
-def following(speed: Floats, leader_speed: Floats, gap: Floats, step: float) -> Following:
+def following(
+    speed: Floats, leader_speed: Floats, gap: Floats, step: float, overridden: Any = (), yielding: Any = ()
+) -> Following:
     """Return how CAVs followed; arrays of shape (moments, CAVs) one `step` apart, NaN where one is not there.
 
+    `overridden` says which commands SUMO changed, `yielding` which were given near a crossing; any shape.
     Sources: TTC after Hayward 1972; DRAC after Almqvist et al. 1991; SAE J2944.
     """
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -79,6 +90,13 @@ def following(speed: Floats, leader_speed: Floats, gap: Floats, step: float) -> 
         headway=float(headways.min(initial=np.inf)),
         time_to_collision=0.0 if (gap <= 0).any() else float(times.min(initial=np.inf)),
         needed_braking=float(needed.max(initial=0.0)),
-        share_short=float((headways < SHORT_HEADWAY).mean()) if headways.size else 0.0,
+        share_short=_share(headways < SHORT_HEADWAY),
         jerk=float(np.nanmax(jerks, initial=0.0)),
+        overridden=_share(np.asarray(overridden, bool) & ~np.asarray(yielding, bool)),
+        yielded=_share(np.asarray(overridden, bool) & np.asarray(yielding, bool)),
     )
+
+
+def _share(there: NDArray[np.bool_]) -> float:
+    """Return the share of what is true; zero of nothing."""
+    return float(there.mean()) if there.size else 0.0

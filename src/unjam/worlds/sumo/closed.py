@@ -23,7 +23,7 @@ from unjam.physics.kinematics import gap_on_loop, next_position, next_speed
 from unjam.scenarios.population import as_calibrated
 from unjam.scenarios.road import ClosedRoad
 from unjam.scenarios.scenario import VEHICLE_LENGTH, Scenario
-from unjam.worlds.audit import Audit, brakings, following
+from unjam.worlds.audit import SHIELD_ROUNDING, Audit, brakings, following
 from unjam.worlds.record import Episode, Floats, trajectory
 from unjam.worlds.sumo.neighbours import loop_neighbours, loop_state, places_along
 from unjam.worlds.sumo.simulation import LEAVE_TO_SUMO, Simulation
@@ -32,6 +32,8 @@ from unjam.worlds.world import Driven, OnProgress
 
 HISTORY = 60.0
 """seconds of the warm-up that a driver may remember"""
+APPROACH = 50.0
+"""way before a crossing on which what SUMO adds is put down to the right of way [m]"""
 NOISE_BLOCK = 100
 """steps for which noise is drawn at once"""
 
@@ -276,11 +278,22 @@ class ClosedTraffic(Traffic[ClosedRoad]):
         step, places = self.scenario.simulation_step, self._places
         accelerations = np.diff(speeds, axis=1) / step
         states = loop_state(speeds, positions, self._near, self.road.loop_length)
-        followed = following(states.speed.T, states.leader_speed.T, states.leader_gap.T, step)
+        followed = (states.speed.T, states.leader_speed.T, states.leader_gap.T)
         if not self._controlled:
-            return Audit(brakings(accelerations), following=followed, floor=self._floor)
+            return Audit(brakings(accelerations), following=following(*followed, step), floor=self._floor)
+        near = np.zeros(states.speed.T[:-1].shape, bool)
+        for start, end in self.road.crossings:
+            near |= (end - states.route_position.T[:-1]) % self.road.loop_length < end - start + APPROACH
+        followed = following(*followed, step, self._added() > SHIELD_ROUNDING / step, near)
         people = np.delete(accelerations, places, axis=0)
         return Audit(brakings(people), brakings(accelerations[places]), followed, self._floor)
+
+    def last_applied(self) -> Floats:
+        """Return what the CAVs were told in the last decision, once it was filtered [m/s2], shape (CAVs,)."""
+        cavs = len(self.cavs)
+        wanted = np.array(self._log_wanted[-cavs:])
+        told = np.array(self._log_told[-cavs * self.scenario.steps_per_decision :]).reshape(-1, cavs)
+        return wanted - (wanted - told).mean(0)
 
     def scene(self) -> Scene:
         """Return this moment as pictures show it."""
@@ -307,9 +320,13 @@ class ClosedTraffic(Traffic[ClosedRoad]):
         """Return the hardest braking that SUMO added to each command, zero if it let it pass, (T, CAVs)."""
         if not self._log_commanded:
             return np.zeros((self.decisions, len(self.cavs)))
+        each = self.scenario.steps_per_decision
+        return self._added().reshape(-1, each, len(self.cavs)).max(1).clip(0.0, None)
+
+    def _added(self) -> Floats:
+        """Return the braking that SUMO added to each command in each step [m/s2], shape (steps, CAVs)."""
         commanded = np.array(self._log_commanded).reshape(-1, len(self.cavs))
-        added = (commanded - self._of_cavs(self._log_moved)) / self.scenario.simulation_step
-        return added.reshape(-1, self.scenario.steps_per_decision, len(self.cavs)).max(1).clip(0.0, None)
+        return (commanded - self._of_cavs(self._log_moved)) / self.scenario.simulation_step
 
     def _of_cavs(self, log: "array[float]") -> Floats:
         """Return what was logged of the CAVs, shape (rows, CAVs)."""

@@ -31,6 +31,8 @@ CAV_COLOUR = "215,38,61"
 """red, in SUMO's window"""
 OBEDIENT = 20.0
 """accelerations of an obedient CAV's type [m/s2]: far beyond what it asks for, so that only safety clips"""
+ACCELERATION = 2.6
+"""of commanded people and of cars, SUMO's own [m/s2]"""
 CAV_TYPES = "cav_of_{}"
 """the type of a CAV whose own type is `{}`"""
 KEPT = (
@@ -97,7 +99,7 @@ def _own_types_xml(scenario: Scenario, road: OwnRoad) -> str:
     for name, attributes in road.files.types.items():
         kept = {key: value for key, value in attributes.items() if key in KEPT or key.startswith("lc")}
         calm = {"id": CAV_TYPES.format(name), "sigma": 0.0, "speedDev": 0.0}
-        types.append({**kept, **calm, **_obedient_layer(scenario.simulation_step)})
+        types.append({**kept, **calm, **_obedient_layer(scenario)})
     return _document("additional", "vType", types)
 
 
@@ -128,7 +130,7 @@ def _human_layer(scenario: Scenario, humans: IDMParameters) -> Attributes:
         "maxSpeed": humans.desired_speed,
     }
     if scenario.human_control == "commanded":
-        layer |= {"accel": 2.6, "decel": 4.5, "tau": 1.0, "minGap": scenario.people_gap}
+        layer |= {"accel": ACCELERATION, "decel": 4.5, "tau": 1.0, "minGap": scenario.people_gap}
         if population:  # the layer may not hold back who keeps less than a second
             layer |= {"tau": min(1.0, population.quickest), "maxSpeed": population.fastest}
     return layer
@@ -144,22 +146,24 @@ def _cav_type(scenario: Scenario) -> str:
         layer = _human_layer(scenario, scenario.humans)
         layer["minGap"] = max(layer["minGap"], SMALLEST_CAV_GAP)
         return _vehicle_type("cav", scenario, color=CAV_COLOUR, **layer)
-    return _vehicle_type(
-        "cav", scenario, **_obedient_layer(scenario.simulation_step), maxSpeed=scenario.top_speed
-    )
+    return _vehicle_type("cav", scenario, **_obedient_layer(scenario), maxSpeed=scenario.top_speed)
 
 
-def _obedient_layer(simulation_step: float) -> Attributes:
+def _obedient_layer(scenario: Scenario) -> Attributes:
     """Return the attributes of a type that executes any safe command exactly.
 
     With SUMO's safe-speed check on, a Krauss vehicle with a reaction time of one step and a small minimum
-    gap is the one that stays out of the way until the command would lead to a crash.
+    gap is the one that stays out of the way until the command would lead to a crash. Where a filter keeps it
+    safe, it has a car's engine and brakes: SUMO only makes it yield, and others expect of it what it can do.
     """
+    safety = scenario.safety
+    brakes = safety.braking if safety.active else OBEDIENT
     return {
         "color": CAV_COLOUR,
         "carFollowModel": "Krauss",
-        **dict.fromkeys(("accel", "decel", "emergencyDecel", "apparentDecel"), OBEDIENT),
-        "tau": simulation_step,
+        "accel": max(ACCELERATION, scenario.limits.highest) if safety.active else OBEDIENT,
+        **dict.fromkeys(("decel", "emergencyDecel", "apparentDecel"), brakes),
+        "tau": scenario.simulation_step,
         "minGap": SMALLEST_CAV_GAP,
     }
 

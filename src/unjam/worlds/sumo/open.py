@@ -12,7 +12,7 @@ from unjam.drivers.command import Command
 from unjam.drivers.local_state import LARGEST_GAP, LocalState
 from unjam.drivers.safety import Ahead
 from unjam.physics.kinematics import next_speed
-from unjam.worlds.audit import Audit, brakings, following
+from unjam.worlds.audit import SHIELD_ROUNDING, Audit, brakings, following
 from unjam.worlds.record import Episode, Floats, Trajectory, trajectory
 from unjam.worlds.sumo.traffic import RoadKind, Scene, Traffic
 from unjam.worlds.world import Driven, OnProgress
@@ -223,8 +223,8 @@ class OpenTraffic(Traffic[RoadKind]):
         fuel = np.full((len(self.log_fuel), len(names)), np.nan) if self.full else np.zeros((0, 0))
         for time, (there, *values) in enumerate(self._log_moments):
             columns = [column[name] for name in there]
-            for array, row in zip((speeds, positions, gaps), values, strict=True):
-                array[time, columns] = row
+            for log, row in zip((speeds, positions, gaps), values, strict=True):
+                log[time, columns] = row
             if self.full:
                 places[time, columns] = self._log_places[time]
                 if time:
@@ -254,7 +254,9 @@ class OpenTraffic(Traffic[RoadKind]):
             rows = slice(len(each.states.speed))
             speed[rows, column] = each.states.speed
             leader[rows, column], gap[rows, column] = each.states.leader_speed, each.states.leader_gap
-        followed = following(speed, leader, gap, self.scenario.decision_step)
+        step = self.scenario.decision_step
+        added = np.concatenate([each.shield for each in trajectories]) if trajectories else np.zeros(0)
+        followed = following(speed, leader, gap, step, added > SHIELD_ROUNDING / step, np.zeros_like(added))
         accelerations = np.array(self._changes) / self.scenario.simulation_step
         of_cav = np.array(self._changed, bool)
         people, cavs = brakings(accelerations[~of_cav]), brakings(accelerations[of_cav])
@@ -290,6 +292,10 @@ class OpenTraffic(Traffic[RoadKind]):
                 )
             )
         return tuple(found)
+
+    def last_applied(self) -> Floats:
+        """Return what the CAVs were told in the last decision, once it was filtered [m/s2], shape (CAVs,)."""
+        return np.array(self._log_applied[-1])
 
     def scene(self) -> Scene:
         """Return this moment as pictures show it."""

@@ -114,6 +114,10 @@ class Traffic(World[Episode], Generic[RoadKind]):
         """Return standard normal noise for one decision: an array (CAVs,), or a plain number."""
         return self._exploration_generator.standard_normal(len(self.cavs))
 
+    def last_applied(self) -> Floats:
+        """Return what the CAVs were told in the last decision, once it was filtered [m/s2], shape (CAVs,)."""
+        raise NotImplementedError
+
     def scene(self) -> Scene:
         """Return this moment as pictures show it."""
         raise NotImplementedError

@@ -1,0 +1,176 @@
+"""Does the safety filter keep what docs/safety.md proves, whatever leaders and drivers do?"""
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from unjam.drivers.actuator import Actuator, Underway
+from unjam.drivers.safety import Ahead, SafetyFilter
+from unjam.errors import InputError
+from unjam.parameters import build
+from unjam.physics.kinematics import next_speed
+from unjam.physics.stopping import speed_to_stop_within, stopping_distance
+
+STEPS = st.sampled_from([0.05, 0.1, 0.2, 0.5])
+SPEEDS = st.floats(0.0, 40.0)
+GAPS = st.floats(0.5, 200.0)
+FILTERS = [
+    SafetyFilter(),
+    SafetyFilter(time_headway=0.0),
+    SafetyFilter(time_headway=1.6, headway_braking=3.0, standstill_gap=2.0),
+    SafetyFilter(braking=4.5, leader_braking=8.0),
+]
+ACTUATORS = [None, Actuator(lag=0.3), Actuator(delay=0.2), Actuator(delay=0.3, lag=0.5)]
+
+
+def stopping_by_steps(speed: float, braking: float, step: float) -> float:
+    distance = 0.0
+    while (speed := next_speed(speed, -braking, step)) > 0.0:
+        distance += speed * step
+    return distance
+
+
+@given(SPEEDS, st.floats(1.0, 9.0), STEPS)
+def test_a_stopping_distance_is_what_single_steps_add_up_to(
+    speed: float, braking: float, step: float
+) -> None:
+    assert stopping_distance(speed, braking, step) == pytest.approx(
+        stopping_by_steps(speed, braking, step), abs=1e-9
+    )
+
+
+@given(st.floats(0.0, 300.0), st.floats(1.0, 9.0), STEPS)
+def test_the_speed_to_stop_within_uses_the_distance_up(distance: float, braking: float, step: float) -> None:
+    speed = speed_to_stop_within(distance, braking, step)
+    assert speed * step + stopping_distance(speed, braking, step) == pytest.approx(distance, abs=1e-9)
+
+
+class Pursuit:
+    """Rows of cars that their filters alone keep behind leaders, in the simulator's own steps."""
+
+    def __init__(
+        self, safety: SafetyFilter, actuator: Actuator | None, step: float, rows: int, seed: int
+    ) -> None:
+        generator = np.random.default_rng(seed)
+        self.safety, self.actuator, self.step, self.generator = safety, actuator, step, generator
+        ahead = Ahead(*generator.uniform(0.0, [[35.0], [35.0], [150.0]], (3, rows)))
+        start = Underway(np.zeros(rows)) if actuator is None else actuator.start(ahead.speed, step)
+        free = safety.highest(ahead, step, actuator, start) > -min(safety.braking, safety.headway_braking)
+        self.ahead = Ahead(*(values[free] for values in ahead))
+        self.underway = Underway(start.acceleration[free], tuple(each[free] for each in start.pending))
+
+    def go(self, leader: Any, wanted: Any) -> np.ndarray:
+        """Make one step in which leaders accelerate with `leader`; return the cars' accelerations."""
+        step = self.step
+        told = self.safety.keep(
+            np.broadcast_to(wanted, self.ahead.speed.shape), self.ahead, step, self.actuator, self.underway
+        )
+        assert (told >= np.minimum(wanted, -self.safety.braking)).all()
+        if self.actuator is not None:
+            self.underway = self.actuator.obey(told, self.ahead.speed, self.underway, step)
+            told = self.underway.acceleration
+        speed = next_speed(self.ahead.speed, told, step)
+        ahead = next_speed(self.ahead.leader_speed, leader, step)
+        self.ahead = Ahead(speed, ahead, self.ahead.gap + step * (ahead - speed))
+        return told
+
+
+@pytest.mark.parametrize("actuator", ACTUATORS, ids=str)
+@pytest.mark.parametrize("safety", FILTERS, ids=["usual", "no floor", "wide", "weak brakes"])
+def test_a_leader_who_brakes_as_hard_as_allowed_is_never_touched(
+    safety: SafetyFilter, actuator: Actuator | None
+) -> None:
+    for step, seed in ((0.1, 0), (0.5, 1)):
+        pursuit = Pursuit(safety, actuator, step, 4000, seed)
+        assert len(pursuit.ahead.gap) > 1000
+        nearest = np.minimum(pursuit.ahead.gap, safety.standstill_gap)
+        leader = np.zeros(len(nearest))
+        for number in range(round(30.0 / step)):
+            if number % round(2.0 / step) == 0:
+                leader = pursuit.generator.choice([-1.0, -1.0, -0.3, 0.0, 0.5], len(nearest))
+                leader *= safety.leader_braking
+            pursuit.go(leader, 3.0)
+            assert (pursuit.ahead.gap >= nearest - 1e-9).all()
+
+
+@pytest.mark.parametrize("actuator", ACTUATORS, ids=str)
+@pytest.mark.parametrize("safety", [FILTERS[0], FILTERS[2]], ids=["usual", "wide"])
+def test_the_floor_holds_behind_who_brakes_no_harder_than_it_allows_for(
+    safety: SafetyFilter, actuator: Actuator | None
+) -> None:
+    pursuit = Pursuit(safety, actuator, 0.1, 4000, 2)
+    leader = np.zeros(len(pursuit.ahead.gap))
+    for number in range(300):
+        if number % 20 == 0:
+            leader = pursuit.generator.choice([-1.0, -1.0, -0.3, 0.0, 0.5], len(pursuit.ahead.gap))
+            leader *= safety.headway_braking
+        pursuit.go(leader, 3.0)
+        if number > 10:  # commands given before the start have arrived
+            speed, _, gap = pursuit.ahead
+            assert (gap >= safety.standstill_gap + safety.time_headway * speed - 1e-9).all()
+
+
+def test_without_the_filter_the_same_cars_crash() -> None:
+    pursuit = Pursuit(SafetyFilter(active=False), None, 0.1, 100, 0)
+    for _ in range(100):
+        pursuit.go(-6.0, 3.0)
+    assert (pursuit.ahead.gap < 0).any()
+
+
+@given(SPEEDS, SPEEDS, GAPS, st.floats(-3.0, 3.0), STEPS)
+def test_one_car_in_plain_numbers_is_told_what_rows_and_tensors_are(
+    speed: float, leader: float, gap: float, wanted: float, step: float
+) -> None:
+    ahead, safety = Ahead(speed, leader, gap), SafetyFilter()
+    told = safety.keep(wanted, ahead, step)
+    rows = safety.keep(np.array([wanted]), Ahead(*(np.array([value]) for value in ahead)), step)
+    tensors = safety.keep(
+        torch.tensor([wanted], dtype=torch.float64),
+        Ahead(*(torch.tensor([value], dtype=torch.float64) for value in ahead)),
+        step,
+    )
+    assert rows[0] == pytest.approx(told, abs=1e-9)
+    assert tensors[0].item() == pytest.approx(told, abs=1e-9)
+
+
+@given(SPEEDS, SPEEDS, GAPS, st.floats(-3.0, 3.0), st.floats(0.0, 2.0), st.floats(0.0, 2.0))
+def test_errors_of_the_sensors_within_their_bounds_never_let_more_pass(
+    speed: float, leader: float, gap: float, wanted: float, far: float, fast: float
+) -> None:
+    careful = SafetyFilter(gap_error=2.0, speed_error=2.0)
+    sensed = careful.keep(wanted, Ahead(speed, leader + fast, gap + far), 0.1)
+    assert sensed <= SafetyFilter().keep(wanted, Ahead(speed, leader, gap), 0.1) + 1e-9
+
+
+@given(st.floats(0.0, 30.0), st.floats(-6.0, 2.0), st.lists(st.floats(-6.0, 2.0), min_size=1, max_size=40))
+def test_a_car_with_lag_drives_no_farther_than_its_equivalent(
+    speed: float, acceleration: float, commands: list[float]
+) -> None:
+    actuator, step, braking = Actuator(lag=0.4), 0.1, 6.0
+    underway = Underway(max(acceleration, -speed / step))
+    for command in commands:
+        equivalent = actuator.equivalent_speed(speed, underway, braking, step)
+        underway = actuator.obey(command, speed, underway, step)
+        speed = next_speed(speed, underway.acceleration, step)
+        following = actuator.equivalent_speed(speed, underway, braking, step)
+        standing = actuator.equivalent_speed(0.0, Underway(0.0), braking, step)
+        assert speed <= following + 1e-9
+        assert following <= max(equivalent + command * step, standing) + 1e-9
+
+
+@pytest.mark.parametrize(
+    ("values", "line"),
+    [
+        ({"leader_braking": 5.0}, "leader_braking: 5 is not allowed; allowed: >= braking, 6"),
+        ({"headway_braking": 7.0}, "headway_braking: 7 is not allowed; allowed: <= braking, 6"),
+        ({"time_headway": -1.0}, "time_headway: -1.0 is not allowed; allowed: greater than or equal to 0"),
+    ],
+)
+def test_brakes_that_prove_nothing_are_refused(values: dict[str, float], line: str) -> None:
+    with pytest.raises(InputError) as refused:
+        build(SafetyFilter, values, "safety")
+    assert line in str(refused.value)
