@@ -1,8 +1,13 @@
-"""Could a car have driven so? A verdict on what was measured of a driver, or the first reason against it."""
+"""Could a car have driven so? What an episode's audit says, and the verdict: the first reason against it."""
 
 from collections.abc import Sequence
-from math import isnan
+from math import isfinite, isnan, nan
 from typing import Any
+
+import numpy as np
+
+from unjam.worlds.audit import BEYOND, Brakings
+from unjam.worlds.record import Episode
 
 FLOOR_MET = 0.9
 """share of the demanded time headway that must be left at any moment"""
@@ -15,6 +20,102 @@ HARDEST_BRAKING = 6.0
 TOLERANCE = 1e-6
 
 DRIVABLE = "drivable"
+
+
+def min_headway(episode: Episode) -> float:
+    """Smallest time headway of the CAV, gap over speed, while it drives faster than 1 m/s [s].
+
+    In any simulation step, as all that follows.
+    """
+    return episode.audit.following.headway
+
+
+def share_short_headway(episode: Episode) -> float:
+    """Share of the CAV's time faster than 1 m/s with a time headway below one second."""
+    return episode.audit.following.share_short
+
+
+def cav_min_ttc(episode: Episode) -> float:
+    """Smallest time to collision of the CAV with the vehicle ahead [s]; NaN where it never closed in."""
+    found = episode.audit.following.time_to_collision
+    return found if isfinite(found) else nan
+
+
+def max_drac(episode: Episode) -> float:
+    """Largest deceleration rate to avoid a crash of the CAV, closing speed squared over twice the gap [m/s2].
+
+    Almqvist, Hyden and Risser 1991.
+    """
+    return episode.audit.following.needed_braking
+
+
+def max_jerk(episode: Episode) -> float:
+    """Largest change of the CAV's acceleration over time [m/s3]."""
+    return episode.audit.following.jerk
+
+
+def cav_max_braking(episode: Episode) -> float:
+    """Hardest braking of a CAV [m/s2]; NaN where nobody is automated."""
+    return episode.audit.cavs.hardest if episode.audit.cavs.moments else nan
+
+
+def people_max_braking(episode: Episode) -> float:
+    """Hardest braking of people [m/s2]."""
+    return episode.audit.people.hardest
+
+
+def _beyond(brakings: Brakings, limit: float) -> float:
+    moments = brakings.moments
+    return 1e6 * brakings.beyond[BEYOND.index(limit)] / moments if moments else nan
+
+
+def cav_beyond_3_5(episode: Episode) -> float:
+    """CAVs' moments (vehicles times simulation steps) of braking beyond 3.5 m/s2, in a million.
+
+    ISO 15622 allows no more above 20 m/s.
+    """
+    return _beyond(episode.audit.cavs, 3.5)
+
+
+def cav_beyond_4_5(episode: Episode) -> float:
+    """CAVs' moments of braking beyond 4.5 m/s2, in a million."""
+    return _beyond(episode.audit.cavs, 4.5)
+
+
+def cav_beyond_9(episode: Episode) -> float:
+    """CAVs' moments of braking beyond 9 m/s2, in a million: more than dry asphalt allows."""
+    return _beyond(episode.audit.cavs, 9.0)
+
+
+def people_beyond_3_5(episode: Episode) -> float:
+    """People's moments (vehicles times simulation steps) of braking beyond 3.5 m/s2, in a million."""
+    return _beyond(episode.audit.people, 3.5)
+
+
+def people_beyond_4_5(episode: Episode) -> float:
+    """People's moments of braking beyond 4.5 m/s2, in a million."""
+    return _beyond(episode.audit.people, 4.5)
+
+
+def people_beyond_9(episode: Episode) -> float:
+    """People's moments of braking beyond 9 m/s2, in a million: more than dry asphalt allows."""
+    return _beyond(episode.audit.people, 9.0)
+
+
+def filter_share(episode: Episode) -> float:
+    """Share of the CAV's decisions in which the safety filter braked harder than its driver."""
+    shares = [(trajectory.filtered > 0).mean() for trajectory in episode.trajectories]
+    return float(np.mean(shares)) if shares else nan
+
+
+def overridden(episode: Episode) -> float:
+    """Share of commands that SUMO's safety check changed, but for the right of way."""
+    return episode.audit.following.overridden
+
+
+def yielded(episode: Episode) -> float:
+    """Share of commands that SUMO changed near a crossing, where vehicles yield."""
+    return episode.audit.following.yielded
 
 
 def drivable(row: dict[str, Any], people_alone: float = 0.0) -> str:

@@ -6,8 +6,25 @@ from typing import Any
 
 import numpy as np
 
-from unjam.measures.drivable import drivable
-from unjam.worlds.audit import BEYOND, Brakings
+from unjam.measures.drivable import (
+    cav_beyond_3_5,
+    cav_beyond_4_5,
+    cav_beyond_9,
+    cav_max_braking,
+    cav_min_ttc,
+    drivable,
+    filter_share,
+    max_drac,
+    max_jerk,
+    min_headway,
+    overridden,
+    people_beyond_3_5,
+    people_beyond_4_5,
+    people_beyond_9,
+    people_max_braking,
+    share_short_headway,
+    yielded,
+)
 from unjam.worlds.record import Episode, Floats, outcome_of
 from unjam.worlds.reward import eq16
 
@@ -160,100 +177,6 @@ def min_ttc(episode: Episode) -> float:
             near = closing > 0
             smallest = min(smallest, float((distance[near] / closing[near]).min(initial=np.inf)))
     return smallest
-
-
-def min_headway(episode: Episode) -> float:
-    """Smallest time headway of the CAV, gap over speed, while it drives faster than 1 m/s [s].
-
-    In any simulation step, as all that follows of the audit.
-    """
-    return episode.audit.following.headway
-
-
-def share_short_headway(episode: Episode) -> float:
-    """Share of the CAV's time faster than 1 m/s with a time headway below one second."""
-    return episode.audit.following.share_short
-
-
-def cav_min_ttc(episode: Episode) -> float:
-    """Smallest time to collision of the CAV with the vehicle ahead [s], gap over closing speed."""
-    return episode.audit.following.time_to_collision
-
-
-def max_drac(episode: Episode) -> float:
-    """Largest deceleration rate to avoid a crash of the CAV, closing speed squared over twice the gap [m/s2].
-
-    Almqvist, Hyden and Risser 1991.
-    """
-    return episode.audit.following.needed_braking
-
-
-def max_jerk(episode: Episode) -> float:
-    """Largest change of the CAV's acceleration over time [m/s3]."""
-    return episode.audit.following.jerk
-
-
-def cav_max_braking(episode: Episode) -> float:
-    """Hardest braking of a CAV [m/s2]; NaN where nobody is automated."""
-    return episode.audit.cavs.hardest if episode.audit.cavs.moments else float("nan")
-
-
-def people_max_braking(episode: Episode) -> float:
-    """Hardest braking of people [m/s2]."""
-    return episode.audit.people.hardest
-
-
-def _beyond(brakings: Brakings, limit: float) -> float:
-    moments = brakings.moments
-    return 1e6 * brakings.beyond[BEYOND.index(limit)] / moments if moments else float("nan")
-
-
-def cav_beyond_3_5(episode: Episode) -> float:
-    """CAVs' moments (vehicles times simulation steps) of braking beyond 3.5 m/s2, in a million.
-
-    ISO 15622 allows no more above 20 m/s.
-    """
-    return _beyond(episode.audit.cavs, 3.5)
-
-
-def cav_beyond_4_5(episode: Episode) -> float:
-    """CAVs' moments of braking beyond 4.5 m/s2, in a million."""
-    return _beyond(episode.audit.cavs, 4.5)
-
-
-def cav_beyond_9(episode: Episode) -> float:
-    """CAVs' moments of braking beyond 9 m/s2, in a million: more than dry asphalt allows."""
-    return _beyond(episode.audit.cavs, 9.0)
-
-
-def people_beyond_3_5(episode: Episode) -> float:
-    """People's moments (vehicles times simulation steps) of braking beyond 3.5 m/s2, in a million."""
-    return _beyond(episode.audit.people, 3.5)
-
-
-def people_beyond_4_5(episode: Episode) -> float:
-    """People's moments of braking beyond 4.5 m/s2, in a million."""
-    return _beyond(episode.audit.people, 4.5)
-
-
-def people_beyond_9(episode: Episode) -> float:
-    """People's moments of braking beyond 9 m/s2, in a million: more than dry asphalt allows."""
-    return _beyond(episode.audit.people, 9.0)
-
-
-def filter_share(episode: Episode) -> float:
-    """Share of the CAV's decisions in which the safety filter braked harder than its driver."""
-    return _over_cavs([(trajectory.filtered > 0).mean() for trajectory in episode.trajectories])
-
-
-def overridden(episode: Episode) -> float:
-    """Share of commands that SUMO's safety check changed, but for the right of way."""
-    return episode.audit.following.overridden
-
-
-def yielded(episode: Episode) -> float:
-    """Share of commands that SUMO changed near a crossing, where vehicles yield."""
-    return episode.audit.following.yielded
 
 
 def collisions(episode: Episode) -> float:

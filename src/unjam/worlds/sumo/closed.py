@@ -275,18 +275,18 @@ class ClosedTraffic(Traffic[ClosedRoad]):
 
     def _audit(self, speeds: Floats, positions: Floats) -> Audit:
         """Return the physics of every simulation step; arrays of shape (vehicles, moments)."""
-        step, places = self.scenario.simulation_step, self._places
-        accelerations = np.diff(speeds, axis=1) / step
-        states = loop_state(speeds, positions, self._near, self.road.loop_length)
-        followed = (states.speed.T, states.leader_speed.T, states.leader_gap.T)
+        step, loop = self.scenario.simulation_step, self.road.loop_length
+        states = loop_state(speeds, positions, self._near, loop).each(lambda values: values.T)
+        followed = states.speed, states.leader_speed, states.leader_gap
+        accelerations, driven = np.diff(speeds, axis=1) / step, np.zeros(len(speeds), bool)
         if not self._controlled:
             return Audit(brakings(accelerations), following=following(*followed, step), floor=self._floor)
-        near = np.zeros(states.speed.T[:-1].shape, bool)
-        for start, end in self.road.crossings:
-            near |= (end - states.route_position.T[:-1]) % self.road.loop_length < end - start + APPROACH
-        followed = following(*followed, step, self._added() > SHIELD_ROUNDING / step, near)
-        people = np.delete(accelerations, places, axis=0)
-        return Audit(brakings(people), brakings(accelerations[places]), followed, self._floor)
+        driven[self._places] = True
+        before = [(end - states.route_position[:-1]) % loop for _, end in self.road.crossings]
+        ways = [end - start + APPROACH for start, end in self.road.crossings]
+        near = sum((left < way for left, way in zip(before, ways, strict=True)), np.zeros(1, bool))
+        found = following(*followed, step, self._added() > SHIELD_ROUNDING / step, near)
+        return Audit(brakings(accelerations[~driven]), brakings(accelerations[driven]), found, self._floor)
 
     def last_applied(self) -> Floats:
         """Return what the CAVs were told in the last decision, once it was filtered [m/s2], shape (CAVs,)."""
