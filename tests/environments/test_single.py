@@ -113,7 +113,7 @@ def test_on_the_merge_the_episode_ends_when_the_cav_leaves(expert: str) -> None:
 
 
 def test_a_collision_terminates_and_does_not_truncate() -> None:
-    environment = RoadEnv("ring", actuation="raw", length=(160, 160))
+    environment = RoadEnv("ring", actuation="raw", length=(160, 160), safety={"active": False})
     environment.reset(seed=0)
     terminated = truncated = False
     while not (terminated or truncated):

@@ -20,17 +20,19 @@ from unjam.drivers import (
 )
 from unjam.drivers.from_file import FileDriver
 from unjam.drivers.observation import local_vector
+from unjam.drivers.safety import SafetyFilter
 from unjam.errors import EpisodeError, InputError
 from unjam.scenarios import Ring
 from unjam.worlds.episode import run_episode
 from unjam.worlds.sumo.simulation import Simulation
 
 RING = Ring(horizon=300)
+UNFILTERED = replace(RING, safety=SafetyFilter(active=False))
 RESIDUAL = ResidualDriver(PISaturation(), random_network(), 1.0)
 
 
 def drives_badly(simulation: Simulation) -> None:
-    ring = replace(RING, actuation="raw", horizon=3000)
+    ring = replace(UNFILTERED, actuation="raw", horizon=3000)
     assert run_episode(ring, Constant(1.0), (9,), simulation=simulation).status == "collision"
 
 
@@ -143,7 +145,7 @@ def test_each_trajectory_is_that_of_its_vehicle(cavs: int, simulation: Simulatio
         def act(self, state: LocalState, memory: dict) -> tuple:
             return np.linspace(0.1, 0.4, len(state.speed)), memory
 
-    ring = replace(RING, cavs=cavs, horizon=80)
+    ring = replace(UNFILTERED, cavs=cavs, horizon=80)
     episode = run_episode(ring, Different(), (0,), simulation=simulation)
     assert tuple(trajectory.vehicle for trajectory in episode.trajectories) == episode.cav_ids
     assert len(episode.cav_ids) == cavs
@@ -275,7 +277,7 @@ def test_the_reward_is_the_scenarios_own_where_none_is_named(simulation: Simulat
 
 
 def test_a_named_reward_and_ones_own_are_used(my_drivers: Path, simulation: Simulation) -> None:
-    ring = replace(RING, cavs=2)
+    ring = replace(UNFILTERED, cavs=2)
     found = run_episode(ring, Constant(0.2), (0,), "eq16", simulation=simulation).trajectories
     assert set(found[0].terms) == {"speed", "headway", "acceleration"}
     episode = run_episode(ring, Constant(0.2), (0,), f"{my_drivers}:calm", simulation=simulation)
@@ -286,7 +288,8 @@ def test_a_named_reward_and_ones_own_are_used(my_drivers: Path, simulation: Simu
 
 
 def test_the_headways_of_a_reward_are_those_after_each_step(simulation: Simulation) -> None:
-    trajectory = run_episode(RING, Constant(1.0), (0,), "eq16", simulation=simulation).trajectories[0]
+    episode = run_episode(UNFILTERED, Constant(1.0), (0,), "eq16", simulation=simulation)
+    trajectory = episode.trajectories[0]
     gap, speed = trajectory.states.leader_gap[1:], trajectory.states.speed[1:]
     expected = [-0.1 * max(1.0 - g / max(v, 1e-3), 0.0) for g, v in zip(gap, speed, strict=True)]
     np.testing.assert_allclose(trajectory.terms["headway"], expected, atol=1e-12)

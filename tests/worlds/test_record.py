@@ -7,6 +7,7 @@ import pytest
 
 from tests.conftest import random_network
 from unjam.drivers import IDM, Constant, Driver, Human, PISaturation, ResidualDriver
+from unjam.drivers.safety import SafetyFilter
 from unjam.scenarios import Ring
 from unjam.tree import pack, unpack
 from unjam.worlds.episode import run_episode
@@ -50,7 +51,7 @@ def test_fingerprints_differ_in_the_last_bit_of_any_array() -> None:
     [
         (RING, IDM()),
         (replace(RING, warmup=30), Human()),
-        (replace(RING, actuation="raw"), Constant(1.0)),
+        (replace(RING, actuation="raw", safety=SafetyFilter(active=False)), Constant(1.0)),
         (replace(RING, cavs=3), PISaturation()),
         (replace(RING, cavs=2, steps_per_decision=2), ResidualDriver(IDM(), random_network(), 1.0, hold=4)),
     ],

@@ -17,12 +17,14 @@ from tests.worlds.sumo.own_roads import straight
 from tests.worlds.test_record import fingerprint
 from unjam.drivers import IDM, Constant, Driver, Human, LocalState, Memory, PISaturation, ResidualDriver
 from unjam.drivers.from_file import FileDriver
+from unjam.drivers.safety import SafetyFilter
 from unjam.errors import InputError
 from unjam.scenarios import Ring, make_scenario
 from unjam.worlds.episode import run_episode
 from unjam.worlds.workers import EpisodeTask, Workers
 
 SHORT = Ring(horizon=60)
+CRASHING = Ring(horizon=500, actuation="raw", safety=SafetyFilter(active=False))
 LONG = Ring(horizon=15_000)  # more than half a second: long enough to be disturbed
 RESIDUAL = ResidualDriver(PISaturation(), random_network(), 1.0, hold=3)
 
@@ -122,7 +124,7 @@ def tasks_of_all_kinds(my_drivers: Path) -> list[EpisodeTask]:
         EpisodeTask(replace(SHORT, horizon=900), PISaturation(), (0,)),
         EpisodeTask(SHORT, Human(), (1, 2), full=True),
         EpisodeTask(replace(SHORT, warmup=40, cavs=2), RESIDUAL, (2,), "eq16", explore=True),
-        EpisodeTask(replace(SHORT, actuation="raw", horizon=500), Constant(1.0), (3,)),
+        EpisodeTask(CRASHING, Constant(1.0), (3,)),
         EpisodeTask(replace(SHORT, steps_per_decision=5), FileDriver(my_drivers, "gentle"), (4,)),
         EpisodeTask(SHORT, FileDriver(my_drivers, "Keeper", {"gain": 0.2}), (5,), f"{my_drivers}:calm"),
     ]

@@ -7,13 +7,15 @@ import numpy as np
 import pytest
 
 from unjam.drivers import IDM, Constant, Driver, Human, LocalState, Memory, PISaturation
+from unjam.drivers.safety import SafetyFilter
 from unjam.errors import EpisodeError, InputError
 from unjam.scenarios import Ring
 from unjam.worlds.episode import run_episode
 from unjam.worlds.record import Episode, Floats
 from unjam.worlds.sumo.simulation import Simulation
 
-RING = Ring(length=(230, 230), horizon=300)
+RING = Ring(length=(230, 230), horizon=300, safety=SafetyFilter(active=False))
+"""what SUMO does with commands, without the filter"""
 STEP = 0.1
 
 

@@ -1,5 +1,6 @@
 """The figure eight on the actual simulator."""
 
+from dataclasses import replace
 from typing import Any
 
 import libsumo
@@ -10,6 +11,7 @@ from unjam.drivers import Driver, LocalState, Memory, PISaturation
 from unjam.drivers.car_following import Human
 from unjam.drivers.command import Command
 from unjam.drivers.road_experts import Pacer
+from unjam.drivers.safety import SafetyFilter
 from unjam.measures.metrics import measure
 from unjam.scenarios.figure_eight import FigureEight
 from unjam.worlds.episode import run_episode
@@ -27,12 +29,13 @@ FLOW = {
     ("pi", 32): 6.33,
     ("pi", 35): 6.39,
 }
+AS_FLOW = FigureEight(actuation="flow", bounded=False, safety=SafetyFilter(active=False))
 DRIVERS = {"human": Human(), "pi": PISaturation(time_constant=0.0)}
 
 
 def test_agrees_with_flow_within_six_percent_without_collision() -> None:
     tasks = [
-        EpisodeTask(FigureEight(radius=(radius, radius)), DRIVERS[driver], (seed,))
+        EpisodeTask(replace(AS_FLOW, radius=(radius, radius)), DRIVERS[driver], (seed,))
         for driver, radius in FLOW
         for seed in range(SEEDS)
     ]
@@ -63,7 +66,7 @@ def test_leader_and_gap_are_those_of_sumo(simulation: Simulation) -> None:
 
 @pytest.mark.parametrize("cavs", [2, 7, 14])
 def test_each_of_several_cavs_is_driven_and_recorded_by_itself(cavs: int, simulation: Simulation) -> None:
-    road = FigureEight(cavs=cavs, horizon=300)
+    road = replace(AS_FLOW, cavs=cavs, horizon=300)
     episode = run_episode(road, ByRow(), (1,), simulation=simulation)
     assert (episode.status, len(episode.trajectories)) == ("completed", cavs)
     assert tuple(trajectory.vehicle for trajectory in episode.trajectories) == episode.cav_ids
