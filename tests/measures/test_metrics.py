@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 from unjam.drivers import LocalState
 from unjam.measures.metrics import METRICS, measure, speed_along_road, wave_speed
 from unjam.scenarios.scenario import VEHICLE_LENGTH
+from unjam.worlds.audit import Audit, following
 from unjam.worlds.record import Episode, Floats, Trajectory, failed_episode, outcome_of
 from unjam.worlds.sumo.neighbours import loop_neighbours, loop_state
 
@@ -59,6 +60,7 @@ def episode_of(
         "limit_speed": LIMIT,
         "vehicle_ids": tuple(f"{'cav' if n < cavs else 'human'}_{n}" for n in range(vehicles)),
         "cav_ids": tuple(f"cav_{n}" for n in range(cavs)),
+        "audit": Audit(following=following(*(rows[:cavs].T for rows in states[:3]), step)),
         "speeds": moved,
         "positions": positions,
         "gaps": states.leader_gap.T,
@@ -214,7 +216,9 @@ def seen(**changes: list[float]) -> LocalState:
 
 
 def with_states(states: LocalState) -> Episode:
-    return episode_of(steady(5.0, len(states.speed) - 1), trajectories=(trajectory_of(states),))
+    followed = following(*(values[:, None] for values in states[:3]), 0.1)
+    audit, cav = Audit(following=followed), trajectory_of(states)
+    return episode_of(steady(5.0, len(states.speed) - 1), trajectories=(cav,), audit=audit)
 
 
 def test_time_to_collision_of_a_closing_pair() -> None:
@@ -328,7 +332,7 @@ def test_a_failed_episode_has_its_reason_and_no_metrics() -> None:
 
 def test_a_row_has_the_episode_what_was_drawn_and_every_metric() -> None:
     row = measure(episode_of(steady(4.0), seed=(7, 1)))
-    assert set(row) == {"seed", "status", "reason", "error", "steps", "length", *METRICS}
+    assert set(row) == {"seed", "status", "reason", "error", "steps", "length", "floor", "drivable", *METRICS}
     assert row["seed"] == [7, 1]
     assert row["length"] == LENGTH
     assert measure(episode_of(steady(4.0), seed=(7,)))["seed"] == 7

@@ -210,7 +210,7 @@ def test_names_of_drivers_are_text_whatever_they_hold(tmp_path: Path) -> None:
     ]
     text, page = page_of(results_in(tmp_path / "drive", *names))
     assert len(page.of("script")) == 2
-    assert len(page.of("b")) == len(names) * len(METRICS)
+    assert len(page.of("b")) == len(names) * (len(METRICS) + 1)  # and the verdict
     assert page.texts["th"][1:7] == names
     assert [driver["name"] for driver in page.replay["drivers"]] == names
     data = text.partition('type="application/json">')[2].partition("</script>")[0]

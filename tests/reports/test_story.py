@@ -209,7 +209,8 @@ def test_the_same_driver_on_another_road_is_not_taken_for_the_same() -> None:
 
 
 def test_the_table_has_every_metric_of_every_driver_with_its_definition() -> None:
-    table = table_of(columns_of([trained_on_pi([10.0, 20.0], [5.0, 5.0])]))
+    verdict, *table = table_of(columns_of([trained_on_pi([10.0, 20.0], [5.0, 5.0])]))
+    assert verdict["label"] == "could a car drive so?"
     assert [row["label"] for row in table] == [metric.label for metric in METRICS.values()]
     assert all(len(row["cells"]) == 3 for row in table)
     for row, metric in zip(table, METRICS.values(), strict=True):

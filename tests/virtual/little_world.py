@@ -7,6 +7,7 @@ import numpy as np
 from unjam.drivers import IDM, LocalState
 from unjam.drivers.check import random_state
 from unjam.drivers.residual import EXPERT, ResidualDriver
+from unjam.drivers.safety import SafetyFilter
 from unjam.physics.arrays import Array, as_column, namespace, stack_columns
 from unjam.scenarios import Ring
 from unjam.tree import mapped
@@ -15,7 +16,7 @@ from unjam.virtual.world import Outcomes
 from unjam.worlds.reward import Outcome, released
 
 LOOP = 230.0
-RING = Ring(length=(int(LOOP), int(LOOP)))
+RING = Ring(length=(int(LOOP), int(LOOP)), safety=SafetyFilter(active=False))
 
 
 class LittleWorld:

@@ -14,6 +14,7 @@ import unjam.virtual
 from unjam.drivers import LocalState
 from unjam.drivers.check import random_state
 from unjam.drivers.local_state import LARGEST_GAP
+from unjam.drivers.safety import Ahead
 from unjam.scenarios import Ring
 from unjam.virtual.model import NUMBERS, TARGETS, EnvironmentModel, base_reward, base_step, torch_generator
 from unjam.virtual.settings import VirtualSettings
@@ -89,7 +90,8 @@ def test_what_it_leads_to_is_physically_possible(seed: int, scale: float) -> Non
     wild = model(residual={name: scale * float(torch.randn(1, generator=generator)) for name in TARGETS})
     state = some_state(30, seed)
     step = world(wild).step(state, torch.ones(30), torch.zeros(30, 1))
-    known = base_reward("idm", make_reward("released"), step.state, torch.ones(30), step.crashed)
+    applied = RING.safety.keep(torch.ones(30), Ahead(*state[:3]), RING.decision_step)
+    known = base_reward("idm", make_reward("released"), step.state, applied, step.crashed)
     for name in ("speed", "leader_speed", "follower_speed"):
         assert (getattr(step.state, name) >= 0.0).all()
         assert (getattr(step.state, name) <= RING.humans.desired_speed).all()

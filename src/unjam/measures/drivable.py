@@ -70,7 +70,7 @@ def _beyond(brakings: Brakings, limit: float) -> float:
 
 
 def cav_beyond_3_5(episode: Episode) -> float:
-    """CAVs' moments (vehicles times simulation steps) of braking beyond 3.5 m/s2, in a million.
+    """CAVs' moments (vehicles times simulation steps) of braking beyond 3.5 m/s2 [per million].
 
     ISO 15622 allows no more above 20 m/s.
     """
@@ -78,27 +78,27 @@ def cav_beyond_3_5(episode: Episode) -> float:
 
 
 def cav_beyond_4_5(episode: Episode) -> float:
-    """CAVs' moments of braking beyond 4.5 m/s2, in a million."""
+    """CAVs' moments of braking beyond 4.5 m/s2 [per million]."""
     return _beyond(episode.audit.cavs, 4.5)
 
 
 def cav_beyond_9(episode: Episode) -> float:
-    """CAVs' moments of braking beyond 9 m/s2, in a million: more than dry asphalt allows."""
+    """CAVs' moments of braking beyond 9 m/s2 [per million]: more than dry asphalt allows."""
     return _beyond(episode.audit.cavs, 9.0)
 
 
 def people_beyond_3_5(episode: Episode) -> float:
-    """People's moments (vehicles times simulation steps) of braking beyond 3.5 m/s2, in a million."""
+    """People's moments (vehicles times simulation steps) of braking beyond 3.5 m/s2 [per million]."""
     return _beyond(episode.audit.people, 3.5)
 
 
 def people_beyond_4_5(episode: Episode) -> float:
-    """People's moments of braking beyond 4.5 m/s2, in a million."""
+    """People's moments of braking beyond 4.5 m/s2 [per million]."""
     return _beyond(episode.audit.people, 4.5)
 
 
 def people_beyond_9(episode: Episode) -> float:
-    """People's moments of braking beyond 9 m/s2, in a million: more than dry asphalt allows."""
+    """People's moments of braking beyond 9 m/s2 [per million]: more than dry asphalt allows."""
     return _beyond(episode.audit.people, 9.0)
 
 
@@ -129,7 +129,7 @@ def drivable(row: dict[str, Any], people_alone: float = 0.0) -> str:
     """
     if row["status"] == "failed" or isnan(row["cav_max_braking"]):
         return ""
-    floor = row["floor"] or USUAL_FLOOR
+    floor = row.get("floor") or USUAL_FLOOR
     checks = (
         (row["collisions"] > 0, f"{row['collisions']:.0f} vehicles in contact"),
         (

@@ -290,10 +290,8 @@ class ClosedTraffic(Traffic[ClosedRoad]):
 
     def last_applied(self) -> Floats:
         """Return what the CAVs were told in the last decision, once it was filtered [m/s2], shape (CAVs,)."""
-        cavs = len(self.cavs)
-        wanted = np.array(self._log_wanted[-cavs:])
-        told = np.array(self._log_told[-cavs * self.scenario.steps_per_decision :]).reshape(-1, cavs)
-        return wanted - (wanted - told).mean(0)
+        told = np.array(self._log_told[-len(self.cavs) * self.scenario.steps_per_decision :])
+        return told.reshape(-1, len(self.cavs)).mean(0)
 
     def scene(self) -> Scene:
         """Return this moment as pictures show it."""
@@ -318,15 +316,13 @@ class ClosedTraffic(Traffic[ClosedRoad]):
 
     def _shield(self) -> Floats:
         """Return the hardest braking that SUMO added to each command, zero if it let it pass, (T, CAVs)."""
-        if not self._log_commanded:
-            return np.zeros((self.decisions, len(self.cavs)))
-        each = self.scenario.steps_per_decision
-        return self._added().reshape(-1, each, len(self.cavs)).max(1).clip(0.0, None)
+        return self._added().reshape(self.decisions, -1, len(self.cavs)).max(1).clip(0.0, None)
 
     def _added(self) -> Floats:
         """Return the braking that SUMO added to each command in each step [m/s2], shape (steps, CAVs)."""
-        commanded = np.array(self._log_commanded).reshape(-1, len(self.cavs))
-        return (commanded - self._of_cavs(self._log_moved)) / self.scenario.simulation_step
+        moved = self._of_cavs(self._log_moved)
+        commanded = np.array(self._log_commanded).reshape(moved.shape) if self._controlled else moved
+        return (commanded - moved) / self.scenario.simulation_step
 
     def _of_cavs(self, log: "array[float]") -> Floats:
         """Return what was logged of the CAVs, shape (rows, CAVs)."""

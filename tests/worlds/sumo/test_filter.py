@@ -1,0 +1,82 @@
+"""Does the filter alone keep CAVs safe on the actual simulator, whose own safety is switched off?"""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from unjam.drivers import IDM, Driver, PISaturation
+from unjam.drivers.actuator import Actuator
+from unjam.drivers.car_following import Constant
+from unjam.drivers.safety import SafetyFilter
+from unjam.measures.drivable import DRIVABLE
+from unjam.measures.metrics import measure
+from unjam.scenarios import FigureEight, Merge, Ring, Scenario
+from unjam.worlds.episode import run_episode
+from unjam.worlds.sumo.simulation import Simulation
+
+RAW = Ring(actuation="raw", horizon=1500, warmup=600)
+
+
+@pytest.mark.parametrize("actuator", [Actuator(), Actuator(lag=0.3, delay=0.2)], ids=["at once", "late"])
+@pytest.mark.parametrize(
+    ("vehicles", "length", "cavs"), [(5, 50, 1), (22, 220, 1), (22, 270, 3), (44, 440, 2), (44, 500, 3)]
+)
+def test_a_reckless_driver_touches_nobody_on_rings_of_all_kinds(
+    vehicles: int, length: int, cavs: int, actuator: Actuator, simulation: Simulation
+) -> None:
+    ring = replace(RAW, vehicles=vehicles, length=(length, length), cavs=cavs, actuator=actuator)
+    episode = run_episode(ring, Constant(1.0), (3,), simulation=simulation)
+    row = measure(episode)
+    assert (row["status"], row["collisions"]) == ("completed", 0.0)
+    assert row["drivable"] == DRIVABLE
+    assert row["filter_share"] > 0.1
+    assert row["min_headway"] > 1.0
+
+
+def test_what_is_commanded_is_what_the_filter_lets_pass(simulation: Simulation) -> None:
+    episode = run_episode(RAW, Constant(1.0), (0,), simulation=simulation)
+    (cav,) = episode.trajectories
+    np.testing.assert_allclose(cav.applied, 1.0 - cav.filtered, atol=1e-12)
+    expected = np.maximum(cav.states.speed[:-1] + 0.1 * cav.applied, 0.0)
+    np.testing.assert_allclose(cav.states.speed[1:], expected, atol=1e-9)
+
+
+def test_within_a_held_decision_every_simulation_step_is_filtered(simulation: Simulation) -> None:
+    held = replace(RAW, steps_per_decision=10, horizon=150)
+    episode = run_episode(held, Constant(1.0), (0,), simulation=simulation)
+    assert episode.audit.following.headway > 1.0
+    assert measure(episode)["drivable"] == DRIVABLE
+
+
+@pytest.mark.parametrize("road", [Ring(horizon=1500, warmup=3000), FigureEight(horizon=800)])
+@pytest.mark.parametrize("driver", [IDM(), PISaturation(), Constant(1.0)])
+def test_sumo_overrides_no_command_in_following(
+    road: Scenario, driver: Driver, simulation: Simulation
+) -> None:
+    assert run_episode(road, driver, (1,), simulation=simulation).audit.following.overridden == 0.0
+
+
+def test_on_the_figure_eight_sumo_makes_cars_yield_and_that_is_told_apart(simulation: Simulation) -> None:
+    found = run_episode(FigureEight(), PISaturation(catch_up_speed=8.0), (1,), simulation=simulation)
+    followed = found.audit.following
+    assert followed.overridden == 0.0
+    assert followed.yielded == pytest.approx((found.trajectories[0].shield > 1e-5).mean())
+
+
+def test_people_on_a_published_merge_brake_as_no_car_can_and_elsewhere_they_do_not(
+    simulation: Simulation,
+) -> None:
+    published = run_episode(Merge(), IDM(), (0,), simulation=simulation)
+    assert measure(published)["drivable"] not in ("", DRIVABLE)
+    assert published.audit.people.hardest > 9.0
+    bounded = Merge(safety=SafetyFilter(), bounded=True, right_of_way=True)
+    honest = run_episode(bounded, IDM(), (0,), simulation=simulation)
+    assert honest.audit.people.hardest < published.audit.people.hardest
+
+
+def test_a_wider_floor_is_kept_and_no_floor_is_none(simulation: Simulation) -> None:
+    for floor in (0.0, 1.5):
+        ring = replace(RAW, warmup=0, safety=SafetyFilter(time_headway=floor))
+        headway = run_episode(ring, Constant(1.0), (0,), simulation=simulation).audit.following.headway
+        assert headway > 1.5 if floor else headway < 1.0

@@ -1,0 +1,48 @@
+"""Does the audit see what a stopwatch and a ruler would?"""
+
+import numpy as np
+import pytest
+
+from unjam.worlds.audit import Audit, brakings, following
+
+
+def test_brakings_are_counted_beyond_each_limit_and_rounding_is_none() -> None:
+    found = brakings([[1.0, -3.5, -3.6], [-4.5 - 1e-9, -4.6, -12.0]])
+    assert (found.hardest, found.beyond, found.moments) == (12.0, (4, 2, 1), 6)
+    assert brakings([0.5, 1.0]).hardest == 0.0
+    assert brakings([]).moments == 0
+
+
+def column(*values: float) -> np.ndarray:
+    return np.array(values, float)[:, None]
+
+
+def test_headway_counts_while_a_car_moves_and_ttc_while_it_closes_in() -> None:
+    found = following(column(0.5, 4.0, 8.0), column(0.5, 4.0, 4.0), column(0.1, 2.0, 12.0), 0.1)
+    assert found.headway == pytest.approx(0.5)
+    assert found.time_to_collision == pytest.approx(3.0)
+    assert found.needed_braking == pytest.approx(16.0 / 24.0)
+    assert found.share_short == pytest.approx(0.5)
+
+
+def test_jerk_is_the_change_of_acceleration_over_time() -> None:
+    speeds = column(5.0, 5.1, 5.1, 5.0)
+    assert following(speeds, speeds, speeds * 3.0, 0.1).jerk == pytest.approx(10.0)
+
+
+def test_contact_is_no_time_to_collision_at_all() -> None:
+    assert following(column(5.0, 5.0), column(5.0, 6.0), column(1.0, -0.1), 0.1).time_to_collision == 0.0
+
+
+def test_a_car_that_is_not_there_is_not_judged() -> None:
+    there = following(column(5.0, np.nan), column(4.0, np.nan), column(10.0, np.nan), 0.1)
+    assert (there.headway, there.time_to_collision, there.jerk) == (2.0, 10.0, 0.0)
+    nobody = np.zeros((4, 0))
+    assert following(nobody, nobody, nobody, 0.1) == Audit().following
+
+
+def test_an_override_near_a_crossing_is_put_down_to_the_right_of_way() -> None:
+    overridden, near = np.array([1, 1, 0, 0], bool), np.array([0, 1, 1, 0], bool)
+    still = np.ones((4, 1))
+    found = following(still, still, still, 0.1, overridden, near)
+    assert (found.overridden, found.yielded) == (0.25, 0.25)
