@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from unjam.drivers import LocalState
 from unjam.measures.metrics import METRICS, measure, speed_along_road, wave_speed
 from unjam.scenarios.scenario import VEHICLE_LENGTH
-from unjam.worlds.audit import Audit, following
+from unjam.worlds.audit import Audit, Following, following
 from unjam.worlds.record import Episode, Floats, Trajectory, failed_episode, outcome_of
 from unjam.worlds.sumo.neighbours import loop_neighbours, loop_state
 
@@ -41,6 +41,12 @@ def trajectory_of(states: LocalState, applied: ArrayLike = 0.0, **changes: Any) 
     return Trajectory(**{**values, **changes})
 
 
+def followed_in(states: LocalState, cavs: int, step: float) -> Following:
+    """How the first `cavs` of vehicles followed, whose states have the shape (vehicles, moments)."""
+    speed, leader, gap = (values[:cavs].T for values in states[:3])
+    return following(speed, leader, gap, step)
+
+
 def episode_of(
     speeds: ArrayLike, cavs: int = 1, step: float = 0.1, applied: ArrayLike = 0.0, **changes: Any
 ) -> Episode:
@@ -60,7 +66,7 @@ def episode_of(
         "limit_speed": LIMIT,
         "vehicle_ids": tuple(f"{'cav' if n < cavs else 'human'}_{n}" for n in range(vehicles)),
         "cav_ids": tuple(f"cav_{n}" for n in range(cavs)),
-        "audit": Audit(following=following(*(rows[:cavs].T for rows in states[:3]), step)),
+        "audit": Audit(following=followed_in(states, cavs, step)),
         "speeds": moved,
         "positions": positions,
         "gaps": states.leader_gap.T,
@@ -216,8 +222,8 @@ def seen(**changes: list[float]) -> LocalState:
 
 
 def with_states(states: LocalState) -> Episode:
-    followed = following(*(values[:, None] for values in states[:3]), 0.1)
-    audit, cav = Audit(following=followed), trajectory_of(states)
+    column = states.each(lambda values: np.asarray(values)[None])
+    audit, cav = Audit(following=followed_in(column, 1, 0.1)), trajectory_of(states)
     return episode_of(steady(5.0, len(states.speed) - 1), trajectories=(cav,), audit=audit)
 
 

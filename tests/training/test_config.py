@@ -11,8 +11,8 @@ from unjam.errors import InputError
 from unjam.learners.settings import AGENTS, PolicySettings, TRPOSettings
 from unjam.parameters import changed
 from unjam.training.config import EvaluationSettings, RunConfig, load_config, read_toml, to_toml
-from unjam.training.evaluate import HELD_OUT, VALIDATION
 from unjam.training.presets import PRESETS
+from unjam.training.seeds import JUDGE, VALIDATE
 
 
 def written(folder: Path, text: str) -> Path:
@@ -105,7 +105,7 @@ def test_a_wrong_value_gets_one_line_that_begins_with_its_name(changes: dict[str
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("seed", [HELD_OUT, VALIDATION])
+@pytest.mark.parametrize("seed", [JUDGE, VALIDATE])
 def test_a_seed_that_would_train_on_the_judging_episodes_is_refused(seed: int) -> None:
     with pytest.raises(InputError, match="seed"):
         load_config(changes={"seed": seed})

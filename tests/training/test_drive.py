@@ -13,7 +13,8 @@ from unjam.files import to_json
 from unjam.measures.metrics import METRICS
 from unjam.reports.results import read_results
 from unjam.scenarios import Ring
-from unjam.training.evaluate import DriveResult, drive, held_out_seeds, raise_failures
+from unjam.training.evaluate import DriveResult, drive, raise_failures
+from unjam.training.seeds import held_out_seeds
 from unjam.worlds.episode import run_episode
 
 ROAD: dict[str, Any] = {"length": (120, 130), "vehicles": 8, "horizon": 60}

@@ -14,15 +14,8 @@ from unjam.errors import DiskError, EpisodeError, InputError, MissingPartError, 
 from unjam.measures.metrics import METRICS
 from unjam.reports.results import read_results
 from unjam.scenarios import Ring
-from unjam.training.evaluate import (
-    HELD_OUT,
-    VALIDATION,
-    Evaluation,
-    evaluate,
-    held_out_seeds,
-    raise_failure,
-    save_evaluation,
-)
+from unjam.training.evaluate import Evaluation, evaluate, raise_failure, save_evaluation
+from unjam.training.seeds import TUNE, VALIDATE, held_out_seeds, tuning_seeds
 from unjam.worlds.episode import run_episode
 from unjam.worlds.workers import Workers
 
@@ -137,17 +130,18 @@ def numbers_of(seed: tuple[int, ...]) -> tuple[int, ...]:
 
 def test_seeds_that_train_choose_and_judge_have_nothing_in_common() -> None:
     judging = {numbers_of(seed) for seed in held_out_seeds(500)}
-    choosing = {numbers_of((VALIDATION, index)) for index in range(500)}
+    choosing = {numbers_of((VALIDATE, index)) for index in range(500)}
+    tuning = {numbers_of(seed) for seed in tuning_seeds(500)}
     training = {
         numbers_of((run, iteration, index))
         for run in (0, 1, 2, 3, 42, 1_000_002, 1_000_004)
         for iteration in range(1, 60)
         for index in range(4)
     }
-    assert len(judging) == len(choosing) == 500
-    assert judging.isdisjoint(choosing)
-    assert training.isdisjoint(judging | choosing)
-    assert HELD_OUT + 500 > VALIDATION > HELD_OUT  # a seed that only counted up from one would meet the other
+    assert len(judging) == len(choosing) == len(tuning) == 500
+    assert len(judging | choosing | tuning) == 1500
+    assert training.isdisjoint(judging | choosing | tuning)
+    assert TUNE < VALIDATE + 500  # a seed that only counted up from one would meet the other
 
 
 def test_more_held_out_episodes_contain_the_fewer() -> None:

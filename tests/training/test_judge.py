@@ -10,7 +10,8 @@ from unjam.drivers import PISaturation, ResidualDriver
 from unjam.errors import InputError
 from unjam.reports.results import read_results
 from unjam.training.config import RunConfig
-from unjam.training.evaluate import TRAINED, comparison, held_out_seeds, judge
+from unjam.training.evaluate import TRAINED, comparison, judge
+from unjam.training.seeds import held_out_seeds
 from unjam.worlds.episode import run_episode
 from unjam.worlds.workers import Workers
 

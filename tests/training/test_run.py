@@ -18,8 +18,8 @@ from unjam.errors import InputError
 from unjam.learners.algorithm_1 import Collected
 from unjam.reports.results import read_progress
 from unjam.training.config import RunConfig, load_config
-from unjam.training.evaluate import HELD_OUT, VALIDATION
 from unjam.training.folder import TENSORS, continue_folder, load_checkpoint, save_checkpoint, start_folder
+from unjam.training.seeds import JUDGE, VALIDATE
 from unjam.training.train import OnIteration, Trainer
 from unjam.worlds.record import Episode
 from unjam.worlds.workers import Workers
@@ -357,7 +357,7 @@ def test_every_training_episode_has_a_seed_of_its_own_that_never_judges(
     seeds = [episode.seed for episode in episodes]
     assert len(seeds) == len(set(seeds)) == 6
     assert {seed[0] for seed in seeds} == {5}
-    assert not {HELD_OUT, VALIDATION} & {number for seed in seeds for number in seed}
+    assert not {JUDGE, VALIDATE} & {number for seed in seeds for number in seed}
 
 
 def test_training_explores_and_validation_does_not(

@@ -16,9 +16,10 @@ from unjam.scenarios import SCENARIOS
 from unjam.studies import STUDIES, TOGETHER
 from unjam.studies.study import REFERENCES, ROADS, OnProgress, PlannedRun, Study, StudyFolder
 from unjam.training.config import load_config
-from unjam.training.evaluate import evaluate, held_out_seeds, save_evaluation
+from unjam.training.evaluate import evaluate, save_evaluation
 from unjam.training.executors import Executor, run_all, training_command
 from unjam.training.folder import read_config
+from unjam.training.seeds import held_out_seeds
 from unjam.worlds.episode import can_drive
 from unjam.worlds.workers import Workers
 

@@ -27,14 +27,8 @@ from unjam.scenarios import make_scenario
 from unjam.studies.comparison import HONEST, entries, estimates, interval, number, table_rows, write_table
 from unjam.studies.study import REFERENCES, ROADS, OnProgress, PlannedRun, Study, StudyFolder, Table, planned
 from unjam.training.config import load_config
-from unjam.training.evaluate import (
-    TRAINED,
-    Evaluation,
-    evaluate,
-    held_out_seeds,
-    raise_failure,
-    save_evaluation,
-)
+from unjam.training.evaluate import TRAINED, Evaluation, evaluate, raise_failure, save_evaluation
+from unjam.training.seeds import held_out_seeds
 from unjam.worlds.record import Episode
 from unjam.worlds.workers import EpisodeTask, Workers
 

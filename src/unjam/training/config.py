@@ -18,6 +18,7 @@ from unjam.parameters import STRICT, Count, CountOrNone, Positive, build, change
 from unjam.scenarios import make_scenario
 from unjam.scenarios.scenario import Scenario
 from unjam.training.presets import preset_values
+from unjam.training.seeds import TRAINING_BELOW
 from unjam.virtual.settings import VirtualSettings
 from unjam.worlds.episode import Task
 
@@ -73,7 +74,7 @@ class RunConfig(Agents):
     """a name or `path.py:name`; empty: the scenario's own"""
     steps: Count = 960_000
     """actual steps of training"""
-    seed: Annotated[int, Field(ge=0, lt=1_000_000)] = 0
+    seed: Annotated[int, Field(ge=0, lt=TRAINING_BELOW)] = 0
     """of the whole run; numbers from a million on are those of the episodes that judge"""
     workers: Count = 2
     spread: bool = True

@@ -29,15 +29,12 @@ from unjam.scenarios.scenario import Scenario
 from unjam.training.config import RunConfig
 from unjam.training.executors import error_named
 from unjam.training.folder import make_new_folder
+from unjam.training.seeds import held_out_seeds
 from unjam.worlds.episode import can_drive
 from unjam.worlds.record import Episode
 from unjam.worlds.reward import make_reward
 from unjam.worlds.workers import EpisodeTask, Workers
 
-HELD_OUT = 1_000_003
-"""first number of the seeds that judge; no training ever uses it"""
-VALIDATION = 1_000_033
-"""first number of the seeds that choose a controller"""
 TRAINED = "trained"
 """label of the trained controller in tables and pictures"""
 ABOUT_SHOWN = (
@@ -66,11 +63,6 @@ class Evaluation:
             label: {name: found.mean for name, found in summarise(rows).items()}
             for label, rows in self.rows.items()
         }
-
-
-def held_out_seeds(count: int) -> list[tuple[int, ...]]:
-    """Return the seeds of final evaluations."""
-    return [(HELD_OUT, index) for index in range(count)]
 
 
 def evaluate(

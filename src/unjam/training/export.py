@@ -19,8 +19,9 @@ from unjam.measures.statistics import summarise
 from unjam.reports.results import EVALUATION_FILE, rows_by_driver
 from unjam.scenarios import make_scenario
 from unjam.scenarios.scenario import Scenario
-from unjam.training.evaluate import TRAINED, held_out_seeds, raise_failure
+from unjam.training.evaluate import TRAINED, raise_failure
 from unjam.training.folder import origin, read_config
+from unjam.training.seeds import held_out_seeds
 from unjam.worlds.workers import EpisodeTask, Workers
 
 SAMPLED = 1000

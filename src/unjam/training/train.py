@@ -22,7 +22,7 @@ from unjam.measures.statistics import Estimate, paired_difference
 from unjam.reports.html import write_report
 from unjam.reports.results import read_progress
 from unjam.training.config import RunConfig, to_toml
-from unjam.training.evaluate import TRAINED, VALIDATION, Progress, Rows, judge, raise_failure
+from unjam.training.evaluate import TRAINED, Progress, Rows, judge, raise_failure
 from unjam.training.executors import OnIteration, train_apart
 from unjam.training.folder import (
     check_possible,
@@ -33,6 +33,7 @@ from unjam.training.folder import (
     start_folder,
 )
 from unjam.training.model_facts import write_model_facts
+from unjam.training.seeds import VALIDATE
 from unjam.worlds.workers import EpisodeTask, Workers
 
 MEANS = (
@@ -238,7 +239,7 @@ class Trainer:
     def returns_of(self, drivers: Sequence[Driver]) -> list[float]:
         """Return the mean return on the validation seeds, by road, each driven by its own of `drivers`."""
         counts = [self.config.evaluation.validation_episodes] * len(self.tasks)
-        episodes = self._drive(drivers, counts, (VALIDATION,))
+        episodes = self._drive(drivers, counts, (VALIDATE,))
         return [float(np.mean([measure(episode)["return"] for episode in driven])) for driven in episodes]
 
     def _drive(

@@ -1,0 +1,25 @@
+"""Seeds in four families that never meet: what chose settings never judges them.
+
+A training draws its episodes from (its seed, iteration, episode), its seed being smaller than any number
+here; the others begin with a number of their own.
+"""
+
+TRAINING_BELOW = 1_000_000
+"""seeds of trainings, and of `unjam drive --seed`, are smaller"""
+JUDGE = 1_000_039
+"""first number of the seeds of final evaluations: they choose nothing. (1,000,003 was it before; presets and
+pacers had been chosen with those in sight.)"""
+VALIDATE = 1_000_033
+"""first number of the seeds that choose a controller among those of a training"""
+TUNE = 1_000_037
+"""first number of the seeds that choose an expert's parameters"""
+
+
+def held_out_seeds(count: int) -> list[tuple[int, ...]]:
+    """Return the seeds of final evaluations."""
+    return [(JUDGE, index) for index in range(count)]
+
+
+def tuning_seeds(count: int, first: int = 0) -> list[tuple[int, ...]]:
+    """Return seeds that choose an expert's parameters, from number `first` on."""
+    return [(TUNE, index) for index in range(first, first + count)]

@@ -1,0 +1,214 @@
+"""Tuning: how far an expert gets by its parameters alone, with as many actual steps as a training has.
+
+What a training gains is judged beside this: `unjam tune`, with Optuna, on seeds of its own, under the same
+limits and filter. Settings that no car could drive do not count.
+"""
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, fields
+from math import inf
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, get_args, get_origin, get_type_hints
+
+import numpy as np
+
+from unjam.controller.file import SUFFIX, controller_bytes
+from unjam.drivers.driver import labelled
+from unjam.drivers.registry import DRIVERS, named_driver
+from unjam.errors import InputError, MissingPartError, UnjamError, wrong_name
+from unjam.files import make_folder, to_json, write_whole
+from unjam.manifest import manifest
+from unjam.measures.drivable import DRIVABLE, drivable_in_all
+from unjam.measures.metrics import measure
+from unjam.scenarios import scenario_recipe
+from unjam.scenarios.scenario import Scenario
+from unjam.training.evaluate import raise_failure
+from unjam.training.folder import origin
+from unjam.training.search import Choice, Range, Space
+from unjam.training.seeds import tuning_seeds
+from unjam.worlds.workers import EpisodeTask, Workers
+
+if TYPE_CHECKING:
+    from optuna import Study
+
+TUNED = "tuned.json"
+EPISODES = 8
+"""of each setting that is tried"""
+FINALISTS = 5
+"""settings that are driven again, on twice as many other seeds: else the luckiest would win"""
+WIDTH = 4.0
+"""a parameter is varied from its default over this to its default times this"""
+TO_ONE = 1.0
+"""upper end for a parameter that is zero by default"""
+
+
+@dataclass(frozen=True)
+class Setting:
+    """Parameters of an expert that were tried."""
+
+    driver: str
+    """as `--driver` takes it"""
+    values: dict[str, Any]
+    score: float | None
+    """mean return; None where no car could drive so"""
+    verdict: str
+
+
+@dataclass(frozen=True)
+class Tuned:
+    """What a tuning found."""
+
+    best: Setting
+    default: Setting
+    """the expert as it is, on the seeds that chose among the finalists"""
+    settings: list[Setting]
+    """all that were tried, in order"""
+    actual_steps: int
+    file: Path
+    """the tuned expert as a controller"""
+
+
+def space_around(expert: str, time_step: float) -> Space:
+    """Return the ranges around an expert's parameters: four times less and more, all words, both truths.
+
+    Raises:
+        InputError: there is no such expert, or nothing of it can be varied.
+    """
+    default = named_driver(expert, time_step)
+    if expert not in DRIVERS or default.native:
+        known = [name for name, kind in DRIVERS.items() if not kind.native]
+        raise wrong_name("expert", expert, known)
+    space: Space = {}
+    hints = get_type_hints(type(default))
+    for field in fields(default):  # pyright: ignore[reportArgumentType]
+        if field.name != "time_step":
+            space[field.name] = _around(getattr(default, field.name), hints[field.name])
+    if not space:
+        raise InputError(f"expert: {expert!r} has nothing to tune")
+    return space
+
+
+def _around(value: Any, hint: Any) -> Range | Choice:
+    if isinstance(value, bool):
+        return Choice((False, True))
+    if get_origin(hint) is Literal:
+        return Choice(get_args(hint))
+    if value == 0:
+        return Range(0.0, TO_ONE)
+    if isinstance(value, int):
+        return Range(max(1, round(value / WIDTH)), round(value * WIDTH), log=True)
+    ends = sorted((float(value) / WIDTH, float(value) * WIDTH))
+    return Range(*ends, log=value > 0)
+
+
+def tune(
+    scenario: Scenario,
+    expert: str,
+    space: Space,
+    steps: int,
+    folder: Path,
+    workers: Workers,
+    reward: str = "",
+    seed: int = 0,
+    on_line: Callable[[str], None] = lambda line: None,
+) -> Tuned:
+    """Search an expert's parameters, and write `tuned.json` and the expert as `EXPERT.unjam` into a folder.
+
+    Args:
+        scenario: road, limits and filter.
+        expert: its name.
+        space: what is varied, of `space_around` or `search.space_of`.
+        steps: actual steps that may be driven in all.
+        folder: exists and is empty.
+        workers: drive; the result does not depend on how many.
+        reward: what is maximised; empty: the scenario's own.
+        seed: of the proposals.
+        on_line: gets a line for each setting.
+
+    Raises:
+        InputError: the steps are too few, or a parameter is wrong.
+        UnjamError: no car could drive any of the settings.
+        MissingPartError: Optuna is not installed.
+    """
+    each = EPISODES * scenario.horizon
+    final = (FINALISTS + 1) * 2 * each
+    trials = (steps - final) // each
+    if trials < 2:
+        raise InputError(f"steps: {steps} is not allowed; allowed: >= {final + 2 * each} for two settings")
+
+    def driven(values: dict[str, Any], first: int, episodes: int) -> Setting:
+        try:
+            driver = named_driver(labelled(expert, values), scenario.decision_step)
+        except InputError as error:  # parameters that do not go together
+            return Setting(labelled(expert, values), values, None, str(error))
+        tasks = [
+            EpisodeTask(scenario.part(part, episodes), driver, number, reward)
+            for part, number in enumerate(tuning_seeds(episodes, first))
+        ]
+        rows = [measure(episode) for episode in workers.run(tasks)]
+        raise_failure(rows)
+        verdict = drivable_in_all([{**row, "people_beyond_4_5": 0.0} for row in rows])
+        score = float(np.mean([row["return"] for row in rows])) if verdict == DRIVABLE else None
+        return Setting(labelled(expert, values), values, score, verdict)
+
+    study, settings = _study(seed), list[Setting]()
+    for number in range(trials):
+        trial = study.ask()
+        for key, values in space.items():
+            values.suggest(trial, key)
+        setting = driven({key: _rounded(value) for key, value in trial.params.items()}, 0, EPISODES)
+        study.tell(trial, setting.score, state=None if setting.score is not None else _failed())
+        settings.append(setting)
+        said = setting.verdict if setting.score is None else f"{setting.score:.0f}"
+        on_line(f"{number + 1} of {trials}: {setting.driver}: {said}")
+    ranked = sorted(settings, key=lambda one: -inf if one.score is None else one.score, reverse=True)
+    again = [driven(one.values, EPISODES, 2 * EPISODES) for one in ranked[:FINALISTS]]
+    default = driven({}, EPISODES, 2 * EPISODES)
+    finalists = [one for one in (*again, default) if one.score is not None]
+    if not finalists:
+        raise UnjamError(f"no car could drive any of {trials} settings of {expert}: {default.verdict}")
+    best = max(finalists, key=lambda one: one.score or 0.0)
+    file = folder / f"{expert}{SUFFIX}"
+    found = Tuned(best, default, settings, trials * each + final, file)
+    _write(scenario, expert, found, folder, reward, seed)
+    return found
+
+
+def _study(seed: int) -> "Study":
+    try:
+        import optuna
+    except ImportError:
+        raise MissingPartError("tune: optuna is not installed: pip install 'unjam[search]'") from None
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    sampler = optuna.samplers.TPESampler(seed=seed, multivariate=True, warn_independent_sampling=False)
+    return optuna.create_study(direction="maximize", sampler=sampler)
+
+
+def _rounded(value: Any) -> Any:
+    """Return a number with as many digits as anybody wants to read; words as they are."""
+    return float(f"{value:.4g}") if isinstance(value, float) else value
+
+
+def _failed() -> Any:
+    from optuna.trial import TrialState
+
+    return TrialState.FAIL
+
+
+def _write(scenario: Scenario, expert: str, found: Tuned, folder: Path, reward: str, seed: int) -> None:
+    about = {
+        "scenario": scenario_recipe(scenario),
+        "expert": expert,
+        "reward": reward or scenario.reward,
+        "seed": seed,
+        "actual_steps": found.actual_steps,
+        "best": asdict(found.best),
+        "default": asdict(found.default),
+    }
+    make_folder(folder)
+    driver = named_driver(found.best.driver, scenario.decision_step)
+    tuned = {key: about[key] for key in ("reward", "seed", "actual_steps", "best", "default")}
+    content = controller_bytes(driver, {**origin(scenario, driver), "tuned": tuned})
+    write_whole(found.file, content)
+    rows = [asdict(one) for one in found.settings]
+    write_whole(folder / TUNED, to_json({**about, "manifest": manifest(), "settings": rows}, indent=1))
