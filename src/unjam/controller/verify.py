@@ -43,6 +43,7 @@ OPERATORS = {
     *("Abs", "Add", "And", "Cast", "Clip", "Concat", "Constant", "Cos", "Div", "Equal", "Expand", "Floor"),
     *("Gather", "GatherElements", "GatherND", "Gemm", "Greater", "GreaterOrEqual", "Identity", "IsNaN"),
     *("Less", "LessOrEqual", "MatMul", "Max", "Min", "Mod", "Mul", "Neg", "Not", "Or", "Pow", "Relu"),
+    "Reciprocal",
     *("Reshape", "ScatterElements", "Shape", "Sin", "Slice", "Sqrt", "Squeeze", "Sub", "Tanh", "Transpose"),
     *("Unsqueeze", "Where"),
 }
@@ -94,9 +95,10 @@ def _short(value: Any) -> str:
 
 def _check_sample(controller: Controller) -> list[Verified]:
     """Compare the driver, and the graph where there is one, with the recorded sample."""
-    limit = controller.manifest["action"]["high"]
-    if limit is None:
+    low, high = (controller.manifest["action"][end] for end in ("low", "high"))
+    if low is None or high is None:
         raise InputError("controller: has a recorded sample, but its manifest names no bounds of its action")
+    limit = max(-low, high)
     states, recorded = read_sample(controller.parts[SAMPLE])
     answers = replay(controller.driver, states, limit)
     verified = [Verified("sample", _compare("its driver", answers, recorded, REPEATS_TO))]

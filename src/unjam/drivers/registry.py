@@ -18,7 +18,8 @@ from unjam.drivers.observation import FEATURES, FeatureName, observation_size
 from unjam.drivers.pi_saturation import PISaturation
 from unjam.drivers.residual import EXPERT, ResidualDriver
 from unjam.drivers.road_experts import JamAbsorber, Pacer
-from unjam.drivers.wrappers import INNER, Impaired, Mixed
+from unjam.drivers.safety import SafetyFilter
+from unjam.drivers.wrappers import INNER, Filtered, Impaired, Mixed
 from unjam.errors import InputError, wrong
 from unjam.parameters import STRICT, Count, NotNegative, Positive, build, split_parameters
 from unjam.tree import Arrays
@@ -130,12 +131,29 @@ def _impaired(recipe: Recipe, arrays: Arrays, held: Held) -> Driver:
     return Impaired(held(recipe["driver"], INNER), **worse)
 
 
+@dataclass(frozen=True, config=STRICT)
+class _FilteredRecipe:
+    """How a driver with its filter is written down."""
+
+    kind: Literal["filtered"]
+    driver: dict[str, Any]
+    action_limit: Positive
+    safety: SafetyFilter
+    time_step: Positive
+
+
+def _filtered(recipe: Recipe, arrays: Arrays, held: Held) -> Driver:
+    found = build(_FilteredRecipe, recipe, "driver recipe")
+    return Filtered(held(found.driver, INNER), found.action_limit, found.safety, found.time_step)
+
+
 RECIPES: dict[str, Callable[[Recipe, Arrays, Held], Driver]] = {
     "named": _named,
     "file": _file,
     "residual": _residual,
     "mixed": _mixed,
     "impaired": _impaired,
+    "filtered": _filtered,
 }
 """how each kind of recipe becomes a driver again"""
 

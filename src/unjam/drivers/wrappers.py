@@ -1,12 +1,15 @@
-"""Drivers around drivers: several side by side, or one whose sensors and actuators are worse."""
+"""Drivers around drivers: several side by side, one with worse sensors, one with its safety filter."""
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from functools import cached_property
 from typing import ClassVar
 
 import numpy as np
 
+from unjam.drivers.command import Limits
 from unjam.drivers.driver import Driver, Memory, Recipe
 from unjam.drivers.local_state import LocalState
+from unjam.drivers.safety import Ahead, SafetyFilter
 from unjam.errors import InputError
 from unjam.parameters import NotNegative
 from unjam.physics.arrays import Array, namespace
@@ -14,8 +17,8 @@ from unjam.physics.arrays import Array, namespace
 KIND = "kind"
 """name in the memory of a mixture: which driver a CAV has"""
 INNER, AGE, SENT = "inner", "age", "sent"
-"""names in the memory of an impaired driver: the other driver's own; decisions made so far; what was said and
-not yet done"""
+"""names in the memory of a wrapper: the other driver's own; of an impaired one besides: decisions made so
+far; what was said and not yet done"""
 SMALLEST_SEEN_GAP = 0.1
 """[m], however wrong a sensor is"""
 
@@ -127,3 +130,49 @@ class Impaired(Wrapper):
         """Return what the other driver is made from, and what is worse about it."""
         worse = {"delay": self.delay, "gap_noise": self.gap_noise, "time_step": self.time_step}
         return {"kind": "impaired", "driver": self.driver.recipe(), **worse}
+
+
+@dataclass(frozen=True)
+class Filtered(Wrapper):
+    """Another driver with the limits and the safety filter of a road, for a car that has none of its own.
+
+    A controller is shipped so: what drives elsewhere is what was proven. Where the road filters as well, as
+    all of unjam's do, nothing changes.
+    """
+
+    driver: Driver
+    action_limit: float
+    """largest acceleration in either direction that the driver may ask for [m/s2]"""
+    safety: SafetyFilter
+    time_step: float
+    """time between two decisions [s]"""
+
+    @property
+    def inner(self) -> dict[str, Driver]:
+        """The other driver."""
+        return {INNER: self.driver}
+
+    @property
+    def plain_numbers(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Whether the other driver takes plain numbers."""
+        return self.driver.plain_numbers
+
+    @cached_property
+    def limits(self) -> Limits:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """What comes out: the driver's limits, and a car's brakes."""
+        return Limits(-max(self.action_limit, self.safety.braking), self.action_limit)
+
+    def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
+        """Return what the filter lets pass of what the other driver wants, and the new memory."""
+        wanted, after = self.driver.act(state, memory[INNER])
+        wanted = Limits.symmetric(self.action_limit).keep(wanted)
+        return self.safety.keep(wanted, Ahead(*state[:3]), self.time_step), {INNER: after}
+
+    def describe(self) -> str:
+        """Return the other driver, and that it is filtered."""
+        return f"{self.driver.describe()}, filtered"
+
+    def recipe(self) -> Recipe:
+        """Return what the other driver is made from, and the filter's settings."""
+        settings = {"action_limit": self.action_limit, "safety": asdict(self.safety)}
+        return {"kind": "filtered", "driver": self.driver.recipe(), **settings, "time_step": self.time_step}

@@ -12,6 +12,7 @@ from unjam.drivers.driver import Driver
 from unjam.drivers.local_state import LocalState
 from unjam.drivers.registry import code_of, recipe_of
 from unjam.drivers.residual import ResidualDriver
+from unjam.drivers.wrappers import Filtered
 from unjam.errors import InputError, wrong
 from unjam.files import check_folder, write_whole
 from unjam.measures.metrics import measure
@@ -43,7 +44,8 @@ class Exported:
 def export_controller(source: str | Path, to: str | Path, onnx: bool = False, scenario: str = "") -> Exported:
     """Write a controller into a file that needs nothing else: `.unjam`, and on demand an ONNX graph.
 
-    One held-out episode is driven for its recorded sample.
+    One held-out episode is driven for its recorded sample. What is written has the road's safety filter with
+    it, where the road has one.
 
     Args:
         source: a run folder, or any driver as `unjam.drive` takes it.
@@ -64,7 +66,11 @@ def export_controller(source: str | Path, to: str | Path, onnx: bool = False, sc
     if driver.native or code:
         why = f"{Path(code[0]['path']).name} is Python code" if code else "human is the simulator itself"
         raise InputError(f"export: {driver.describe()} is not allowed: {why}; allowed: drivers that are data")
-    limit = driver.action_limit if isinstance(driver, ResidualDriver) else road.action_limit
+    if road.safety.active and not isinstance(driver, Filtered):
+        asked = (driver.limits or road.limits).highest
+        driver = Filtered(driver, asked, road.safety, road.decision_step)
+    low, high = driver.limits or road.limits
+    limit = max(-low, high)
     graph: dict[str, bytes] = {}
     if onnx:
         from unjam.controller.onnx_graph import onnx_graph  # torch.onnx takes its time, and not all want it
