@@ -14,7 +14,8 @@ from tests.controller.test_file import ABOUT, residual, written
 from tests.controller.test_sample import perceived
 from unjam.controller import controller_bytes, load_controller
 from unjam.controller.file import GRAPH, MANIFEST, SAMPLE, hash_of, pack_parts, unpack_parts
-from unjam.controller.verify import sample_bytes, verify_controller
+from unjam.controller.sample import sample_bytes
+from unjam.controller.verify import verify_controller
 from unjam.drivers import Constant, Driver, PISaturation
 from unjam.errors import InputError
 

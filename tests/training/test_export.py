@@ -9,7 +9,7 @@ from tests.pictures import empty_pictures
 from tests.training.test_run import small_config
 from unjam.controller import load_controller
 from unjam.controller.file import GRAPH, MANIFEST, SAMPLE, WEIGHTS, unpack_parts
-from unjam.controller.verify import read_sample
+from unjam.controller.sample import read_sample
 from unjam.drivers import PISaturation, ResidualDriver
 from unjam.errors import InputError
 from unjam.training.export import SAMPLED, export_controller

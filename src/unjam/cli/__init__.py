@@ -13,7 +13,7 @@ from unjam import __version__
 from unjam.cli.drive import drive, watch
 from unjam.cli.machine import bench, doctor
 from unjam.cli.parts import drivers, fit_drivers, scenarios
-from unjam.cli.results import evaluate, export, model, report, verify
+from unjam.cli.results import certify, evaluate, export, model, report, verify
 from unjam.cli.train import reproduce, search, train, tune
 from unjam.errors import DISK_ERRNOS, UnjamError, disk_error
 
@@ -46,7 +46,7 @@ def _root(
 
 for verb in (
     *(scenarios, drivers, drive, train, evaluate, model, fit_drivers),
-    *(report, tune, search, reproduce, export, verify, watch, bench, doctor),
+    *(report, tune, search, reproduce, export, certify, verify, watch, bench, doctor),
 ):
     app.command()(verb)
 

@@ -169,6 +169,42 @@ def export(
     aside.print(f"{done.driver}, verified on {done.decisions:,} decisions of a held-out episode")
 
 
+def certify(
+    file: Annotated[Path, typer.Argument(help="A .unjam file that was exported; it gets the certificate.")],
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", help="The page to write.", show_default="beside the file, ending in .html"),
+    ] = None,
+    json: JsonOption = False,
+) -> None:
+    """Certify a controller: what is proven of it, worst cases, comfort, strings of vehicles, its domain.
+
+    Leaders brake to standstill from every state of its sample, an adversary looks for contact, and others
+    sway at all frequencies. The certificate becomes a part of the file, which `unjam verify` tries again.
+
+    Example:
+
+      unjam certify ring.unjam
+    """
+    from unjam.controller.certificate import certificate_of
+    from unjam.controller.file import add_certificate, read_controller
+    from unjam.files import check_folder
+    from unjam.reports.certificate import write_certificate
+
+    controller, target = read_controller(file), out or file.with_suffix(".html")
+    check_folder(target)
+    found = certificate_of(controller)
+    add_certificate(file, controller, found)
+    write_certificate(file.name, controller, found, target)
+    if json:
+        print_json({"file": str(file), "page": str(target), "certificate": found})
+        return
+    worst = found["worst"]
+    tried = f"{worst['steps']:,} steps behind leaders that brake and attack: {worst['contacts']} contacts"
+    console.print(f"{tried}, smallest gap {worst['smallest_gap']:.2f} m", soft_wrap=True)
+    aside.print(f"page: {target}")
+
+
 def verify(
     file: Annotated[Path, typer.Argument(help="A .unjam file, or the folder of a training run.")],
     json: JsonOption = False,

@@ -19,7 +19,7 @@ from unjam.drivers.driver import Driver
 from unjam.drivers.local_state import STATE_UNITS
 from unjam.drivers.registry import code_of, driver_from_recipe, recipe_of
 from unjam.errors import InputError
-from unjam.files import to_json
+from unjam.files import to_json, write_whole
 from unjam.tree import leaves
 
 SUFFIX = ".unjam"
@@ -29,9 +29,10 @@ READABLE = (1, 2, FORMAT)
 """versions that can be read; the first had no description, sample or graph, the second other names of what is
 remembered"""
 MANIFEST, WEIGHTS = "manifest.json", "weights.safetensors"
-SAMPLE, GRAPH = "sample.safetensors", "controller.onnx"
-PARTS = (MANIFEST, WEIGHTS, SAMPLE, GRAPH)
-"""all that an archive may hold; the last two are there where it was exported"""
+SAMPLE, GRAPH, CERTIFICATE = "sample.safetensors", "controller.onnx", "certificate.json"
+PARTS = (MANIFEST, WEIGHTS, SAMPLE, GRAPH, CERTIFICATE)
+"""all that an archive may hold; sample and graph are there where it was exported, the certificate where it
+was certified"""
 LARGEST_PART = 64 * 2**20
 """bytes of one part"""
 DAMAGED = (
@@ -71,6 +72,14 @@ def controller_bytes(driver: Driver, about: dict[str, Any], parts: dict[str, byt
         "sha256": {name: hash_of(part) for name, part in parts.items()},
     }
     return pack_parts({MANIFEST: to_json(manifest, indent=1).encode(), **parts})
+
+
+def add_certificate(file: Path, controller: Controller, certificate: dict[str, Any]) -> None:
+    """Write a controller's file once more, with its certificate among its parts and their hashes."""
+    parts = {**controller.parts, CERTIFICATE: to_json(certificate, indent=1).encode()}
+    del parts[MANIFEST]
+    manifest = {**controller.manifest, "sha256": {name: hash_of(part) for name, part in parts.items()}}
+    write_whole(file, pack_parts({MANIFEST: to_json(manifest, indent=1).encode(), **parts}))
 
 
 def load_controller(path: Path | str) -> Driver:

@@ -4,16 +4,17 @@ Its forms are its driver, a recorded sample (what a CAV perceived in an episode,
 answers to it) and an ONNX graph, which is looked at before it is run.
 """
 
+import json
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
-from safetensors.numpy import load, save
 
+from unjam.controller.certificate import certificate_of
 from unjam.controller.file import (
+    CERTIFICATE,
     FORMAT,
     GRAPH,
     MANIFEST,
@@ -23,20 +24,17 @@ from unjam.controller.file import (
     description,
     read_controller,
 )
-from unjam.drivers.command import Limits
+from unjam.controller.sample import ANSWER, Floats, read_sample, replay
 from unjam.drivers.driver import Driver
 from unjam.drivers.local_state import LocalState
 from unjam.errors import InputError, MissingPartError
+from unjam.files import to_json
 from unjam.tree import leaves
-from unjam.worlds.drive import drive
-from unjam.worlds.world import RecordedWorld
 
-Floats = NDArray[np.float64]
-
-ANSWER = "acceleration"
-"""the answer's name in a sample and in a graph"""
 REPEATS_TO = 1e-9
 """how far the recorded accelerations may be from those of this machine [m/s2]"""
+CERTIFIED_TO = 1e-6
+"""how far a certificate's numbers may be from those of this machine"""
 PARITY = 1e-6
 """how far the graph may be from the driver [m/s2]"""
 OPERATORS = {
@@ -83,8 +81,10 @@ def verify_controller(path: Path | str) -> list[Verified]:
         verified.append(Verified("manifest", seen))
     if SAMPLE in parts:
         verified += _check_sample(controller)
-    elif GRAPH in parts:
-        raise InputError("controller: has a graph, but no recorded sample to compare it on")
+    elif GRAPH in parts or CERTIFICATE in parts:
+        raise InputError("controller: has a graph or a certificate, but no recorded sample to try it on")
+    if CERTIFICATE in parts:
+        verified.append(Verified("certificate", _check_certificate(controller)))
     return verified
 
 
@@ -114,6 +114,33 @@ def _check_sample(controller: Controller) -> list[Verified]:
     return verified
 
 
+def _check_certificate(controller: Controller) -> str:
+    """Try the controller again, and compare with its certificate number by number."""
+    said = json.loads(controller.parts[CERTIFICATE])
+    found = json.loads(to_json(certificate_of(controller)))
+    for name, (written, again) in _numbers(said, found).items():
+        if not (again == written or abs(again - written) <= CERTIFIED_TO * max(1.0, abs(again))):
+            raise InputError(f"controller: its certificate says of {name}: {written}; allowed: {again}")
+    worst = found["worst"]
+    return (
+        f"{worst['steps']:,} steps behind leaders that brake and attack, {worst['contacts']} contacts, "
+        f"smallest gap {worst['smallest_gap']:.2f} m: as certified"
+    )
+
+
+def _numbers(said: Any, found: Any, name: str = "") -> dict[str, tuple[Any, Any]]:
+    """Return all leaves of two JSON trees, by name; raise `InputError` where they are not alike."""
+    if isinstance(found, dict) and isinstance(said, dict) and said.keys() == found.keys():
+        pairs = [(said[key], found[key], f"{name}.{key}".strip(".")) for key in found]
+    elif isinstance(found, list) and isinstance(said, list) and len(said) == len(found):
+        pairs = [(one, two, f"{name}[{i}]") for i, (one, two) in enumerate(zip(said, found, strict=True))]
+    elif isinstance(found, int | float) and isinstance(said, int | float):
+        return {name: (said, found)}
+    else:
+        raise InputError(f"controller: its certificate says of {name or 'itself'}: {_short(said)}")
+    return {key: pair for one, two, below in pairs for key, pair in _numbers(one, two, below).items()}
+
+
 def _compare(who: str, found: np.ndarray, recorded: np.ndarray, tolerance: float) -> str:
     off = np.abs(found - recorded)
     if not (off <= tolerance).all():  # NaN is not either
@@ -123,47 +150,6 @@ def _compare(who: str, found: np.ndarray, recorded: np.ndarray, tolerance: float
             f"allowed: {recorded[step]:.9g} to {tolerance:g}"
         )
     return f"{len(found):,} decisions, {who} within {off.max(initial=0.0):.1e} m/s2 of what was recorded"
-
-
-def sample_bytes(driver: Driver, states: LocalState, limit: float) -> bytes:
-    """Return the part of an archive with `states`, arrays of shape (T,), and the answers of `driver`."""
-    arrays = {name: np.array(values, np.float64) for name, values in states._asdict().items()}
-    return save({**arrays, ANSWER: replay(driver, states, limit)})
-
-
-def read_sample(part: bytes) -> tuple[LocalState, Floats]:
-    """Return the states of a sample and the recorded accelerations [m/s2], all of shape (T,).
-
-    Raises:
-        InputError: an array is missing, unknown, of another shape or type, or an acceleration is not finite.
-    """
-    arrays: dict[str, Any] = load(part)
-    names = {*LocalState._fields, ANSWER}
-    if arrays.keys() != names:
-        wrong = min(arrays.keys() ^ names)
-        raise InputError(f"sample: {wrong!r} is {'missing' if wrong in names else 'unknown'}")
-    answers = arrays.pop(ANSWER)
-    for name, values in {**arrays, ANSWER: answers}.items():
-        if values.ndim != 1 or values.shape != answers.shape or values.dtype != np.float64:
-            raise InputError(f"sample: {name!r} has shape {values.shape} of {values.dtype}; allowed: numbers")
-    if not np.isfinite(answers).all():
-        raise InputError("sample: a recorded acceleration is not finite")
-    return LocalState(**arrays), answers
-
-
-def replay(driver: Driver, states: LocalState, limit: float) -> Floats:
-    """Return what a driver answers when it perceives `states` one after the other, from its first memory.
-
-    Args:
-        driver: of one CAV.
-        states: arrays of shape (T,).
-        limit: the acceleration is clipped to it [m/s2].
-
-    Returns:
-        Accelerations [m/s2], shape (T,).
-    """
-    world = RecordedWorld(states.each(lambda values: values[:, None]), Limits.symmetric(limit))
-    return drive(world, driver).ravel()
 
 
 def graph_names(driver: Driver) -> tuple[list[str], list[str]]:

@@ -7,7 +7,8 @@ from typing import Any
 
 from unjam.controller import SUFFIX, controller_bytes, make_driver
 from unjam.controller.file import GRAPH, SAMPLE, read_controller
-from unjam.controller.verify import sample_bytes, verify_controller
+from unjam.controller.sample import sample_bytes
+from unjam.controller.verify import verify_controller
 from unjam.drivers.driver import Driver
 from unjam.drivers.local_state import LocalState
 from unjam.drivers.registry import code_of, recipe_of

@@ -47,8 +47,8 @@ CLOSING_ABSORBER = "jam-absorber:gap_gain=0,push=0.9,speed_gain=0.8"
 """the expert that gets furthest on the merge"""
 
 BEST: dict[str, dict[str, Any]] = {
-    # The expert is tuned: what a residual on it gains, no parameter does. It is easily upset: with seven times
-    # the noise the first 40 iterations unlearn what it can, and noise that is learned vanishes too soon.
+    # The expert is tuned: what a residual on it gains, no parameter does. It is easily upset: seven times the
+    # noise makes the first 40 iterations unlearn what it can, and noise that is learned vanishes too soon.
     "ring": {
         **PRESETS["demo"],
         "steps": 1_500_000,

@@ -1,0 +1,94 @@
+"""The page of a certificate: what is proven of a controller, what was tried, and where it was seen."""
+
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jinja2 import Environment, StrictUndefined
+from markupsafe import Markup
+from matplotlib import rc_context
+from matplotlib.figure import Figure
+
+from unjam import __version__
+from unjam.controller.certificate import ATTACK_PIECE, ROUNDING
+from unjam.controller.file import Controller
+from unjam.drivers.wrappers import Filtered
+from unjam.files import write_whole
+from unjam.reports.figures import CAV_COLOUR, LINES, MUTED, STYLE, data_uri, new_figure
+
+UNITS = (("own speed", "speed", "m/s"), ("leader's speed", "leader_speed", "m/s"), ("gap", "leader_gap", "m"))
+
+
+def write_certificate(name: str, controller: Controller, certificate: dict[str, Any], target: Path) -> None:
+    """Write the page; `certificate` is what `certificate_of` returned."""
+    page = files("unjam.reports") / "page"
+    template, style = (
+        (page / part).read_text(encoding="utf-8") for part in ("certificate.html", "report.css")
+    )
+    driver = controller.driver
+    assert isinstance(driver, Filtered)
+    worst, comfort = certificate["worst"], certificate["comfort"]
+    cards = [
+        ("Smallest gap", f"{worst['smallest_gap']:.2f} m", "in all that was tried"),
+        ("Smallest headway", f"{worst['smallest_headway']:.2f} s", "while the leader brakes hard"),
+        ("Hardest braking", f"{worst['hardest_braking']:.1f} m/s²", "in all that was tried"),
+        ("Riding along", f"{comfort['acceleration']:.2f} m/s²", "r.m.s.; below 0.315 is comfortable"),
+    ]
+    environment = Environment(
+        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    text = environment.from_string(template).render(
+        version=__version__,
+        name=name,
+        driver=driver.describe(),
+        style=Markup(style),
+        worst=worst,
+        cards=cards,
+        notes=_notes(certificate),
+        safety=driver.safety,
+        step=f"{driver.time_step:g}",
+        strings=certificate["strings"],
+        attack=data_uri(_attack(worst["attack"])),
+        strings_picture=data_uri(_strings(certificate["strings"])),
+        domain=[(label, certificate["domain"][key], unit) for label, key, unit in UNITS],
+    )
+    write_whole(target, text)
+
+
+def _notes(certificate: dict[str, Any]) -> list[str]:
+    notes = []
+    if not certificate["comfort"]["within_iso_15622"]:
+        notes.append("On its road it brakes or speeds up harder than ISO 15622 lets a cruise control.")
+    for each in certificate["strings"]:
+        gains, frequencies = np.array(each["gains"]), np.array(each["frequencies"])
+        growing = frequencies[gains > 1.0 + ROUNDING]
+        if len(growing):
+            notes.append(
+                f"At {each['speed']:g} m/s it amplifies sway between {growing[0]:.2f} and {growing[-1]:.2f} "
+                f"rad/s, up to {gains.max():.2f} times; so no people behind it are stabilised there."
+            )
+    return notes
+
+
+@rc_context(STYLE)
+def _attack(accelerations: list[float]) -> Figure:
+    figure = new_figure(2.2)
+    axes = figure.subplots()
+    axes.stairs(accelerations, np.arange(len(accelerations) + 1) * ATTACK_PIECE, color=CAV_COLOUR)
+    axes.set(xlabel="time [s]", ylabel="m/s²", title="The manoeuvre that came closest: leader's acceleration")
+    return figure
+
+
+@rc_context(STYLE)
+def _strings(strings: list[dict[str, Any]]) -> Figure:
+    figure = new_figure(2.8)
+    found = figure.subplots(1, max(1, len(strings)), sharey=True, squeeze=False)[0]
+    for axes, each in zip(found, strings, strict=False):
+        axes.axhline(1.0, color=MUTED, lw=0.8)
+        axes.semilogx(each["frequencies"], each["gains"], color=CAV_COLOUR, label="controller")
+        axes.semilogx(each["frequencies"], each["people"], color=LINES[2], ls="--", label="people (IDM)")
+        axes.set(xlabel="frequency [rad/s]", title=f"{each['speed']:g} m/s")
+    found[0].set_ylabel("gain")
+    found[0].legend()
+    return figure

@@ -1,0 +1,140 @@
+"""Does a certificate say what is so, and is one that does not found out?"""
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from unjam.controller import certificate as certificates
+from unjam.controller.certificate import FREQUENCIES, Domain, certificate_of, certify, human_gain
+from unjam.controller.file import (
+    CERTIFICATE,
+    MANIFEST,
+    SAMPLE,
+    add_certificate,
+    controller_bytes,
+    hash_of,
+    pack_parts,
+    read_controller,
+)
+from unjam.controller.sample import sample_bytes
+from unjam.controller.verify import verify_controller
+from unjam.drivers import IDM, Driver, LocalState, PISaturation
+from unjam.drivers.car_following import Constant
+from unjam.drivers.safety import SafetyFilter
+from unjam.drivers.wrappers import Filtered
+from unjam.errors import InputError
+from unjam.physics.idm import PAPER_IDM, IDMParameters, equilibrium_gap
+from unjam.reports.certificate import write_certificate
+from unjam.scenarios import Ring
+from unjam.training.folder import origin
+
+
+@pytest.fixture(autouse=True)
+def few_attacks(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(certificates, "ATTACKS", 24)
+    monkeypatch.setattr(certificates, "GENERATIONS", 3)
+    monkeypatch.setattr(certificates, "FREQUENCIES", FREQUENCIES[::4])
+
+
+def filtered(driver: Driver, **changes: Any) -> Filtered:
+    return Filtered(driver, 1.0, SafetyFilter(**changes), 0.1)
+
+
+def visited(count: int = 60) -> LocalState:
+    speed = np.linspace(0.0, 5.0, count)
+    return LocalState(
+        speed, speed[::-1].copy(), 8.0 + 3.0 * speed, speed, 9.0 + speed, speed * 0.0, speed * 0.0 + 245.0
+    )
+
+
+def test_a_reckless_driver_behind_its_filter_touches_nobody() -> None:
+    worst = certify(filtered(Constant(1.0)), visited(), PAPER_IDM).worst
+    assert worst.contacts == 0
+    assert worst.smallest_gap == pytest.approx(1.0, abs=1e-6)
+    assert worst.smallest_headway > 1.0
+    assert 1.0 < worst.hardest_braking <= 6.0 + 1e-9
+    assert worst.steps > 30_000
+
+
+def test_a_filter_that_does_not_act_is_found_out() -> None:
+    bare = filtered(Constant(1.0), active=False)
+    assert certify(bare, visited(), PAPER_IDM).worst.contacts > 0
+
+
+@pytest.mark.parametrize("humans", [PAPER_IDM, IDMParameters(time_headway=1.6, max_acceleration=2.0)])
+def test_the_measured_gain_of_an_idm_is_that_of_the_linearised_one(humans: IDMParameters) -> None:
+    idm = Filtered(IDM(**asdict(humans)), 3.0, SafetyFilter(time_headway=0.0), 0.1)
+    for each in certify(idm, visited(), humans).strings:
+        assert each.speed in (2.5, 4.5)
+        np.testing.assert_allclose(each.gains, each.people, atol=0.05)
+
+
+@pytest.mark.parametrize(("acceleration", "stable"), [(0.6, False), (1.0, False), (1.6, False), (3.0, True)])
+def test_people_amplify_sway_exactly_where_the_idm_is_known_to_be_unstable(
+    acceleration: float, stable: bool
+) -> None:
+    humans, v = IDMParameters(max_acceleration=acceleration), 4.0
+    s, wanted = equilibrium_gap(v, humans), 2.0 + v
+    f_s = 2.0 * acceleration * wanted**2 / s**3
+    f_v = -acceleration * (4.0 * v**3 / 30.0**4 + 2.0 * wanted / s**2)
+    f_dv = acceleration * 2.0 * wanted / s**2 * v / (2.0 * np.sqrt(acceleration * 1.5))
+    assert (f_v**2 / 2.0 - f_v * f_dv >= f_s) == stable  # Treiber and Kesting 2013, Eq. 15.31
+    low = np.geomspace(1e-3, 3.0, 200)
+    assert (human_gain(low, v, humans).max() <= 1.0 + 1e-6) == stable
+
+
+def test_who_stands_still_stabilises_any_number_of_people() -> None:
+    still = certify(filtered(Constant(-1.0)), visited(), PAPER_IDM)
+    assert all(each.stabilised == certificates.MOST_BEHIND for each in still.strings)
+
+
+def test_a_state_outside_of_the_domain_is_told_from_one_within() -> None:
+    domain = Domain((0.0, 5.0), (0.0, 6.0), (2.0, 30.0))
+    states = visited(3)._replace(speed=np.array([4.0, 5.5, 4.0]), leader_gap=np.array([9.0, 9.0, 40.0]))
+    assert domain.holds(states).tolist() == [True, False, False]
+
+
+def written(folder: Path, driver: Driver | None = None) -> Path:
+    driver = driver or filtered(PISaturation())
+    file, ring = folder / "ring.unjam", Ring()
+    sample = sample_bytes(driver, visited(), 6.0)
+    file.write_bytes(controller_bytes(driver, origin(ring, driver), {SAMPLE: sample}))
+    return file
+
+
+def test_a_certificate_becomes_a_part_of_the_file_and_is_tried_again(tmp_path: Path) -> None:
+    file = written(tmp_path)
+    controller = read_controller(file)
+    found = certificate_of(controller)
+    add_certificate(file, controller, found)
+    assert json.loads(read_controller(file).parts[CERTIFICATE]) == json.loads(json.dumps(found))
+    (said,) = [each.found for each in verify_controller(file) if each.name == "certificate"]
+    assert "0 contacts" in said
+    write_certificate(file.name, read_controller(file), found, tmp_path / "page.html")
+    assert "No contact in" in (tmp_path / "page.html").read_text()
+
+
+def test_a_certificate_that_was_changed_is_refused_even_with_a_right_hash(tmp_path: Path) -> None:
+    file = written(tmp_path)
+    controller = read_controller(file)
+    found = certificate_of(controller)
+    found["worst"]["smallest_gap"] += 0.5
+    add_certificate(file, controller, found)
+    with pytest.raises(InputError, match=r"its certificate says of worst.smallest_gap: 1.5"):
+        verify_controller(file)
+    parts = {**read_controller(file).parts, CERTIFICATE: b"{}"}
+    manifest = json.loads(parts.pop(MANIFEST))
+    manifest["sha256"] = {name: hash_of(part) for name, part in parts.items()}
+    file.write_bytes(pack_parts({MANIFEST: json.dumps(manifest).encode(), **parts}))
+    with pytest.raises(InputError, match="its certificate says of itself"):
+        verify_controller(file)
+
+
+@pytest.mark.parametrize("driver", [PISaturation(), filtered(PISaturation(), active=False)])
+def test_what_has_no_filter_has_no_certificate(driver: Driver, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="without its safety filter"):
+        certificate_of(read_controller(written(tmp_path, driver)))
