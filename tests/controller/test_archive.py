@@ -90,8 +90,8 @@ def test_a_part_that_is_too_large_is_refused(tmp_path: Path, monkeypatch: pytest
     assert "has 1001 bytes; allowed: at most 1000" in refused(
         tmp_path, with_entry(zipfile.ZipInfo(PARTS[2]), bytes(1001))
     )
-    assert "bytes; allowed: at most 4000" in refused(
-        tmp_path, with_entry(zipfile.ZipInfo(PARTS[2]), bytes(4000))
+    assert "bytes; allowed: at most 5000" in refused(
+        tmp_path, with_entry(zipfile.ZipInfo(PARTS[2]), bytes(5000))
     )
 
 

@@ -98,7 +98,7 @@ def test_a_sample_without_bounds_is_refused(tmp_path: Path) -> None:
 
 def test_a_graph_without_a_sample_is_refused(tmp_path: Path) -> None:
     path = written(tmp_path, controller_bytes(HELD, ABOUT, {GRAPH: b"graph"}))
-    assert "a graph, but no recorded sample" in refused(path)
+    assert "a graph or a certificate, but no recorded sample" in refused(path)
 
 
 def test_a_graph_that_answers_something_else_is_refused(tmp_path: Path) -> None:

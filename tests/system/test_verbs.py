@@ -189,7 +189,12 @@ def test_train_go_on_drive_and_export(unjam: Run, tmp_path: Path) -> None:
     assert driven["episodes"][0]["status"] == "completed"
 
     shipped = document(unjam("export", "run", "--to", "ring.unjam", "--json"))
-    assert shipped == {"file": "ring.unjam", "onnx": None, "driver": "pi + residual", "decisions": 80}
+    assert shipped == {
+        "file": "ring.unjam",
+        "onnx": None,
+        "driver": "pi + residual, filtered",
+        "decisions": 80,
+    }
     assert document(unjam("verify", "ring.unjam", "--json"))["verified"].keys() >= {"weights", "sample"}
     assert "ok sample: 80 decisions" in unjam("verify", "ring.unjam").stdout
     assert "ring.unjam: " in unjam("export", "run", "--to", "ring.unjam").stdout

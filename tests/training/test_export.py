@@ -11,6 +11,7 @@ from unjam.controller import load_controller
 from unjam.controller.file import GRAPH, MANIFEST, SAMPLE, WEIGHTS, unpack_parts
 from unjam.controller.sample import read_sample
 from unjam.drivers import PISaturation, ResidualDriver
+from unjam.drivers.wrappers import Filtered
 from unjam.errors import InputError
 from unjam.training.export import SAMPLED, export_controller
 from unjam.training.train import train
@@ -35,6 +36,8 @@ def exported(run: Path) -> Path:
 
 def test_it_is_the_runs_controller_that_is_exported(run: Path, exported: Path) -> None:
     made, kept = load_controller(exported), load_controller(run)
+    assert isinstance(made, Filtered)
+    made = made.driver
     assert isinstance(made, ResidualDriver)
     assert isinstance(kept, ResidualDriver)
     for ours, theirs in zip(made.network.layers, kept.network.layers, strict=True):

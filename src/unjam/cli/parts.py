@@ -142,6 +142,9 @@ def _about_shipped(name: str) -> str:
     from unjam.controller.file import read_controller
 
     manifest = read_controller(shipped_file(name)).manifest
+    if tuned := manifest.get("tuned"):
+        earned = [tuned[one]["score"] for one in ("best", "default")]
+        return f"{manifest['expert']}, tuned: returns {earned[0]:.0f} on tuning seeds, before {earned[1]:.0f}"
     expert, metrics, road = manifest["expert"], manifest["metrics"], manifest["run"]["scenario"]
     ours, theirs = (metrics[label]["mean_speed"]["mean"] for label in ("trained", expert))
     return (

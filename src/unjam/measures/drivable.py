@@ -23,11 +23,15 @@ DRIVABLE = "drivable"
 
 
 def min_headway(episode: Episode) -> float:
-    """Smallest time headway of the CAV, gap over speed, while it drives faster than 1 m/s [s].
+    """Smallest time headway of the CAV, gap over speed, while it drives faster than 1 m/s [s]; NaN if never.
 
     In any simulation step, as all that follows.
     """
-    return episode.audit.following.headway
+    return _finite(episode.audit.following.headway)
+
+
+def _finite(value: float) -> float:
+    return value if isfinite(value) else nan
 
 
 def share_short_headway(episode: Episode) -> float:
@@ -37,8 +41,7 @@ def share_short_headway(episode: Episode) -> float:
 
 def cav_min_ttc(episode: Episode) -> float:
     """Smallest time to collision of the CAV with the vehicle ahead [s]; NaN where it never closed in."""
-    found = episode.audit.following.time_to_collision
-    return found if isfinite(found) else nan
+    return _finite(episode.audit.following.time_to_collision)
 
 
 def max_drac(episode: Episode) -> float:
