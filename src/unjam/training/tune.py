@@ -81,18 +81,22 @@ def space_around(expert: str, time_step: float) -> Space:
     space: Space = {}
     hints = get_type_hints(type(default))
     for field in fields(default):  # pyright: ignore[reportArgumentType]
-        if field.name != "time_step":
-            space[field.name] = _around(getattr(default, field.name), hints[field.name])
+        around = _around(getattr(default, field.name), hints[field.name])
+        if around is not None and field.name != "time_step":
+            space[field.name] = around
     if not space:
         raise InputError(f"expert: {expert!r} has nothing to tune")
     return space
 
 
-def _around(value: Any, hint: Any) -> Range | Choice:
+def _around(value: Any, hint: Any) -> Range | Choice | None:
+    """Return what is tried of a parameter; None where nothing is near, as for a list."""
     if isinstance(value, bool):
         return Choice((False, True))
     if get_origin(hint) is Literal:
         return Choice(get_args(hint))
+    if not isinstance(value, int | float):
+        return None
     if value == 0:
         return Range(0.0, TO_ONE)
     if isinstance(value, int):
