@@ -178,6 +178,8 @@ def bench(
     for what, speed, ratio in rows:
         table.add_row(what, f"{speed:,.0f}", ratio)
     console.print(table)
+    filtered = f"safety filter: an episode runs at {found['over_unfiltered']:.2f} of its speed without"
+    console.print(f"{filtered}; its audit takes {100 * found['audit_share']:.1f} % of the time")
     for entry in found["scaling"]:
         cost = f"{entry['us_per_vehicle_step']:.2f} us a vehicle-step"
         console.print(f"{entry['vehicles']:>5} vehicles: {cost}")

@@ -30,6 +30,7 @@ from unjam.virtual.model import EnvironmentModel, torch_generator
 from unjam.virtual.rollout import begin, draw_starts, imagine
 from unjam.virtual.settings import VirtualSettings
 from unjam.virtual.world import VirtualDynamics
+from unjam.worlds.audit import brakings, following
 from unjam.worlds.drive import Drive
 from unjam.worlds.episode import run_episode
 from unjam.worlds.record import Episode
@@ -71,6 +72,8 @@ def measure_speed(rounds: int = ROUNDS, on_line: OnLine = lambda line: None) -> 
     `over_traci`: steps/s of the same driving loop with libsumo over those through TraCI.
     `virtual`: decisions/s of virtual rollouts, with the default ensemble and beginning them included, over
     those of `run_episode`.
+    `over_unfiltered`: steps/s of `run_episode` over those without the safety filter.
+    `audit_share`: share of an episode's time that its audit takes.
     `roads`: `over_bare` on other roads.
     `growth`: the largest cost of a vehicle-step over that of the smallest road.
     """
@@ -88,7 +91,7 @@ def _measure(rounds: int, on_line: OnLine) -> dict[str, Any]:
     ring = SCENARIOS["ring"]
     driver, every_step = neural_driver(PolicySettings().decisions_held(ring.decision_step)), neural_driver(1)
     roads: dict[str, Rates] = {name: {"bare": [], "episode": []} for name in ("ring", *OTHER_ROADS)}
-    rates: Rates = {name: [] for name in ("every_step", "loop", "traci", *VIRTUAL)}
+    rates: Rates = {name: [] for name in ("every_step", "unfiltered", "audit", "loop", "traci", *VIRTUAL)}
     torch.set_num_threads(1)
     with Simulation() as simulation:
         for name in OTHER_ROADS:  # networks made, caches warm
@@ -104,6 +107,9 @@ def _measure(rounds: int, on_line: OnLine) -> dict[str, Any]:
                 found["bare"].append(_rate(partial(_step, simulation, steps), road.horizon))
                 found["episode"].append(_episode_rate(road, driver, number, simulation))
             rates["every_step"].append(_episode_rate(ring, every_step, number, simulation))
+            bare = replace(ring, safety=replace(ring.safety, active=False))
+            rates["unfiltered"].append(_episode_rate(bare, driver, number, simulation))
+            rates["audit"].append(_rate(partial(_audit, driven), ring.horizon))
             for name, (rows, decisions) in VIRTUAL.items():
                 rates[name].append(_virtual_rate(driven, ring, driver, rows, decisions))
             rates["loop"].append(_loop_rate(ring, driver, simulation))
@@ -118,6 +124,8 @@ def _measure(rounds: int, on_line: OnLine) -> dict[str, Any]:
         "traci_steps_per_s": median(rates["traci"]),
         "every_step_steps_per_s": median(rates["every_step"]),
         "over_bare_every_step": _median_ratio(rates["every_step"], on_ring["bare"]),
+        "over_unfiltered": _median_ratio(on_ring["episode"], rates["unfiltered"]),
+        "audit_share": _median_ratio(on_ring["episode"], rates["audit"]),
         "over_traci": _median_ratio(rates["loop"], rates["traci"]),
         "virtual": {
             name: {
@@ -187,6 +195,14 @@ def _virtual_rate(
         lambda: imagine(driver, world, begin(data, starts, driver.expert, "cpu"), decisions, generator),
         rows * decisions,
     )
+
+
+def _audit(episode: Episode) -> None:
+    """Do what an audit does with an episode's speeds and gaps."""
+    (cav,) = episode.trajectories
+    speed, leader_speed, gap = (values[:, None] for values in cav.states[:3])
+    brakings(np.diff(episode.speeds, axis=0) / episode.step)
+    following(speed, leader_speed, gap, episode.step)
 
 
 def _step(simulation: Simulation, steps: int) -> None:

@@ -4,6 +4,7 @@ from array import array
 from collections import defaultdict
 from collections.abc import Sequence
 from math import inf
+from operator import sub
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -111,7 +112,8 @@ class OpenTraffic(Traffic[RoadKind]):
 
     def _forget(self) -> None:
         """Begin the log of everybody's accelerations anew."""
-        self._last_speeds: dict[str, float] = {}
+        self._watched, self._of_cav, self._on_road_changed = list[str](), b"", True
+        self._last_speeds: list[float] = []
         self._changes, self._changed = array("d"), bytearray()
         """everybody's changes of speed in each simulation step [m/s], and whether a CAV's"""
 
@@ -179,20 +181,26 @@ class OpenTraffic(Traffic[RoadKind]):
         self._arrived += len(self._simulation.arrived())
         for name in left:
             self._on_road.pop(name, None)
+        self._on_road_changed |= bool(left or entered)
         self._moved(left, entered)
         for name in entered:
             self._on_road[name] = self._is_cav(name)
 
     def _watch(self) -> None:
         """Note how everybody's speed has changed in this step: people's and CAVs' apart."""
-        names = list(self._on_road)
-        speeds = self._simulation.speeds(names)
-        before = self._last_speeds
-        changes = [speed - before.get(name, speed) for name, speed in zip(names, speeds, strict=True)]
-        self._last_speeds = dict(zip(names, speeds, strict=True))
-        self._changes.fromlist(changes)
-        driven = set(self.cavs) if self._controlled else ()
-        self._changed.extend(map(driven.__contains__, names))
+        if self._on_road_changed:  # in few steps: the rest is quick
+            before = dict(zip(self._watched, self._last_speeds, strict=True))
+            self._watched = list(self._on_road)
+            driven = set(self.cavs) if self._controlled else set[str]()
+            self._of_cav = bytes(map(driven.__contains__, self._watched))
+            speeds = self._simulation.speeds(self._watched)
+            last = [before.get(name, speed) for name, speed in zip(self._watched, speeds, strict=True)]
+            self._on_road_changed = False
+        else:
+            speeds, last = self._simulation.speeds(self._watched), self._last_speeds
+        self._changes.fromlist(list(map(sub, speeds, last)))
+        self._changed.extend(self._of_cav)
+        self._last_speeds = speeds
 
     def _look(self) -> None:
         """Note who is where after a decision, and take control of the CAVs that have entered."""
@@ -202,6 +210,7 @@ class OpenTraffic(Traffic[RoadKind]):
         self.kept = rows if new or len(rows) < len(known) else None
         self.cavs = [*(self.cavs[row] for row in rows), *new]
         self.entered += len(new)
+        self._on_road_changed |= bool(new)
         if self._controlled:
             simulation.take_control(new, scenario.actuation, scenario.right_of_way, self._cav_type)
         moment = self._moment()
