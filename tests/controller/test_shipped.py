@@ -7,11 +7,16 @@ import unjam
 from unjam.controller import SHIPPED, make_driver, shipped_file, shipped_names
 from unjam.controller.verify import verify_controller
 from unjam.drivers import ResidualDriver
+from unjam.drivers.car_following import Human
 from unjam.drivers.wrappers import Filtered
 from unjam.errors import InputError
-from unjam.measures.drivable import DRIVABLE
+from unjam.measures.drivable import DRIVABLE, drivable_in_all
+from unjam.measures.metrics import measure
 from unjam.measures.statistics import paired_difference
+from unjam.scenarios import FigureEight, Ring
 from unjam.training.presets import BEST
+from unjam.worlds.episode import run_episode
+from unjam.worlds.sumo.simulation import Simulation
 
 
 @pytest.mark.parametrize("name", shipped_names())
@@ -59,3 +64,22 @@ def test_the_figure_eights_is_faster_than_its_expert_over_the_radii() -> None:
     found = unjam.drive("figure-eight", [expert, "unjam:figure-eight-best"], episodes=8, road=road, workers=2)
     speeds = [np.mean([row["mean_speed"] for row in found.rows[name]]) for name in found.rows]
     assert speeds[1] > speeds[0] + 0.2
+
+
+RINGS = [
+    Ring(vehicles=vehicles, cavs=cavs, length=(length, length), warmup=warmup, horizon=600)
+    for vehicles, cavs, length in ((5, 1, 50), (22, 1, 180), (22, 3, 240), (22, 2, 330), (44, 3, 480))
+    for warmup in (0, 1500)
+]
+EIGHTS = [
+    FigureEight(radius=(radius, radius), vehicles=count, horizon=600) for radius, count in ((26, 9), (42, 14))
+]
+
+
+@pytest.mark.parametrize("name", [name for name in shipped_names() if not name.startswith("merge")])
+def test_none_is_undrivable_on_roads_it_was_never_trained_on(name: str, simulation: Simulation) -> None:
+    driver = make_driver(f"{SHIPPED}{name}", 0.1)
+    for road in [*RINGS, *EIGHTS]:
+        row = measure(run_episode(road, driver, (11,), simulation=simulation))
+        alone = measure(run_episode(road, Human(), (11,), simulation=simulation))
+        assert drivable_in_all([row], [alone]) == DRIVABLE, road

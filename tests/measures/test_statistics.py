@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from unjam.measures.metrics import METRICS
-from unjam.measures.statistics import estimate, paired_difference, summarise
+from unjam.measures.statistics import crossed_estimate, estimate, paired_difference, summarise
 
 NUMBERS = st.lists(st.floats(-1e3, 1e3), min_size=2, max_size=12)
 
@@ -112,3 +112,22 @@ def test_summary_has_an_estimate_of_every_metric() -> None:
     found = summarise(rows)
     assert list(found) == list(METRICS)
     assert set(found.values()) == {estimate([0.0, 1.0, 2.0, 3.0])}
+
+
+@pytest.mark.parametrize(("between", "shared"), [(1.0, 0.5), (0.3, 2.0), (1.0, 0.0)])
+@pytest.mark.parametrize("trainings", [3, 5, 10, 20])
+def test_crossed_intervals_cover_what_they_say(trainings: int, between: float, shared: float) -> None:
+    generator, seeds, repeats = np.random.default_rng(trainings), 20, 2000
+    tables = (
+        between * generator.standard_normal((repeats, trainings, 1))
+        + shared * generator.standard_normal((repeats, 1, seeds))
+        + generator.standard_normal((repeats, trainings, seeds))
+    )
+    found = [crossed_estimate(table) for table in tables]
+    covered = np.mean([each.low <= 0.0 <= each.high for each in found])
+    assert 0.93 <= covered <= 0.97
+
+
+def test_a_crossed_interval_of_equal_numbers_is_a_point() -> None:
+    found = crossed_estimate(np.full((3, 4), 2.5))
+    assert (found.mean, found.low, found.high, found.count) == (2.5, 2.5, 2.5, 3)

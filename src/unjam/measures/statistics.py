@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 from scipy.stats import bootstrap, trim_mean
+from scipy.stats import t as student
 
 from unjam.measures.metrics import METRICS
 
@@ -86,3 +87,31 @@ def probability_of_improvement(
         differences = np.array([row[name] - other[str(row["seed"])] for row in rows])
         shares.append(float(np.mean((differences > 0) + 0.5 * (differences == 0))))
     return estimate(shares)
+
+
+def crossed_estimate(values: Any) -> Estimate:
+    """Return the mean over trainings that were judged on shared seeds, with its 95 % interval.
+
+    Both trainings and seeds are drawn at random, and every training meets every seed: two-way random effects
+    without repetition. The variance of the mean is (MS_T + MS_S - MS_R) / (T S), and the interval that of
+    Student's t with Satterthwaite's degrees of freedom.
+
+    Args:
+        values: of each training on each seed, shape (T, S), both at least 2.
+
+    Source: Satterthwaite 1946, Biometrics Bulletin 2; Searle, Casella, McCulloch 1992, Variance Components.
+    """
+    table = np.asarray(values, np.float64)
+    trainings, seeds = table.shape
+    mean = float(table.mean())
+    rows, columns = table.mean(1) - mean, table.mean(0) - mean
+    rest = table - mean - rows[:, None] - columns
+    freedom = np.array([trainings - 1.0, seeds - 1.0, (trainings - 1.0) * (seeds - 1.0)])
+    squares = np.array([seeds * (rows**2).sum(), trainings * (columns**2).sum(), (rest**2).sum()]) / freedom
+    # Never below what one of both alone would give: estimated by chance, the difference may be negative.
+    spread = max(squares[0] + squares[1] - squares[2], squares[0], squares[1])
+    if spread == 0:
+        return Estimate(mean, mean, mean, trainings)
+    degrees = spread**2 / (squares**2 / freedom).sum()
+    half = float(student.ppf(0.5 + CONFIDENCE / 2, degrees) * np.sqrt(spread / table.size))
+    return Estimate(mean, mean - half, mean + half, trainings)
