@@ -1,6 +1,7 @@
 """The studies of `unjam reproduce`: the paper's tables and figures."""
 
 from unjam.studies.comparison import FIGURE_5, comparison_of
+from unjam.studies.drivable import DRIVABLE_STUDY
 from unjam.studies.figure_6 import FIGURE_6
 from unjam.studies.robustness import FIGURE_10, ROBUSTNESS
 from unjam.studies.study import PAPERS_ROADS, Study
@@ -44,6 +45,7 @@ STUDIES: dict[str, Study] = {
         "ring-jammed",
     ),
     "robustness": ROBUSTNESS,
+    "drivable": DRIVABLE_STUDY,
 }
 """every study by name"""
 
