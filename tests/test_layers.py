@@ -21,7 +21,7 @@ ORDER = (
 EVERYWHERE = {"", "errors", "files", "kernels", "manifest", "parameters", "tree"}
 """what has no place in the order: it imports none of the layers"""
 ALLOWED = {
-    "controller": {"drivers", "worlds"},
+    "controller": {"physics", "drivers", "worlds"},
     "following": {"physics", "drivers", "scenarios"},
     "reports": {"physics", "drivers", "scenarios", "worlds", "measures"},
     "learners": {"following"},

@@ -188,6 +188,7 @@ def certify(
     """
     from unjam.controller.certificate import certificate_of
     from unjam.controller.file import add_certificate, read_controller
+    from unjam.drivers.wrappers import Filtered
     from unjam.files import check_folder
     from unjam.reports.certificate import write_certificate
 
@@ -195,7 +196,8 @@ def certify(
     check_folder(target)
     found = certificate_of(controller)
     add_certificate(file, controller, found)
-    write_certificate(file.name, controller, found, target)
+    assert isinstance(controller.driver, Filtered)  # nothing else is certified
+    write_certificate(file.name, controller.driver, found, target)
     if json:
         print_json({"file": str(file), "page": str(target), "certificate": found})
         return

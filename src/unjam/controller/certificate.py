@@ -76,6 +76,8 @@ class StringStability:
     """one human's, by the linearised IDM"""
     worst_frequency: float
     """where the CAV's is largest [rad/s]"""
+    amplified: tuple[float, ...]
+    """smallest and largest frequency at which the CAV's gain is above one; empty where none is [rad/s]"""
     stabilised: int
     """most people behind the CAV whose last one sways no more than the leader at any frequency"""
 
@@ -243,6 +245,7 @@ def _string(pursue: Pursue, speed: float, step: float, humans: IDMParameters) ->
             for row, frequency in enumerate(FREQUENCIES)
         ]
     )
+    growing = FREQUENCIES[gains > 1.0 + ROUNDING]
     people = human_gain(FREQUENCIES, speed, humans)
     stable = [n for n in range(MOST_BEHIND + 1) if (gains * people**n).max() <= 1.0 + ROUNDING]
     return StringStability(
@@ -251,6 +254,7 @@ def _string(pursue: Pursue, speed: float, step: float, humans: IDMParameters) ->
         tuple(gains.tolist()),
         tuple(people.tolist()),
         float(FREQUENCIES[int(np.argmax(gains))]),
+        (float(growing[0]), float(growing[-1])) if len(growing) else (),
         max(stable, default=0),
     )
 

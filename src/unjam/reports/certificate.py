@@ -11,8 +11,6 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 
 from unjam import __version__
-from unjam.controller.certificate import ATTACK_PIECE, ROUNDING
-from unjam.controller.file import Controller
 from unjam.drivers.wrappers import Filtered
 from unjam.files import write_whole
 from unjam.reports.figures import CAV_COLOUR, LINES, MUTED, STYLE, data_uri, new_figure
@@ -20,14 +18,12 @@ from unjam.reports.figures import CAV_COLOUR, LINES, MUTED, STYLE, data_uri, new
 UNITS = (("own speed", "speed", "m/s"), ("leader's speed", "leader_speed", "m/s"), ("gap", "leader_gap", "m"))
 
 
-def write_certificate(name: str, controller: Controller, certificate: dict[str, Any], target: Path) -> None:
-    """Write the page; `certificate` is what `certificate_of` returned."""
+def write_certificate(name: str, driver: Filtered, certificate: dict[str, Any], target: Path) -> None:
+    """Write the page of a controller; `certificate` is that of its file."""
     page = files("unjam.reports") / "page"
     template, style = (
         (page / part).read_text(encoding="utf-8") for part in ("certificate.html", "report.css")
     )
-    driver = controller.driver
-    assert isinstance(driver, Filtered)
     worst, comfort = certificate["worst"], certificate["comfort"]
     cards = [
         ("Smallest gap", f"{worst['smallest_gap']:.2f} m", "in all that was tried"),
@@ -61,12 +57,11 @@ def _notes(certificate: dict[str, Any]) -> list[str]:
     if not certificate["comfort"]["within_iso_15622"]:
         notes.append("On its road it brakes or speeds up harder than ISO 15622 lets a cruise control.")
     for each in certificate["strings"]:
-        gains, frequencies = np.array(each["gains"]), np.array(each["frequencies"])
-        growing = frequencies[gains > 1.0 + ROUNDING]
-        if len(growing):
+        if each["amplified"]:
+            low, high = each["amplified"]
             notes.append(
-                f"At {each['speed']:g} m/s it amplifies sway between {growing[0]:.2f} and {growing[-1]:.2f} "
-                f"rad/s, up to {gains.max():.2f} times; so no people behind it are stabilised there."
+                f"At {each['speed']:g} m/s it amplifies sway between {low:.2f} and {high:.2f} rad/s, up to "
+                f"{max(each['gains']):.2f} times; so no people behind it are stabilised there."
             )
     return notes
 
@@ -75,7 +70,7 @@ def _notes(certificate: dict[str, Any]) -> list[str]:
 def _attack(accelerations: list[float]) -> Figure:
     figure = new_figure(2.2)
     axes = figure.subplots()
-    axes.stairs(accelerations, np.arange(len(accelerations) + 1) * ATTACK_PIECE, color=CAV_COLOUR)
+    axes.stairs(accelerations, np.arange(len(accelerations) + 1.0), color=CAV_COLOUR)
     axes.set(xlabel="time [s]", ylabel="m/s²", title="The manoeuvre that came closest: leader's acceleration")
     return figure
 
