@@ -1,4 +1,4 @@
-"""Runs a .unjam controller with Python and NumPy alone; copy it with plain_experts.py beside your program.
+"""Runs a .unjam controller with Python and NumPy alone; copy it with plain_experts.py and plain_safety.py.
 
     controller = Controller("ring.unjam")
     while driving:  # once every controller.time_step seconds, for one vehicle
@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 from plain_experts import EXPERTS, State, clip
+from plain_safety import highest
 
 
 class Driver:
@@ -27,6 +28,9 @@ class Driver:
         if recipe["kind"] == "named":
             self.p = SimpleNamespace(**recipe["parameters"])
             return
+        if recipe["kind"] == "filtered":
+            self.inner = Driver(recipe["driver"], weights, f"{prefix}inner.")
+            return
         self.expert = Driver(recipe["expert"], weights, f"{prefix}expert.")
         count = sum(f"{prefix}{index}.weight" in weights for index in range(len(weights)))
         self.layers = [[weights[f"{prefix}{i}.{part}"] for part in ("weight", "bias")] for i in range(count)]
@@ -35,6 +39,9 @@ class Driver:
         """Return the wanted acceleration [m/s2]."""
         if self.r["kind"] == "named":
             return EXPERTS[self.r["name"]](self.p, s, self.memory)
+        if self.r["kind"] == "filtered":
+            wanted = clip(self.inner.act(s), -self.r["action_limit"], self.r["action_limit"])
+            return min(wanted, highest(SimpleNamespace(**self.r["safety"]), s, self.r["time_step"]))
         limit = self.r["action_limit"]
         expert = clip(self.expert.act(s), -limit, limit)
         self.memory = self.expert.memory
@@ -82,7 +89,8 @@ class Controller:
             if hashlib.sha256(part).hexdigest() != self.manifest["sha256"][name]:
                 raise ValueError(f"{path}: {name} is damaged")
         self.sample = arrays(parts["sample.safetensors"])
-        self.time_step, self.limit = self.manifest["time_step"], self.manifest["action"]["high"]
+        self.time_step, action = self.manifest["time_step"], self.manifest["action"]
+        self.limit = max(-action["low"], action["high"])
         self.driver = Driver(self.manifest["driver"], arrays(parts["weights.safetensors"]))
 
     def act(self, *perceived: float) -> float:

@@ -19,6 +19,8 @@ from unjam.controller.sample import replay, sample_bytes
 from unjam.drivers import LACC, Driver, FollowerStopper, LocalState, Pacer, PISaturation
 from unjam.drivers.local_state import LARGEST_GAP
 from unjam.drivers.registry import named_driver
+from unjam.drivers.safety import SafetyFilter
+from unjam.drivers.wrappers import Filtered
 from unjam.worlds.sumo.files import sumo_program
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -70,13 +72,15 @@ def test_the_plain_reader_drives_as_unjam_without_it(tmp_path: Path) -> None:
         residual(PISaturation(), hold=10),
         residual(Pacer(lap_time=40.0), hold=3, outputs=2),
         residual(residual(residual(FollowerStopper(), 1, hold=3), 2), 3, hold=5),
+        Filtered(residual(PISaturation(), hold=10), 1.0, SafetyFilter(gap_error=0.5), 0.1),
+        Filtered(named_driver("constant:acceleration=1", 0.1), 1.5, SafetyFilter(time_headway=0.0), 0.1),
     ]
     states = perceived(700)
     paths = [shipped(driver, tmp_path / f"{number}.unjam", states) for number, driver in enumerate(drivers)]
     command = [sys.executable, "-I", "-c", WITHOUT_UNJAM, str(EXAMPLES), *map(str, paths)]
     ran = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
     for driver, line in zip(drivers, ran.stdout.splitlines(), strict=True):
-        limit = getattr(driver, "action_limit", 1.5)
+        limit = 6.0 if isinstance(driver, Filtered) else getattr(driver, "action_limit", 1.5)
         found = np.array(line.strip("[]").split(","), float)
         np.testing.assert_allclose(
             found, replay(driver, states, limit), rtol=0, atol=1e-9, err_msg=str(driver)
@@ -95,7 +99,8 @@ def test_the_plain_reader_compares_itself_with_the_recorded_sample(tmp_path: Pat
 
 def test_the_plain_reader_is_short() -> None:
     lines = [
-        len((EXAMPLES / name).read_text().splitlines()) for name in ("run_controller.py", "plain_experts.py")
+        len((EXAMPLES / name).read_text().splitlines())
+        for name in ("run_controller.py", "plain_experts.py", "plain_safety.py")
     ]
     assert max(lines) < 200
     assert lines[0] < 120
@@ -122,7 +127,7 @@ def test_the_client_drives_a_vehicle_of_a_running_sumo(tmp_path: Path) -> None:
     record = tmp_path / "record.xml"
     sumo = [sumo_program("sumo"), "-c", str(road), "--remote-port", str(port), "--no-step-log"]
     sumo += ["--fcd-output", str(record), "--precision", "9"]
-    for name in ("traci_client.py", "run_controller.py", "plain_experts.py"):
+    for name in ("traci_client.py", "run_controller.py", "plain_experts.py", "plain_safety.py"):
         shutil.copy(EXAMPLES / name, tmp_path)
     with subprocess.Popen(sumo, stdout=subprocess.DEVNULL) as running:
         try:
