@@ -39,7 +39,8 @@ def one_line(error: ValidationError, field: str) -> str:
         return f"{name}: unknown name"
     if problem["type"] == "missing":
         return f"{name}: missing"
-    if problem["type"] == "value_error" and not problem["loc"]:  # a check across fields names them itself
+    names_itself = not problem["loc"] or " is not allowed; allowed: " in problem["msg"]
+    if problem["type"] == "value_error" and names_itself:  # a check across fields
         return f"{name}.{problem['msg'].removeprefix('Value error, ')}".removeprefix(".")
     allowed = problem["msg"].removeprefix("Input should be ").removeprefix("Value error, ")
     return f"{name}: {problem['input']!r} is not allowed; allowed: {allowed}"

@@ -174,7 +174,9 @@ def _parameter_table(rows: list[dict[str, Any]], title: str) -> Any:
     for row in rows:
         value = row["default"]
         if isinstance(value, dict):
-            value = ", ".join(f"{key}={entry:g}" for key, entry in value.items())
+            value = ", ".join(
+                f"{key}={entry if isinstance(entry, bool) else f'{entry:g}'}" for key, entry in value.items()
+            )
         table.add_row(f"  {row['name']}", escape(str(value)), escape(" ".join(row["about"].split())))
     return table
 
