@@ -34,7 +34,9 @@ def test_there_is_one_for_each_preset_that_is_known_to_reach_furthest() -> None:
 
 @pytest.mark.parametrize("name", ["nothing", "", "../ring-best", "ring-best.unjam"])
 def test_another_name_lists_those_that_there_are(name: str) -> None:
-    with pytest.raises(InputError, match="allowed: unjam:figure-eight-best, unjam:merge-best, "):
+    with pytest.raises(
+        InputError, match="allowed: unjam:figure-eight-best, unjam:figure-eight-tuned, unjam:merge-best, "
+    ):
         make_driver(f"{SHIPPED}{name}", 0.1)
 
 
