@@ -46,26 +46,41 @@ class Files(NamedTuple):
     """What SUMO reads of an episode."""
 
     options: tuple[str, ...]
-    """that name the network, and what else is of the road"""
+    """that say how to simulate"""
+    named: dict[str, tuple[Path, ...]]
+    """the network, and what else is there already, by the option that names it"""
     traffic: str
     """XML of vehicle types, and of routes and vehicles where they are not the user's"""
     option: str
     """by which SUMO takes the traffic"""
-    beside: tuple[Path, ...] = ()
-    """files that the same option must name too"""
+    to_copy: frozenset[Path] = frozenset()
+    """files that SUMO must not read themselves, but in a harmless copy"""
 
 
 def files_of(scenario: Scenario, road: Road) -> Files:
     """Return what SUMO reads of a road: one that is built for the episode, or the user's own network."""
-    if isinstance(road, OwnRoad):  # its own files say all that is not named here
-        options = ("--configuration-file", str(road.files.path), "--verbose", "false")
-        traffic = _own_types_xml(scenario, road)
-        return Files(options, traffic, "--additional-files", road.files.additional_files)
+    if isinstance(road, OwnRoad):
+        return _own_files(scenario, road)
     assert isinstance(road, BuiltRoad)
     # Vehicles neither vanish from a jam nor give up waiting to enter.
     patience = ("--time-to-teleport", "-1", "--max-depart-delay", "-1")
-    options = ("--net-file", str(network_file(road.network)), *patience)
-    return Files(options, _traffic_xml(scenario, road), "--route-files")
+    network = {"--net-file": (network_file(road.network),)}
+    return Files(patience, network, _traffic_xml(scenario, road), "--route-files")
+
+
+def _own_files(scenario: Scenario, road: OwnRoad) -> Files:
+    """Return what SUMO reads of the user's own network: never its configuration itself."""
+    files = road.files
+    options = [f"--{name}={value}" for name, value in files.options.items()]
+    # Validation would fetch the schemas that the files name.
+    options += [f"--xml-validation{what}=never" for what in ("", ".net", ".routes")]
+    named = {
+        "--net-file": (files.network,),
+        "--additional-files": files.additional_files,
+        "--route-files": files.route_files,
+    }
+    traffic = _own_types_xml(scenario, road)
+    return Files(tuple(options), named, traffic, "--additional-files", files.to_copy)
 
 
 def _traffic_xml(scenario: Scenario, road: BuiltRoad) -> str:
