@@ -20,14 +20,14 @@ from unjam.learners.imagination import full_policy
 from unjam.measures.metrics import measure
 from unjam.measures.statistics import Estimate, paired_difference
 from unjam.reports.html import write_report
-from unjam.reports.results import read_progress
 from unjam.training.config import RunConfig, to_toml
 from unjam.training.evaluate import TRAINED, Progress, Rows, judge, raise_failure
 from unjam.training.executors import OnIteration, train_apart
 from unjam.training.folder import (
+    PROGRESS,
     check_possible,
     continue_folder,
-    load_checkpoint,
+    last_state,
     origin,
     save_checkpoint,
     start_folder,
@@ -159,14 +159,12 @@ class Trainer:
         self._shares = [task.weight / total for task in self.tasks]
         self._validation_best = -np.inf
         self._expert_returns = [float("nan")] * len(self.tasks)
-        checkpoint = load_checkpoint(folder / "checkpoint")
+        checkpoint = last_state(folder, {folder, *self.folders})
         if checkpoint is not None:
             state, tensors = checkpoint
             self.training.restore(state, tensors)
             self._validation_best = state["validation_best"]
             self._expert_returns = state["expert_returns"]
-            for place in {folder, *self.folders}:
-                _forget_progress_after(state["iteration"], place)
 
     def train(self) -> None:
         """Learn until the configured number of actual steps; a stop loses at most the running iteration."""
@@ -214,7 +212,7 @@ class Trainer:
         whole = rows[0]
         if self.config.tasks:
             for place, row in zip(self.folders, rows, strict=True):
-                append_line(place / "progress.jsonl", to_json(row))
+                append_line(place / PROGRESS, to_json(row))
             names = [*RETURNS, *MEANS] if validated else [*RETURNS[:-1], *MEANS]
             whole = {
                 **rows[0],
@@ -226,7 +224,7 @@ class Trainer:
                     for task, row in zip(self.tasks, rows, strict=True)
                 },
             }
-        append_line(self.folder / "progress.jsonl", to_json(whole))
+        append_line(self.folder / PROGRESS, to_json(whole))
         counters, tensors = self.training.state()
         state = {
             **counters,
@@ -286,9 +284,3 @@ class Trainer:
         for place, task, driver in zip(self.folders, self.tasks, self.drivers(network), strict=True):
             about = {**origin(task.scenario, task.expert), **done}
             write_whole(place / "controller.unjam", controller_bytes(driver, about))
-
-
-def _forget_progress_after(iteration: int, folder: Path) -> None:
-    """Remove rows of iterations that the checkpoint does not know: they will be made again."""
-    kept = [to_json(row) + "\n" for row in read_progress(folder) if row["iteration"] <= iteration]
-    write_whole(folder / "progress.jsonl", "".join(kept))
