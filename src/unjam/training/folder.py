@@ -20,6 +20,7 @@ from unjam.drivers.observation import feature, observation_size
 from unjam.errors import InputError
 from unjam.files import is_leftover, make_folder, to_json, write_folder, write_whole
 from unjam.manifest import manifest, package_versions
+from unjam.processes import LOCK
 from unjam.reports.results import read_progress
 from unjam.scenarios import scenario_recipe
 from unjam.scenarios.scenario import Scenario
@@ -58,7 +59,9 @@ def make_new_folder(folder: Path, otherwise: str = "") -> None:
 
     What somebody left who was killed before anything was written is nothing.
     """
-    if folder.exists() and not (folder.is_dir() and all(map(is_leftover, folder.iterdir()))):
+    if folder.exists() and not (
+        folder.is_dir() and all(is_leftover(path) or path.name == LOCK for path in folder.iterdir())
+    ):
         raise InputError(f"out: {str(folder)!r} is not empty; allowed: a new folder{otherwise}")
     make_folder(folder)
 

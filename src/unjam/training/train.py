@@ -19,6 +19,7 @@ from unjam.learners.algorithm_1 import Collected, Iteration, Validated, algorith
 from unjam.learners.imagination import full_policy
 from unjam.measures.metrics import measure
 from unjam.measures.statistics import Estimate, paired_difference
+from unjam.processes import owned
 from unjam.reports.html import write_report
 from unjam.training.config import RunConfig, to_toml
 from unjam.training.evaluate import TRAINED, Progress, Rows, judge, raise_failure
@@ -28,7 +29,9 @@ from unjam.training.folder import (
     check_possible,
     continue_folder,
     last_state,
+    make_new_folder,
     origin,
+    read_config,
     save_checkpoint,
     start_folder,
 )
@@ -91,7 +94,8 @@ def train(
         progress: called with how far the final evaluation is: ((driver, episode), decisions).
 
     Raises:
-        InputError: the folder holds something else, or the driver or reward are at fault.
+        InputError: the folder holds something else, another process trains into it, or the driver or reward
+            are at fault.
         DiskError: the disk is full; the last checkpoint is whole.
     """
     folder = Path(folder)
@@ -113,6 +117,22 @@ def train_here(
 ) -> dict[str, Rows]:
     """Train in this process, as `train` does; return the rows of the judgement, by road and driver."""
     check_possible(config)  # what is wrong is said before anything is written
+    if resume:
+        read_config(folder)
+    else:
+        make_new_folder(folder, f", or --resume {folder}")
+    with owned(folder):
+        return _train_owned(config, folder, resume, on_iteration, progress)
+
+
+def _train_owned(
+    config: RunConfig,
+    folder: Path,
+    resume: bool,
+    on_iteration: OnIteration | None,
+    progress: Progress | None,
+) -> dict[str, Rows]:
+    """Train into a folder that no other process writes."""
     if resume:
         continue_folder(folder, config)
     else:
