@@ -4,6 +4,8 @@ import errno
 import json
 import math
 import os
+import shutil
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -24,16 +26,58 @@ def write_whole(path: Path, content: bytes | str) -> None:
             file.flush()
             os.fsync(file.fileno())
         os.replace(temporary, path)
+        sync_folder(path.parent)
     except OSError as error:
         temporary.unlink(missing_ok=True)
         raise _disk(error, path) from None
 
 
+def write_folder(folder: Path, files: dict[str, bytes | str]) -> None:
+    """Write a folder of files whole or not at all: it appears by one change of its name, files and all.
+
+    What has its name already is removed before.
+
+    Raises:
+        DiskError: the disk is full or cannot be written.
+    """
+    temporary = folder.with_name(f".{folder.name}.part")
+    try:
+        for old in (temporary, folder):
+            if old.exists():
+                shutil.rmtree(old)
+        temporary.mkdir(parents=True)
+        for name, content in files.items():
+            write_whole(temporary / name, content)
+        os.replace(temporary, folder)
+        sync_folder(folder.parent)
+    except (OSError, DiskError) as error:
+        shutil.rmtree(temporary, ignore_errors=True)
+        raise (_disk(error, folder) if isinstance(error, OSError) else error) from None
+
+
+def is_leftover(path: Path) -> bool:
+    """Return whether a file is what a process left behind that was killed while it wrote."""
+    return path.name.startswith(".") and path.name.endswith(".part")
+
+
+def sync_folder(folder: Path) -> None:
+    """Let the disk keep the names of a folder's files too; on Windows that is the system's business."""
+    if sys.platform == "win32":
+        return
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
 def append_line(path: Path, line: str) -> None:
-    """Append a line to a file; raise `DiskError` where the disk is full."""
+    """Append a line to a file, and to the disk; raise `DiskError` where it is full."""
     try:
         with open(path, "a", encoding="utf-8") as file:
             file.write(line + "\n")
+            file.flush()
+            os.fsync(file.fileno())
     except OSError as error:
         raise _disk(error, path) from None
 

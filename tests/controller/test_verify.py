@@ -10,13 +10,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.conftest import random_network
 from tests.controller.test_file import ABOUT, residual, written
 from tests.controller.test_sample import perceived
 from unjam.controller import controller_bytes, load_controller
 from unjam.controller.file import GRAPH, MANIFEST, SAMPLE, hash_of, pack_parts, unpack_parts
 from unjam.controller.sample import sample_bytes
 from unjam.controller.verify import verify_controller
-from unjam.drivers import Constant, Driver, PISaturation
+from unjam.drivers import Constant, Driver, PISaturation, ResidualDriver
+from unjam.drivers.from_file import FileDriver
 from unjam.errors import InputError
 
 HELD = residual(PISaturation(), hold=3)
@@ -53,6 +55,32 @@ def test_a_whole_controller_is_verified(tmp_path: Path) -> None:
     path = written(tmp_path, content_of())
     assert names(path) == ["parts", "driver", "weights", "manifest", "sample"]
     assert "40 decisions, its driver within 0.0e+00 m/s2" in verify_controller(path)[-1].found
+
+
+def test_code_of_a_folder_runs_only_where_it_is_trusted(tmp_path: Path) -> None:
+    code, ran = tmp_path / "code.py", tmp_path / "ran"
+    code.write_text("def gentle(state):\n    return 0.1 * (state.leader_speed - state.speed)\n")
+    held = residual(FileDriver(code, "gentle"))
+    code.write_text(f"open({str(ran)!r}, 'w').close()\n" + code.read_text())
+    (tmp_path / "controller.unjam").write_bytes(controller_bytes(held, ABOUT))
+    for path in (tmp_path, tmp_path / "controller.unjam"):
+        assert "its expert is Python code (code.py), which " in refused(path)
+    assert refused(tmp_path).endswith("which runs only with --trust-code")
+    assert not ran.exists()
+    assert [each.name for each in verify_controller(tmp_path, trust_code=True)][-1] == "manifest"
+    assert ran.exists()
+
+
+def test_a_feature_of_a_folder_is_code_too(tmp_path: Path) -> None:
+    code, ran = tmp_path / "eyes.py", tmp_path / "ran"
+    code.write_text("def seen(state):\n    return state.speed\n")
+    network = random_network(inputs=1)
+    held = ResidualDriver(PISaturation(), network, 1.0, (f"{code}:seen",))
+    code.write_text(f"open({str(ran)!r}, 'w').close()\n" + code.read_text())
+    (tmp_path / "controller.unjam").write_bytes(controller_bytes(held, ABOUT))
+    ran.unlink(missing_ok=True)
+    assert refused(tmp_path).endswith("Python code (eyes.py), which runs only with --trust-code")
+    assert not ran.exists()
 
 
 def test_a_controller_of_a_run_has_no_sample_and_is_verified(tmp_path: Path) -> None:

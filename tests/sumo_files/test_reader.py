@@ -11,6 +11,7 @@ import pytest
 from tests.sumo_files.test_sumo_files import NETWORK, ROUTES, configuration
 from unjam import sumo_files
 from unjam.errors import InputError
+from unjam.sumo_files import program as reader
 from unjam.sumo_files import read_lanes, read_sumo_files
 
 LAUGHS = "".join(f'<!ENTITY l{n} "{f"&l{n - 1};" * 10 if n else "lol"}">' for n in range(10))
@@ -48,9 +49,9 @@ def test_what_unpacks_to_too_much_is_refused_and_takes_no_memory_here(
     monkeypatch.setattr(sumo_files, "LARGEST_MEMORY", 150 * 2**20)
     path = configuration(tmp_path)
     line = b"a" * 1000 + b"\n"
-    bomb = b'<net version="1.20">' + line * 200_000 + b"</net>"
-    (tmp_path / "road.net.xml.gz").write_bytes(gzip.compress(bomb, 1))
-    path.write_text(path.read_text().replace("road.net.xml", "road.net.xml.gz"))
+    bomb = b"<routes>" + line * 200_000 + b"</routes>"
+    (tmp_path / "road.rou.xml.gz").write_bytes(gzip.compress(bomb, 1))
+    path.write_text(path.read_text().replace("road.rou.xml", "road.rou.xml.gz"))
     assert refused(path) == "road.sumocfg: its files are too large to be read"
 
 
@@ -62,14 +63,14 @@ def test_what_takes_too_long_is_refused(tmp_path: Path, monkeypatch: pytest.Monk
 
 def test_a_reader_that_is_lost_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = configuration(tmp_path)
-    monkeypatch.setattr(sumo_files, "__file__", str(tmp_path / "none.py"))
+    monkeypatch.setattr(sumo_files, "PROGRAM", tmp_path / "none.py")
     assert "cannot be read within" in refused(path)
 
 
 def test_it_needs_pythons_own_library_alone(tmp_path: Path) -> None:
-    program = [sys.executable, "-I", "-S", sumo_files.__file__, "configuration"]
+    program = [sys.executable, "-I", "-S", str(sumo_files.PROGRAM), "configuration"]
     ran = subprocess.run(
-        [*program, str(configuration(tmp_path)), str(2**30), "60"], capture_output=True, check=True
+        [*program, str(2**30), "60", str(configuration(tmp_path))], capture_output=True, check=True
     )
     assert json.loads(ran.stdout)["found"]["used_types"] == ["car"]
 
@@ -94,7 +95,7 @@ def test_in_this_process_it_answers_the_same(
 ) -> None:
     monkeypatch.setitem(sys.modules, "resource", None)  # where there are no limits
     path = configuration(tmp_path, routes=ROUTES)
-    sumo_files.main("configuration", str(path), "0", "0")
+    reader.main("configuration", "0", "0", str(path))
     assert json.loads(capsys.readouterr().out)["found"]["network"] == str(tmp_path / "road.net.xml")
-    sumo_files.main("lanes", str(tmp_path / "none"), "0", "0")
+    reader.main("lanes", "0", "0", str(tmp_path / "none"))
     assert "cannot be read" in json.loads(capsys.readouterr().out)["broken"]

@@ -16,6 +16,7 @@ from unjam.cli.parts import drivers, fit_drivers, scenarios
 from unjam.cli.results import certify, evaluate, export, model, report, verify
 from unjam.cli.train import reproduce, search, train, tune
 from unjam.errors import DISK_ERRNOS, UnjamError, disk_error
+from unjam.processes import end_with_parent
 
 INTERRUPTED, TERMINATED = 130, 143
 
@@ -62,6 +63,7 @@ def _terminate(signum: int, frame: FrameType | None) -> None:
 def main() -> None:
     """Run the command line; every error that a user can mend is one line and an exit code."""
     signal.signal(signal.SIGTERM, _terminate)
+    end_with_parent(signal.SIGTERM)
     sys.exit(_run())
 
 

@@ -92,8 +92,11 @@ def load_controller(path: Path | str) -> Driver:
     return read_controller(path).driver
 
 
-def read_controller(path: Path | str) -> Controller:
-    """Return what a `.unjam` file holds, checked; raise `InputError` as `load_controller`."""
+def read_controller(path: Path | str, trust_code: bool = True) -> Controller:
+    """Return what a `.unjam` file holds, checked; raise `InputError` as `load_controller`.
+
+    Python code that it names runs only where the file lies in a run folder, and `trust_code` says so.
+    """
     path = Path(path)
     file = path / f"controller{SUFFIX}" if path.is_dir() else path
     if not file.is_file():
@@ -104,7 +107,7 @@ def read_controller(path: Path | str) -> Controller:
         if manifest["format"] not in READABLE:
             raise InputError(f"controller {file.name}: format {manifest['format']!r} is unknown")
         _check_hashes(file.name, manifest["sha256"], parts)
-        _check_code(file.name, manifest["driver"], own=path.is_dir())
+        _check_code(file.name, manifest["driver"], path.is_dir(), trust_code)
         arrays = load(parts[WEIGHTS])
         driver = driver_from_recipe(manifest["driver"], arrays)
         unknown = arrays.keys() - recipe_of(driver)[1].keys()
@@ -129,18 +132,17 @@ def _check_hashes(name: str, hashes: dict[str, str], parts: dict[str, bytes]) ->
             raise InputError(f"controller {name}: damaged: {part} does not have the hash that it names")
 
 
-def _check_code(name: str, recipe: Any, own: bool) -> None:
+def _check_code(name: str, recipe: Any, in_folder: bool, trusted: bool) -> None:
     """Raise `InputError` where a driver is Python code that a stranger may have named, or that has changed.
 
-    What lies in a run folder is the user's `own`; a file by itself may come from anywhere.
+    A file by itself may come from anywhere; so may a folder, unless it is `trusted`.
     """
     for found in code_of(recipe):
         code = Path(found["path"])
-        if not own:
-            raise InputError(
-                f"controller {name}: its expert is Python code ({code.name}), which a file by itself may not "
-                f"run; use the run folder"
-            )
+        if not (in_folder and trusted):
+            alone = "a file by itself may not run; use the run folder"
+            why = "runs only with --trust-code" if in_folder else alone
+            raise InputError(f"controller {name}: its expert is Python code ({code.name}), which {why}")
         if code.is_file() and hash_of(code.read_bytes()) != found["sha256"]:
             raise InputError(f"controller {name}: its expert {str(code)!r} has changed since")
 

@@ -1,6 +1,8 @@
 """The user's own road: any SUMO network with its traffic, some of whose vehicles become CAVs."""
 
+import logging
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
@@ -18,6 +20,9 @@ LONGEST = 3600.0
 """seconds of an episode where the configuration names no end"""
 CARS = ("passenger", "private", "hov", "taxi", "evehicle", "delivery", "truck", "trailer", "bus", "coach")
 """SUMO's vehicle classes that a share picks from"""
+MOST_NAMED = 8
+"""things of the files that are not used, in the line that tells of them"""
+LOG = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -111,12 +116,22 @@ def own_network(file: str, changes: dict[str, Any]) -> OwnNetwork:
         InputError: one line on what is missing or broken, before SUMO starts.
     """
     files = read_sumo_files(Path(file).resolve())
+    if files.dropped:
+        _tell_dropped(files.path.name, files.dropped)
     values = {"file": str(files.path), "simulation_step": files.step, **changes}
     made = build(OwnNetwork, values, Path(file).name)
     if "horizon" in changes:
         return made
     seconds = LONGEST if files.end is None else files.end - files.begin
     return replace(made, horizon=max(1, int(seconds / made.decision_step + 1e-9)))
+
+
+@cache
+def _tell_dropped(file: str, dropped: tuple[str, ...]) -> None:
+    """Tell once, in one line, what of the files SUMO is not given."""
+    names = ", ".join(name[:60] for name in dropped[:MOST_NAMED])
+    more = f" and {len(dropped) - MOST_NAMED} more" if len(dropped) > MOST_NAMED else ""
+    LOG.warning("%s: left out, so that SUMO only simulates: %s%s", file, names, more)
 
 
 def is_car(attributes: dict[str, str]) -> bool:

@@ -7,6 +7,7 @@ unjam.training.executors`, reads one line of JSON and answers lines: a list of a
 import json
 import os
 import shlex
+import signal
 import subprocess
 import sys
 import threading
@@ -21,6 +22,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 from unjam.errors import MissingPartError, UnjamError
 from unjam.files import make_folder, write_whole
 from unjam.parameters import build
+from unjam.processes import bound, end_with_parent
 
 if TYPE_CHECKING:  # the command line asks which executors there are: it is to be quick
     from unjam.training.config import RunConfig
@@ -97,7 +99,10 @@ class Processes:
         with open(command.log, "ab") as log:
             log.write(f"$ {shlex.join(line)}\n".encode())
             log.flush()
-            with subprocess.Popen(line, stdin=subprocess.DEVNULL, stdout=log, stderr=log) as process:
+            environment = bound(os.environ)
+            with subprocess.Popen(
+                line, stdin=subprocess.DEVNULL, stdout=log, stderr=log, env=environment
+            ) as process:
                 with self._lock:
                     self._running.add(process)
                 code = process.wait()
@@ -193,7 +198,9 @@ def train_apart(
         UnjamError: of the same kind as in this process.
     """
     command = [sys.executable, "-m", "unjam.training.executors"]
-    child = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, encoding="utf-8")
+    child = subprocess.Popen(
+        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, encoding="utf-8", env=bound(os.environ)
+    )
     try:
         assert child.stdin is not None
         assert child.stdout is not None
@@ -223,6 +230,7 @@ def error_named(kind: str, words: str) -> UnjamError:
 
 def main() -> None:
     """Train as the line on standard input says."""
+    end_with_parent(signal.SIGTERM)
     answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)  # SUMO and user code may print: not into the answers
     values, folder, resume, path = json.loads(sys.stdin.read())

@@ -7,6 +7,7 @@ are made at the end of iterations: written whole, checked by hash, two generatio
 import hashlib
 import json
 import shutil
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,8 +18,10 @@ from unjam.controller import make_driver
 from unjam.drivers.driver import Driver
 from unjam.drivers.observation import feature, observation_size
 from unjam.errors import InputError
-from unjam.files import make_folder, to_json, write_whole
+from unjam.files import is_leftover, make_folder, to_json, write_folder, write_whole
 from unjam.manifest import manifest, package_versions
+from unjam.processes import LOCK
+from unjam.reports.results import read_progress
 from unjam.scenarios import scenario_recipe
 from unjam.scenarios.scenario import Scenario
 from unjam.training.config import RunConfig, load_config, to_toml
@@ -30,6 +33,7 @@ if TYPE_CHECKING:
 FORMAT = 4
 """of what a checkpoint holds; one of another unjam is refused"""
 GENERATIONS = 2
+MANIFEST, PROGRESS = "manifest.json", "progress.jsonl"
 STATE, TENSORS = "state.json", "tensors.safetensors"
 
 
@@ -51,8 +55,13 @@ def check_possible(config: RunConfig) -> None:
 
 
 def make_new_folder(folder: Path, otherwise: str = "") -> None:
-    """Make a folder; raise `InputError` where it holds something already, `otherwise` is allowed too."""
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+    """Make a folder; raise `InputError` where it holds something already, `otherwise` is allowed too.
+
+    What somebody left who was killed before anything was written is nothing.
+    """
+    if folder.exists() and not (
+        folder.is_dir() and all(is_leftover(path) or path.name == LOCK for path in folder.iterdir())
+    ):
         raise InputError(f"out: {str(folder)!r} is not empty; allowed: a new folder{otherwise}")
     make_folder(folder)
 
@@ -65,7 +74,7 @@ def start_folder(folder: Path, config: RunConfig) -> None:
     """
     make_new_folder(folder, f", or --resume {folder}")
     write_whole(folder / "config.toml", to_toml(config))
-    write_whole(folder / "manifest.json", to_json(manifest(), indent=1))
+    write_whole(folder / MANIFEST, to_json(manifest(), indent=1))
 
 
 def read_config(folder: Path) -> RunConfig:
@@ -90,6 +99,8 @@ def continue_folder(folder: Path, config: RunConfig) -> None:
         raise InputError("resume: only steps and workers may change; all else is the run's")
     if config != before:
         write_whole(folder / "config.toml", to_toml(config))
+    if not (folder / MANIFEST).is_file():  # it was stopped before it had written that
+        write_whole(folder / MANIFEST, to_json(manifest(), indent=1))
 
 
 def origin(scenario: Scenario, expert: Driver) -> dict[str, Any]:
@@ -106,18 +117,32 @@ def origin(scenario: Scenario, expert: Driver) -> dict[str, Any]:
 def save_checkpoint(folder: Path, state: dict[str, Any], tensors: "Tensors") -> None:
     """Write the checkpoint of an iteration under `folder`, and remove all but the newest two.
 
-    `state["iteration"]` names it. The state is written last and holds the hash of both: a
-    checkpoint without it does not count.
+    `state["iteration"]` names it. It appears whole or not at all; the state holds the hash of both parts.
     """
     from safetensors.torch import save
 
-    place = folder / f"{state['iteration']:06d}"
-    make_folder(place)
     state, data = {**state, "format": FORMAT}, save(tensors)
-    write_whole(place / TENSORS, data)
-    write_whole(place / STATE, json.dumps({**state, "sha256": _hash(state, data)}, indent=1))
-    for old in _places(folder)[:-GENERATIONS]:
-        shutil.rmtree(old, ignore_errors=True)
+    said = json.dumps({**state, "sha256": _hash(state, data)}, indent=1)
+    write_folder(folder / f"{state['iteration']:06d}", {TENSORS: data, STATE: said})
+    _sweep(folder)
+
+
+def last_state(folder: Path, places: Iterable[Path]) -> "tuple[dict[str, Any], Tensors] | None":
+    """Return the newest checkpoint of a run; None where it begins, or begins anew.
+
+    What the checkpoint does not know is removed: rows of progress in any of `places`, which will be made
+    again, and files that were not written to their end.
+    """
+    found = load_checkpoint(folder / "checkpoint")
+    _sweep(folder / "checkpoint")
+    for left in [path for place in places for path in place.glob(".*") if is_leftover(path)]:
+        left.unlink()
+    done = found[0]["iteration"] if found else 0
+    for place in places:
+        if (place / PROGRESS).is_file():
+            kept = [to_json(row) + "\n" for row in read_progress(place) if row["iteration"] <= done]
+            write_whole(place / PROGRESS, "".join(kept))
+    return found
 
 
 def load_checkpoint(folder: Path) -> "tuple[dict[str, Any], Tensors] | None":
@@ -146,6 +171,12 @@ def load_checkpoint(folder: Path) -> "tuple[dict[str, Any], Tensors] | None":
     if places:
         raise InputError(f"checkpoint: all {len(places)} under {folder} are damaged")
     return None
+
+
+def _sweep(folder: Path) -> None:
+    """Remove all but the newest two checkpoints, and those that were not written to their end."""
+    for old in [*_places(folder)[:-GENERATIONS], *filter(is_leftover, folder.glob(".*"))]:
+        shutil.rmtree(old, ignore_errors=True)
 
 
 def _hash(state: dict[str, Any], data: bytes) -> str:

@@ -19,16 +19,19 @@ from unjam.learners.algorithm_1 import Collected, Iteration, Validated, algorith
 from unjam.learners.imagination import full_policy
 from unjam.measures.metrics import measure
 from unjam.measures.statistics import Estimate, paired_difference
+from unjam.processes import owned
 from unjam.reports.html import write_report
-from unjam.reports.results import read_progress
 from unjam.training.config import RunConfig, to_toml
 from unjam.training.evaluate import TRAINED, Progress, Rows, judge, raise_failure
 from unjam.training.executors import OnIteration, train_apart
 from unjam.training.folder import (
+    PROGRESS,
     check_possible,
     continue_folder,
-    load_checkpoint,
+    last_state,
+    make_new_folder,
     origin,
+    read_config,
     save_checkpoint,
     start_folder,
 )
@@ -91,7 +94,8 @@ def train(
         progress: called with how far the final evaluation is: ((driver, episode), decisions).
 
     Raises:
-        InputError: the folder holds something else, or the driver or reward are at fault.
+        InputError: the folder holds something else, another process trains into it, or the driver or reward
+            are at fault.
         DiskError: the disk is full; the last checkpoint is whole.
     """
     folder = Path(folder)
@@ -113,6 +117,22 @@ def train_here(
 ) -> dict[str, Rows]:
     """Train in this process, as `train` does; return the rows of the judgement, by road and driver."""
     check_possible(config)  # what is wrong is said before anything is written
+    if resume:
+        read_config(folder)
+    else:
+        make_new_folder(folder, f", or --resume {folder}")
+    with owned(folder):
+        return _train_owned(config, folder, resume, on_iteration, progress)
+
+
+def _train_owned(
+    config: RunConfig,
+    folder: Path,
+    resume: bool,
+    on_iteration: OnIteration | None,
+    progress: Progress | None,
+) -> dict[str, Rows]:
+    """Train into a folder that no other process writes."""
     if resume:
         continue_folder(folder, config)
     else:
@@ -159,14 +179,12 @@ class Trainer:
         self._shares = [task.weight / total for task in self.tasks]
         self._validation_best = -np.inf
         self._expert_returns = [float("nan")] * len(self.tasks)
-        checkpoint = load_checkpoint(folder / "checkpoint")
+        checkpoint = last_state(folder, {folder, *self.folders})
         if checkpoint is not None:
             state, tensors = checkpoint
             self.training.restore(state, tensors)
             self._validation_best = state["validation_best"]
             self._expert_returns = state["expert_returns"]
-            for place in {folder, *self.folders}:
-                _forget_progress_after(state["iteration"], place)
 
     def train(self) -> None:
         """Learn until the configured number of actual steps; a stop loses at most the running iteration."""
@@ -214,7 +232,7 @@ class Trainer:
         whole = rows[0]
         if self.config.tasks:
             for place, row in zip(self.folders, rows, strict=True):
-                append_line(place / "progress.jsonl", to_json(row))
+                append_line(place / PROGRESS, to_json(row))
             names = [*RETURNS, *MEANS] if validated else [*RETURNS[:-1], *MEANS]
             whole = {
                 **rows[0],
@@ -226,7 +244,7 @@ class Trainer:
                     for task, row in zip(self.tasks, rows, strict=True)
                 },
             }
-        append_line(self.folder / "progress.jsonl", to_json(whole))
+        append_line(self.folder / PROGRESS, to_json(whole))
         counters, tensors = self.training.state()
         state = {
             **counters,
@@ -286,9 +304,3 @@ class Trainer:
         for place, task, driver in zip(self.folders, self.tasks, self.drivers(network), strict=True):
             about = {**origin(task.scenario, task.expert), **done}
             write_whole(place / "controller.unjam", controller_bytes(driver, about))
-
-
-def _forget_progress_after(iteration: int, folder: Path) -> None:
-    """Remove rows of iterations that the checkpoint does not know: they will be made again."""
-    kept = [to_json(row) + "\n" for row in read_progress(folder) if row["iteration"] <= iteration]
-    write_whole(folder / "progress.jsonl", "".join(kept))

@@ -8,6 +8,7 @@ Started by `unjam.worlds.workers` as `python -m unjam.worlds.worker`.
 import gc
 import json
 import os
+import signal
 import struct
 import sys
 import time
@@ -19,6 +20,7 @@ from safetensors.numpy import load, save
 
 from unjam.drivers.registry import driver_from_recipe
 from unjam.errors import DISK_ERRNOS, UnjamError, disk_error
+from unjam.processes import end_with_parent
 from unjam.scenarios import scenario_from_recipe
 from unjam.scenarios.own_network import OwnNetwork
 from unjam.tree import Arrays, pack
@@ -63,6 +65,7 @@ def _read_exactly(pipe: IO[bytes], length: int) -> bytes:
 
 def main() -> None:
     """Answer requests from standard input until it is closed."""
+    end_with_parent(signal.SIGKILL)
     answers = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # SUMO and user code may print: not into the answers
     gc.freeze()  # what the imports made stays; searching it for garbage would cost every episode

@@ -14,6 +14,7 @@ from typing import Any, Self, TypeVar
 from unjam.drivers.driver import Driver
 from unjam.drivers.registry import recipe_of
 from unjam.errors import EpisodeError
+from unjam.processes import bound
 from unjam.scenarios import scenario_recipe
 from unjam.scenarios.scenario import Scenario
 from unjam.tree import Arrays, unpack
@@ -144,7 +145,7 @@ class _Worker:
     def _start(self) -> subprocess.Popen[bytes]:
         # A BLAS with threads of its own would fight with the other workers for the cores.
         single = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
-        environment = {**os.environ, **single, "TMPDIR": self._temporary}
+        environment = bound({**os.environ, **single, "TMPDIR": self._temporary})
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115  (lives as long as the process)
         process = subprocess.Popen(
             [sys.executable, "-m", "unjam.worlds.worker"],

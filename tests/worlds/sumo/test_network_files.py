@@ -3,7 +3,7 @@ import os
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -17,6 +17,7 @@ import pytest
 from unjam.errors import DiskError, EpisodeError, MissingPartError
 from unjam.scenarios import Ring
 from unjam.scenarios.road import RoadNetwork
+from unjam.worlds.sumo import cache as cache_module
 from unjam.worlds.sumo import files
 from unjam.worlds.sumo.files import cache_folder, network_file, sumo_program
 
@@ -210,3 +211,59 @@ def test_a_disk_that_takes_nothing_is_a_disk_error_and_leaves_nothing_behind(
     with pytest.raises(DiskError, match=f"cannot write .*networks: {os.strerror(problem)}"):
         network_file(road_of(230))
     assert files_in(cache) == {cache / "networks"}
+
+
+def cut(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[:700])
+
+
+def edit(path: Path) -> None:
+    path.write_text(path.read_text().replace('speed="30.00"', 'speed="3.00"').replace("57.5", "58.5"))
+
+
+def empty(path: Path) -> None:
+    path.write_bytes(b"")
+
+
+def unsealed(path: Path) -> None:
+    path.write_text(path.read_text().rpartition("<!--")[0])
+
+
+@pytest.mark.parametrize("damage", [cut, edit, empty, unsealed])
+def test_a_network_that_is_no_longer_as_it_was_made_is_made_anew(
+    damage: Callable[[Path], None], cache: Path
+) -> None:
+    made = network_file(road_of(230))
+    whole = edges_of(made)
+    damage(made)
+    assert network_file(road_of(230)) == made
+    assert edges_of(made) == whole
+    assert files_in(cache) == {made}
+
+
+def test_another_process_notices_too(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made = network_file(road_of(230))
+    whole, stamp = made.read_bytes(), made.stat()
+    made.write_bytes(whole.replace(b"57.5", b"58.5"))
+    os.utime(made, ns=(stamp.st_atime_ns, stamp.st_mtime_ns))
+    monkeypatch.setattr(cache_module, "_whole", {})
+    assert edges_of(network_file(road_of(230))) == {f"edge_{index}": 57.5 for index in range(4)}
+
+
+def test_a_network_that_a_full_disk_cut_short_is_not_kept(
+    cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = subprocess.run
+
+    def run_on_full_disk(command: list[str], **options: Any) -> Any:
+        done = run(command, **options)
+        (written,) = [word for word in command if word.startswith("--output-file=")]
+        cut(Path(written.partition("=")[2]))
+        return done
+
+    with monkeypatch.context() as patch:
+        patch.setattr(subprocess, "run", run_on_full_disk)
+        with pytest.raises(DiskError, match=r"cannot write .*networks: No space left on device"):
+            network_file(road_of(230))
+    assert files_in(cache) == {cache / "networks"}
+    assert len(edges_of(network_file(road_of(230)))) == 4

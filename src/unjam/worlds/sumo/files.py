@@ -1,5 +1,6 @@
 """What SUMO reads of an episode: the network, made once for each content, who drives how, and who enters."""
 
+import errno
 import hashlib
 import os
 import shutil
@@ -14,7 +15,6 @@ from typing import Any, NamedTuple
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
-import platformdirs
 
 from unjam.errors import DISK_ERRNOS, EpisodeError, MissingPartError, disk_error
 from unjam.physics.idm import IDMParameters
@@ -22,6 +22,7 @@ from unjam.scenarios.road import BuiltRoad, Edge, Node, OwnRoad, Road, RoadNetwo
 from unjam.scenarios.scenario import VEHICLE_LENGTH, Scenario
 from unjam.sumo_files import read_lanes
 from unjam.worlds.record import Floats
+from unjam.worlds.sumo.cache import cache_folder, is_as_made, seal
 
 Attributes = dict[str, Any]
 """of an XML element"""
@@ -46,26 +47,41 @@ class Files(NamedTuple):
     """What SUMO reads of an episode."""
 
     options: tuple[str, ...]
-    """that name the network, and what else is of the road"""
+    """that say how to simulate"""
+    named: dict[str, tuple[Path, ...]]
+    """the network, and what else is there already, by the option that names it"""
     traffic: str
     """XML of vehicle types, and of routes and vehicles where they are not the user's"""
     option: str
     """by which SUMO takes the traffic"""
-    beside: tuple[Path, ...] = ()
-    """files that the same option must name too"""
+    to_copy: frozenset[Path] = frozenset()
+    """files that SUMO must not read themselves, but in a harmless copy"""
 
 
 def files_of(scenario: Scenario, road: Road) -> Files:
     """Return what SUMO reads of a road: one that is built for the episode, or the user's own network."""
-    if isinstance(road, OwnRoad):  # its own files say all that is not named here
-        options = ("--configuration-file", str(road.files.path), "--verbose", "false")
-        traffic = _own_types_xml(scenario, road)
-        return Files(options, traffic, "--additional-files", road.files.additional_files)
+    if isinstance(road, OwnRoad):
+        return _own_files(scenario, road)
     assert isinstance(road, BuiltRoad)
     # Vehicles neither vanish from a jam nor give up waiting to enter.
     patience = ("--time-to-teleport", "-1", "--max-depart-delay", "-1")
-    options = ("--net-file", str(network_file(road.network)), *patience)
-    return Files(options, _traffic_xml(scenario, road), "--route-files")
+    network = {"--net-file": (network_file(road.network),)}
+    return Files(patience, network, _traffic_xml(scenario, road), "--route-files")
+
+
+def _own_files(scenario: Scenario, road: OwnRoad) -> Files:
+    """Return what SUMO reads of the user's own network: never its configuration itself."""
+    files = road.files
+    options = [f"--{name}={value}" for name, value in files.options.items()]
+    # Validation would fetch the schemas that the files name.
+    options += [f"--xml-validation{what}=never" for what in ("", ".net", ".routes")]
+    named = {
+        "--net-file": (files.network,),
+        "--additional-files": files.additional_files,
+        "--route-files": files.route_files,
+    }
+    traffic = _own_types_xml(scenario, road)
+    return Files(tuple(options), named, traffic, "--additional-files", files.to_copy)
 
 
 def _traffic_xml(scenario: Scenario, road: BuiltRoad) -> str:
@@ -168,12 +184,6 @@ def _obedient_layer(scenario: Scenario) -> Attributes:
     }
 
 
-def cache_folder() -> Path:
-    """Return where networks are kept: `$UNJAM_CACHE`, or the user's cache folder."""
-    chosen = os.environ.get("UNJAM_CACHE")
-    return Path(chosen) if chosen else Path(platformdirs.user_cache_dir("unjam"))
-
-
 @cache
 def sumo_program(name: str) -> str:
     """Return the path of one of SUMO's programs: the installed package's, else the one on the PATH.
@@ -208,7 +218,7 @@ def sumo_words(lines: Iterable[str]) -> str:
 
 
 def network_file(network: RoadNetwork) -> Path:
-    """Return SUMO's network file, made with netconvert if this content was never made before.
+    """Return SUMO's network file, made with netconvert if this content was never made before, or is damaged.
 
     Raises:
         MissingPartError: netconvert is missing.
@@ -226,12 +236,16 @@ def network_file(network: RoadNetwork) -> Path:
     content = "\n".join([sumo_version(), *options, *files.values()])
     name = hashlib.sha256(content.encode()).hexdigest()[:24]
     target = cache_folder() / "networks" / f"{name}.net.xml"
-    if target.exists():
+    if is_as_made(target):
         return target
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=target.parent) as folder:
             made = _netconvert(files, options, Path(folder))
+            with made.open("ab") as file:
+                file.write(seal(made.read_bytes()))
+                file.flush()
+                os.fsync(file.fileno())
             os.replace(made, target)  # whole or not at all, also with several workers at it
     except OSError as error:
         if error.errno in DISK_ERRNOS:
@@ -290,7 +304,9 @@ def _netconvert(files: dict[tuple[str, str], str], options: list[str], folder: P
         *options,
     ]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
-    if done.returncode != 0 or not made.exists():
-        words = sumo_words((done.stderr or done.stdout).splitlines())
-        raise EpisodeError(f"netconvert cannot make the road: {words}")
-    return made
+    if done.returncode == 0 and made.exists():
+        if made.read_bytes().rstrip().endswith(b"</net>"):
+            return made
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))  # of which netconvert itself says nothing
+    words = sumo_words((done.stderr or done.stdout).splitlines())
+    raise EpisodeError(f"netconvert cannot make the road: {words}")

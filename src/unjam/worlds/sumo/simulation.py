@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from unjam.errors import EpisodeError, MissingPartError, UnjamError
 from unjam.scenarios.scenario import Actuation
+from unjam.sumo_files import copy_harmless, stamp_of
 from unjam.worlds.sumo.files import Files, sumo_program, sumo_words
 
 Backend = Literal["libsumo", "traci", "gui"]
@@ -62,6 +63,8 @@ class Simulation:
         self._sumo: Any = _import(backend)
         self._folder = tempfile.TemporaryDirectory(prefix="unjam-")
         self._error_log = Path(self._folder.name) / "error.log"
+        self._copies: dict[Path, tuple[tuple[int, int] | None, Path]] = {}
+        """of users' own files, with the stamps of those"""
         self._running = False
         if backend == "libsumo":
             self._bind()
@@ -97,8 +100,12 @@ class Simulation:
         """
         traffic = Path(self._folder.name) / "traffic.rou.xml"
         traffic.write_text(files.traffic)
-        named = ",".join(str(path) for path in (*files.beside, traffic))
-        options = [*files.options, files.option, named, *self._options(step, seed)]
+        named = {
+            option: [self._readable(path, files) for path in paths] for option, paths in files.named.items()
+        }
+        named.setdefault(files.option, []).append(str(traffic))
+        inputs = [f"{option}={','.join(paths)}" for option, paths in named.items() if paths]
+        options = [*inputs, *files.options, *self._options(step, seed)]
         try:
             if self._running:
                 self._sumo.load(options)
@@ -111,6 +118,17 @@ class Simulation:
             self._end()  # only then are SUMO's words in its log, and can the next episode start afresh
             words = self._reason() or " ".join(str(error).split())
             raise EpisodeError(f"SUMO cannot start: {words}") from error
+
+    def _readable(self, path: Path, files: Files) -> str:
+        """Return what SUMO reads instead of a file: itself, or a harmless copy of its content."""
+        if path not in files.to_copy:
+            return str(path)
+        stamp, copy = self._copies.get(path, (None, Path(self._folder.name) / f"{len(self._copies)}.xml"))
+        if stamp_of(path) != stamp:
+            self._copies[path] = None, copy
+            copy_harmless(path, copy)
+            self._copies[path] = stamp_of(path), copy
+        return str(copy)
 
     def _start(self, command: list[str]) -> None:
         if self.backend == "libsumo":

@@ -1,22 +1,20 @@
-"""What the user's own SUMO files say, read before SUMO starts: SUMO crashes on some that are broken.
+"""The program that reads users' own SUMO files: in a process of its own, with limits on memory and time.
 
-Such files may come from anywhere. So that none can harm who asks, this file is also the program that reads
-them, in a process of its own with limits on memory and time, which answers one JSON document. As a program it
-uses Python's own library alone, and starts in a twentieth of a second.
+It answers one JSON document, uses Python's own library alone, and starts in a twentieth of a second.
 """
 
 import gzip
 import json
-import subprocess
 import sys
 import zlib
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from math import isfinite, nan
 from pathlib import Path
-from typing import IO, Any, Literal, NamedTuple
+from typing import IO, Any, NamedTuple
 from xml.etree import ElementTree
 from xml.parsers import expat
+from xml.sax.saxutils import escape, quoteattr
 
 DEFAULT_TYPE = "DEFAULT_VEHTYPE"
 """SUMO's type of vehicles that name none"""
@@ -27,93 +25,32 @@ UNITS = (1.0, 60.0, 3600.0, 86400.0)
 """seconds, minutes, hours and days [s]: SUMO's times may be 1:30:00"""
 CHUNK = 65_536
 """bytes read at once"""
-SYNONYMS = {"net": "net-file", "routes": "route-files", "additional": "additional-files"}
-
-
-LARGEST_MEMORY = 4 * 2**30
-"""bytes that reading may take"""
-LONGEST_TIME = 120
-"""seconds that reading may take"""
+FILES = {
+    **dict.fromkeys(("net-file", "net", "n"), "net-file"),
+    **dict.fromkeys(("route-files", "routes", "r"), "route-files"),
+    **dict.fromkeys(("additional-files", "additional", "a"), "additional-files"),
+}
+"""options that name files which SUMO reads, also by their short names"""
+OTHER_NAMES = {"b": "begin", "e": "end", "carfollow.model": "default.carfollowmodel"}
+ONLY_WRITERS = {"edgeData", "laneData", "vTypeProbe", "timedEvent", "instantInductionLoop", "include"}
+"""elements that do nothing but write files, and the one that reads another file into this one"""
+DETECTORS = ("Detector", "inductionLoop", "routeProbe", "detector")
+"""how elements end that signals and calibrators ask too: they stay, and write to nowhere"""
+NOWHERE = "NUL"
+"""the file that SUMO never makes"""
+TO_FILES = ("file", "output", "dest", "href")
+"""attributes that name files, beside those that end in `File`"""
+IN_PARAMETERS = ("file", "output", "log", "ssm")
+"""what is in the names of parameters of vehicles and signals that name files, or write one by themselves"""
+PLAIN_ENCODINGS = (None, "utf-8", "us-ascii", "ascii", "iso-8859-1")
+"""in which SUMO's parser cannot see another element than the one here"""
+UNREADABLE = (
+    *(ElementTree.ParseError, expat.ExpatError, OSError, EOFError, zlib.error, LookupError, ValueError),
+)
+"""what reading can raise where a file is broken"""
 
 Lane = tuple[str, float, list[tuple[float, float]]]
 """edge, length [m] and centre line [(x, y), m]"""
-
-
-class SumoFiles(NamedTuple):
-    """A .sumocfg file and what the files that it names hold."""
-
-    path: Path
-    network: Path
-    additional_files: tuple[Path, ...]
-    begin: float
-    """[s]"""
-    end: float | None
-    """[s]; None: when the last vehicle has arrived"""
-    step: float
-    """[s]"""
-    types: dict[str, dict[str, str]]
-    """attributes of all vehicle types, by id"""
-    used_types: frozenset[str]
-    """types that vehicles have"""
-
-
-_known: dict[Path, tuple[dict[Path, tuple[int, int]], SumoFiles]] = {}
-"""what was read already, with the stamps of all files that were read for it"""
-
-
-def read_sumo_files(path: Path) -> SumoFiles:
-    """Return what a .sumocfg file and the files that it names say; read again where one has changed.
-
-    Raises:
-        InputError: one is missing, broken or too large, the network has no version, or there are no
-            vehicles.
-    """
-    if path in _known:
-        stamps, files = _known[path]
-        if all(file.is_file() and _stamp(file) == before for file, before in stamps.items()):
-            return files
-    found = _ask("configuration", path)
-    stamps = {Path(file): (time, size) for file, (time, size) in found.pop("stamps").items()}
-    found["network"] = Path(found["network"])
-    found["additional_files"] = tuple(map(Path, found["additional_files"]))
-    found["used_types"] = frozenset(found["used_types"])
-    files = SumoFiles(path, **found)
-    _known[path] = stamps, files
-    return files
-
-
-def read_lanes(path: Path) -> list[Lane]:
-    """Return all lanes of a network file.
-
-    Raises:
-        InputError: it is broken, or too large.
-    """
-    lanes = _ask("lanes", path)
-    return [(edge, length, [(x, y) for x, y in line]) for edge, length, line in lanes]
-
-
-def _ask(command: Literal["configuration", "lanes"], path: Path) -> Any:
-    """Return what the program answers; raise `InputError` where it says what is wrong, or is lost."""
-    from unjam.errors import InputError  # the program has no packages
-
-    program = [sys.executable, "-I", "-S", __file__, command, str(path)]
-    try:
-        done = subprocess.run(
-            [*program, str(LARGEST_MEMORY), str(LONGEST_TIME)],
-            capture_output=True,
-            timeout=LONGEST_TIME,
-            check=False,
-        )
-        answer = json.loads(done.stdout)
-    except (subprocess.TimeoutExpired, ValueError):
-        limits = f"{LARGEST_MEMORY / 2**30:g} GiB, {LONGEST_TIME:g} s"
-        raise InputError(f"{path.name}: its files cannot be read within {limits}") from None
-    if "broken" in answer:
-        raise InputError(answer["broken"])
-    return answer["found"]
-
-
-# From here on: the program.
 
 
 class Broken(Exception):
@@ -129,8 +66,8 @@ def _configuration(path: Path) -> dict[str, Any]:
     if not path.is_file():
         raise Broken(f"{str(path)!r}: there is no such file")
     options = {
-        SYNONYMS.get(element.tag, element.tag): element.get("value", "")
-        for element in _elements(path, "end")
+        {**FILES, **OTHER_NAMES}.get(element.tag, element.tag): element.get("value", "")
+        for element in _elements(path)
         if element.get("value") is not None
     }
     if not options.get("net-file"):
@@ -145,7 +82,8 @@ def _configuration(path: Path) -> dict[str, Any]:
         if not file.is_file():
             raise Broken(f"{str(file)!r}: there is no such file")
     stamps = {str(file): _stamp(file) for file in files}
-    _check_network(network)
+    filters = {file: _filtered(file) for file in (network, *additional, *routes)}
+    _check_network(network, filters[network])
     demand = _Demand({}, {}, set())
     for file in [*additional, *routes]:
         _read_demand(file, demand)
@@ -163,6 +101,10 @@ def _configuration(path: Path) -> dict[str, Any]:
     return {
         "network": str(network),
         "additional_files": [str(file) for file in additional],
+        "route_files": [str(file) for file in routes],
+        "options": {name: value for name, value in options.items() if name not in FILES},
+        "dropped": sorted({name for found in filters.values() for name in found.dropped}),
+        "to_copy": [str(file) for file, found in filters.items() if found.to_copy],
         "begin": begin,
         "end": end,
         "step": _seconds(path, options, "step-length", 1.0) or 1.0,
@@ -176,7 +118,7 @@ def _lanes(path: Path) -> list[Lane]:
     """Return all lanes of a network file."""
     lanes: list[Lane] = []
     try:
-        for element in _elements(path, "end"):
+        for element in _elements(path):
             if element.tag == "lane":
                 edge, length, shape = (element.get(name, "") for name in ("id", "length", "shape"))
                 line = [tuple(map(float, point.split(",")[:2])) for point in shape.split()]
@@ -211,20 +153,97 @@ def _seconds(path: Path, options: dict[str, str], name: str, otherwise: float | 
     return value
 
 
-def _check_network(path: Path) -> None:
-    """Raise `Broken` unless it is whole, and a network with a version.
-
-    SUMO itself would crash without a version, and says nothing of a file that is torn off.
-    """
-    elements = _elements(path, "start")
-    root = next(elements)
-    version = root.get("version")
-    for _ in elements:
-        root.clear()
-    if root.tag != "net":
-        raise Broken(f"{path.name}: is not a SUMO network: it begins with <{root.tag}>")
-    if not version:
+def _check_network(path: Path, found: "_Filter") -> None:
+    """Raise `Broken` unless it is a network with a version: SUMO itself would crash without."""
+    if found.root != "net":
+        raise Broken(f"{path.name}: is not a SUMO network: it begins with <{found.root}>")
+    if not found.version:
         raise Broken(f"{path.name}: the network has no version; make it anew: netconvert -s {path.name} -o")
+
+
+class _Filter:
+    """Follows an XML file, and writes what is harmless of it to `out`, if there is one.
+
+    Names are those in the file, with their prefixes, as SUMO takes them.
+    """
+
+    def __init__(self, path: Path, out: IO[str] | None) -> None:
+        self._write = out.write if out else lambda text: None
+        self._within = 0
+        """open elements within one that was dropped, itself included"""
+        self.root, self.version = "", ""
+        self.dropped: set[str] = set()
+        self.to_copy = path.suffix == ".gz" or any(sign in str(path) for sign in ",; \t$%")
+        self.parser = expat.ParserCreate()
+        self.parser.buffer_text = True
+        self.parser.XmlDeclHandler = self._declared
+        self.parser.StartElementHandler = self._started
+        self.parser.EndElementHandler = self._ended
+        self.parser.CharacterDataHandler = self._text
+
+    def _declared(self, version: str, encoding: str | None, standalone: int) -> None:
+        self.to_copy |= (encoding and encoding.lower()) not in PLAIN_ENCODINGS
+
+    def _started(self, tag: str, attributes: dict[str, str]) -> None:
+        if not self.root:
+            self.root, self.version = tag, attributes.get("version", "")
+        kept = None if self._within else self._harmless(tag, attributes)
+        if kept is None:
+            self._within += 1
+        else:
+            inside = "".join(f" {name}={quoteattr(value)}" for name, value in kept.items())
+            self._write(f"<{tag}{inside}>")
+
+    def _ended(self, tag: str) -> None:
+        if self._within:
+            self._within -= 1
+        else:
+            self._write(f"</{tag}>")
+
+    def _text(self, text: str) -> None:
+        if not self._within:
+            self._write(escape(text))
+
+    def _harmless(self, tag: str, attributes: dict[str, str]) -> dict[str, str] | None:
+        """Return which attributes of an element are harmless; None where the element is not."""
+        key = attributes.get("key", "").lower()
+        if tag in ONLY_WRITERS or (tag == "param" and any(word in key for word in IN_PARAMETERS)):
+            self._drop(tag if tag != "param" else f"parameter {attributes['key']}")
+            return None
+        kept = dict(attributes)
+        for name in [name for name in attributes if name in TO_FILES or name.endswith("File")]:
+            if name == "file" and tag.endswith(DETECTORS):
+                if kept[name] != NOWHERE:
+                    kept[name] = NOWHERE
+                    self._drop(f"{name} of {tag}")
+            else:
+                del kept[name]
+                self._drop(f"{name} of {tag}")
+        return kept
+
+    def _drop(self, name: str) -> None:
+        self.dropped.add(name)
+        self.to_copy = True
+
+
+def _filtered(path: Path, out: IO[str] | None = None) -> _Filter:
+    """Follow an XML file to its end; raise `Broken` where it has a document type, or is no XML."""
+    try:
+        _refuse_definitions(path)
+        found = _Filter(path, out)
+        with _open(path) as file:
+            while chunk := file.read(CHUNK):
+                found.parser.Parse(chunk, False)
+            found.parser.Parse(b"", True)
+    except UNREADABLE as error:
+        raise _unreadable(path, error) from None
+    return found
+
+
+def _copy(path: Path, copy: Path) -> None:
+    """Write an XML file again without what is not harmless."""
+    with open(copy, "w", encoding="utf-8") as out:
+        _filtered(path, out)
 
 
 class _Demand(NamedTuple):
@@ -239,7 +258,7 @@ class _Demand(NamedTuple):
 
 def _read_demand(path: Path, demand: _Demand) -> None:
     """Add what a file defines, and what its vehicles have."""
-    for element in _elements(path, "end"):
+    for element in _elements(path):
         name = element.get("id", "")
         if element.tag == "vType":
             demand.types[name] = dict(element.attrib)
@@ -250,15 +269,19 @@ def _read_demand(path: Path, demand: _Demand) -> None:
             demand.wanted.add(element.get("type", DEFAULT_TYPE))
 
 
-def _elements(path: Path, event: Literal["start", "end"]) -> Iterator[ElementTree.Element]:
-    """Yield the elements of an XML file, also of a compressed one, as they end (or start)."""
+def _elements(path: Path) -> Iterator[ElementTree.Element]:
+    """Yield the elements of an XML file, also of a compressed one, as they end."""
     try:
         _refuse_definitions(path)
         with _open(path) as file:
-            for _, element in ElementTree.iterparse(file, (event,)):
+            for _, element in ElementTree.iterparse(file, ("end",)):
                 yield element
-    except (ElementTree.ParseError, OSError, EOFError, zlib.error, LookupError, ValueError) as error:
-        raise Broken(f"{path.name}: cannot be read: {' '.join(str(error).split())}") from None
+    except UNREADABLE as error:
+        raise _unreadable(path, error) from None
+
+
+def _unreadable(path: Path, error: Exception) -> Broken:
+    return Broken(f"{path.name}: cannot be read: {' '.join(str(error).split())}")
 
 
 def _refuse_definitions(path: Path) -> None:
@@ -281,10 +304,10 @@ def _open(path: Path) -> IO[bytes]:
     return gzip.open(path) if path.suffix == ".gz" else path.open("rb")  # type: ignore[return-value]
 
 
-COMMANDS: dict[str, Callable[[Path], Any]] = {"configuration": _configuration, "lanes": _lanes}
+COMMANDS: dict[str, Callable[..., Any]] = {"configuration": _configuration, "lanes": _lanes, "copy": _copy}
 
 
-def main(command: str, path: str, memory: str, seconds: str) -> None:
+def main(command: str, memory: str, seconds: str, *paths: str) -> None:
     """Print what a file says, or what is wrong with it, under limits on memory [bytes] and time [s]."""
     with suppress(ImportError):  # not on Windows
         import resource
@@ -292,11 +315,11 @@ def main(command: str, path: str, memory: str, seconds: str) -> None:
         resource.setrlimit(resource.RLIMIT_AS, (int(memory), int(memory)))
         resource.setrlimit(resource.RLIMIT_CPU, (int(seconds), int(seconds)))
     try:
-        found = {"found": COMMANDS[command](Path(path))}
+        found = {"found": COMMANDS[command](*map(Path, paths))}
     except Broken as error:
         found = {"broken": str(error)}
     except (MemoryError, RecursionError):
-        found = {"broken": f"{Path(path).name}: its files are too large to be read"}
+        found = {"broken": f"{Path(paths[0]).name}: its files are too large to be read"}
     sys.stdout.write(json.dumps(found))
 
 

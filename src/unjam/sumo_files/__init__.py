@@ -1,0 +1,119 @@
+"""What the user's own SUMO files say, read before SUMO starts: SUMO crashes on some that are broken.
+
+Such files may come from anywhere. So that none can harm who asks, `program.py` reads them in a process of its
+own with limits on memory and time, and answers one JSON document. What SUMO would write, and where it would
+listen, is never passed on to it: see `copy_harmless`.
+"""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+from unjam.errors import InputError
+from unjam.sumo_files.options import is_missed, is_passed
+
+PROGRAM = Path(__file__).with_name("program.py")
+LARGEST_MEMORY = 4 * 2**30
+"""bytes that reading may take"""
+LONGEST_TIME = 120
+"""seconds that reading may take"""
+
+Lane = tuple[str, float, list[tuple[float, float]]]
+"""edge, length [m] and centre line [(x, y), m]"""
+
+
+class SumoFiles(NamedTuple):
+    """A .sumocfg file and what the files that it names hold."""
+
+    path: Path
+    network: Path
+    additional_files: tuple[Path, ...]
+    route_files: tuple[Path, ...]
+    begin: float
+    """[s]"""
+    end: float | None
+    """[s]; None: when the last vehicle has arrived"""
+    step: float
+    """[s]"""
+    options: dict[str, str]
+    """what else SUMO may be told of it, by name: harmless ways of simulating"""
+    dropped: tuple[str, ...]
+    """what it is not told: options and elements that write, listen, or read other files"""
+    to_copy: frozenset[Path]
+    """files that SUMO gets a harmless copy of; it reads the others themselves"""
+    types: dict[str, dict[str, str]]
+    """attributes of all vehicle types, by id"""
+    used_types: frozenset[str]
+    """types that vehicles have"""
+
+
+_known: dict[Path, tuple[dict[Path, tuple[int, int]], SumoFiles]] = {}
+"""what was read already, with the stamps of all files that were read for it"""
+
+
+def read_sumo_files(path: Path) -> SumoFiles:
+    """Return what a .sumocfg file and the files that it names say; read again where one has changed.
+
+    Raises:
+        InputError: one is missing, broken or too large, the network has no version, or there are no
+            vehicles.
+    """
+    if path in _known:
+        stamps, files = _known[path]
+        if all(file.is_file() and stamp_of(file) == before for file, before in stamps.items()):
+            return files
+    found = _ask("configuration", path)
+    stamps = {Path(file): (time, size) for file, (time, size) in found.pop("stamps").items()}
+    found["network"] = Path(found["network"])
+    for name, kind in {"additional_files": tuple, "route_files": tuple, "to_copy": frozenset}.items():
+        found[name] = kind(map(Path, found[name]))
+    found["used_types"] = frozenset(found["used_types"])
+    options = found["options"]
+    found["options"] = {name: value for name, value in options.items() if is_passed(name)}
+    found["dropped"] = (*(f"option {name}" for name in options if is_missed(name)), *found["dropped"])
+    files = SumoFiles(path, **found)
+    _known[path] = stamps, files
+    return files
+
+
+def read_lanes(path: Path) -> list[Lane]:
+    """Return all lanes of a network file.
+
+    Raises:
+        InputError: it is broken, or too large.
+    """
+    lanes = _ask("lanes", path)
+    return [(edge, length, [(x, y) for x, y in line]) for edge, length, line in lanes]
+
+
+def copy_harmless(path: Path, copy: Path) -> None:
+    """Write one of SUMO's files again without what makes SUMO write a file, listen, or read another file.
+
+    Raises:
+        InputError: it is broken, or too large.
+    """
+    _ask("copy", path, copy)
+
+
+def stamp_of(file: Path) -> tuple[int, int]:
+    """Return time of change and size of a file: another content has another stamp."""
+    found = file.stat()
+    return found.st_mtime_ns, found.st_size
+
+
+def _ask(command: Literal["configuration", "lanes", "copy"], path: Path, *more: Path) -> Any:
+    """Return what the program answers; raise `InputError` where it says what is wrong, or is lost."""
+    program = [sys.executable, "-I", "-S", str(PROGRAM), command, str(LARGEST_MEMORY), str(LONGEST_TIME)]
+    try:
+        done = subprocess.run(
+            [*program, str(path), *map(str, more)], capture_output=True, timeout=LONGEST_TIME, check=False
+        )
+        answer = json.loads(done.stdout)
+    except (subprocess.TimeoutExpired, ValueError):
+        limits = f"{LARGEST_MEMORY / 2**30:g} GiB, {LONGEST_TIME:g} s"
+        raise InputError(f"{path.name}: its files cannot be read within {limits}") from None
+    if "broken" in answer:
+        raise InputError(answer["broken"])
+    return answer["found"]

@@ -1,0 +1,131 @@
+"""Who writes a folder, and who ends with whom."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from tests.training.test_run import small_config
+from tests.worlds.test_workers import has_ended
+from unjam.errors import InputError
+from unjam.processes import LOCK, PARENT, bound, end_with_parent, owned
+from unjam.training.folder import start_folder
+from unjam.training.train import train
+
+linux = pytest.mark.skipif(sys.platform != "linux", reason="Linux tells a process that its parent is gone")
+HOLD = (
+    "import sys\nfrom pathlib import Path\nfrom unjam.processes import owned\n"
+    "with owned(Path(sys.argv[1])):\n    print('held', flush=True)\n    sys.stdin.read()\n"
+)
+
+
+def holder(folder: Path) -> subprocess.Popen[str]:
+    process = subprocess.Popen(
+        [sys.executable, "-c", HOLD, str(folder)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    )
+    assert process.stdout is not None
+    assert process.stdout.readline() == "held\n"
+    return process
+
+
+def soon(process: int) -> bool:
+    patience = time.monotonic() + 15.0
+    while not has_ended(process) and time.monotonic() < patience:
+        time.sleep(0.05)
+    return has_ended(process)
+
+
+def test_a_folder_has_one_owner_and_is_free_when_that_is_killed(tmp_path: Path) -> None:
+    process = holder(tmp_path)
+    words = "is being written by another process; allowed: one at a time"
+    with pytest.raises(InputError, match=words), owned(tmp_path):
+        pass
+    process.kill()
+    process.wait()
+    with owned(tmp_path):
+        assert (tmp_path / LOCK).is_file()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_owner_in_this_process_keeps_others_out_too(tmp_path: Path) -> None:
+    with owned(tmp_path), pytest.raises(InputError), owned(tmp_path):
+        pass
+    with owned(tmp_path):
+        pass
+
+
+def test_a_second_training_of_a_run_is_refused_in_one_line_and_writes_nothing(tmp_path: Path) -> None:
+    start_folder(tmp_path, small_config())
+    process = holder(tmp_path)
+    before = {path: path.stat().st_mtime_ns for path in tmp_path.iterdir()}
+    with pytest.raises(InputError, match="another process") as caught:
+        train(small_config(steps=900), tmp_path, resume=True)
+    assert caught.value.exit_code == 2
+    assert {path: path.stat().st_mtime_ns for path in tmp_path.iterdir()} == before
+    process.communicate("")
+
+
+def test_what_a_killed_owner_left_of_a_folder_is_a_new_one(tmp_path: Path) -> None:
+    for name in (LOCK, ".config.toml.part"):
+        (tmp_path / name).touch()
+    start_folder(tmp_path, small_config())
+    assert (tmp_path / "config.toml").is_file()
+
+
+CHILD = (
+    "import os, signal, time\nfrom unjam.processes import end_with_parent\n"
+    "end_with_parent(signal.SIGKILL)\nprint(os.getpid(), flush=True)\n"
+    "while True:\n    pass\n"
+)
+
+
+@linux
+def test_a_busy_process_ends_with_the_one_that_started_it() -> None:
+    code = (
+        "import os, signal, subprocess, sys\nfrom unjam.processes import bound\n"
+        f"child = subprocess.Popen([sys.executable, '-c', {CHILD!r}], stdout=subprocess.PIPE, text=True,\n"
+        "    env=bound(os.environ))\n"
+        "print(child.stdout.readline(), flush=True)\nos.kill(os.getpid(), signal.SIGKILL)\n"
+    )
+    parent = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert parent.returncode == -signal.SIGKILL
+    assert soon(int(parent.stdout))
+
+
+@linux
+def test_a_process_whose_parent_was_gone_before_ends_at_once() -> None:
+    gone = subprocess.run([sys.executable, "-c", "import os; print(os.getpid())"], capture_output=True)
+    done = subprocess.run(
+        [sys.executable, "-c", CHILD], env={**os.environ, PARENT: gone.stdout.decode().strip()}, timeout=60
+    )
+    assert done.returncode == -signal.SIGKILL
+
+
+def test_nobody_else_is_bound(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv(PARENT, raising=False)
+    end_with_parent(signal.SIGKILL)
+    assert bound({"A": "b"}) == {"A": "b", PARENT: str(os.getpid())}
+
+
+@linux
+def test_a_training_that_was_started_for_another_ends_with_it(tmp_path: Path) -> None:
+    code = (
+        "import os, signal, sys, threading, time\nfrom pathlib import Path\n"
+        "from unjam.training.executors import CommandLine, Processes\n"
+        "processes, folder = Processes(), Path(sys.argv[1])\n"
+        "words = ['train', 'ring', '--steps', '100000000', '--workers', '1', '--out', str(folder / 'run')]\n"
+        "command = CommandLine(words, folder / 'log')\n"
+        "threading.Thread(target=processes.run, args=(command,), daemon=True).start()\n"
+        "while not (folder / 'run' / 'config.toml').exists():\n    time.sleep(0.05)\n"
+        "print(*(process.pid for process in processes._running), flush=True)\n"
+        "os.kill(os.getpid(), signal.SIGKILL)\n"
+    )
+    parent = subprocess.run(
+        [sys.executable, "-c", code, str(tmp_path)], capture_output=True, text=True, check=False, timeout=120
+    )
+    assert parent.returncode == -signal.SIGKILL
+    assert soon(int(parent.stdout))

@@ -1,0 +1,161 @@
+"""A run is killed, or the disk is full, before, within and after every single thing it does to its folder."""
+
+import builtins
+import errno
+import json
+import os
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, Literal, NoReturn
+
+import pytest
+import torch
+
+from tests.training.test_run import small_config
+from unjam import files
+from unjam.errors import DiskError
+from unjam.files import append_line, to_json
+from unjam.training import folder as run_folder
+from unjam.training.folder import PROGRESS, continue_folder, last_state, save_checkpoint, start_folder
+
+ITERATIONS = 4
+Moment = Literal["before", "half", "after"]
+Content = dict[str, bytes]
+
+
+class Killed(BaseException):
+    """The process is no more: nothing that it does from now on happens."""
+
+
+class Disk:
+    """Counts what is done to files, and fails at one of them: by death, or as a full disk does."""
+
+    def __init__(self, patch: pytest.MonkeyPatch, at: int, moment: Moment, kill: bool) -> None:
+        self.at, self.moment, self.kill = at, moment, kill
+        self.count, self.dead = 0, False
+        for name in ("replace", "mkdir", "unlink", "rmdir"):
+            patch.setattr(os, name, self.failing(getattr(os, name)))
+        patch.setattr(os, "fsync", self.failing(lambda descriptor: None))  # no power is lost here
+        patch.setattr(files, "open", self.opened, raising=False)
+
+    def fail(self) -> NoReturn:
+        if self.kill:
+            self.dead = True
+            raise Killed
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    def now(self, moment: Moment) -> bool:
+        return self.count == self.at and self.moment == moment
+
+    def failing(self, function: Callable[..., Any]) -> Callable[..., Any]:
+        def done(*arguments: Any, **options: Any) -> Any:
+            if self.dead:
+                raise Killed
+            self.count += 1
+            if self.now("before"):
+                self.fail()
+            found = function(*arguments, **options)
+            if self.now("after"):
+                self.fail()
+            return found
+
+        return done
+
+    def opened(self, *arguments: Any, **options: Any) -> Any:
+        file = self.failing(builtins.open)(*arguments, **options)
+        write = file.write
+
+        def written(data: Any) -> int:
+            if self.now_within():
+                write(data[: len(data) // 2])
+                file.flush()
+                self.fail()
+            return self.failing(write)(data)
+
+        return _Written(file, written)
+
+    def now_within(self) -> bool:
+        if self.count + 1 == self.at and self.moment == "half" and not self.dead:
+            self.count += 1
+            return True
+        return False
+
+
+class _Written:
+    """A file that is written to in another way."""
+
+    def __init__(self, file: Any, write: Callable[[Any], int]) -> None:
+        self._file, self.write = file, write
+        self.flush, self.fileno = file.flush, file.fileno
+
+    def __enter__(self) -> "_Written":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._file.close()
+
+
+@pytest.fixture(autouse=True)
+def no_manifest(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(run_folder, "manifest", lambda: {"started": "some day"})
+
+
+def run(folder: Path) -> None:
+    """What a training does to its folder: begun, or gone on with where it was begun before."""
+    if (folder / "config.toml").is_file():
+        continue_folder(folder, small_config())
+    else:
+        start_folder(folder, small_config())
+    found = last_state(folder, {folder})
+    state, tensors = found or ({"iteration": 0, "sum": 0}, {"weight": torch.zeros(2)})
+    while state["iteration"] < ITERATIONS:
+        number = state["iteration"] + 1
+        state = {"iteration": number, "sum": state["sum"] + number}
+        tensors = {"weight": tensors["weight"] * 2 + number}
+        append_line(folder / PROGRESS, to_json({**state, "return": 1 / 3}))
+        save_checkpoint(folder / "checkpoint", state, tensors)
+
+
+def content_of(folder: Path) -> Content:
+    return {
+        path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()
+    }
+
+
+def crash(folder: Path, at: int, moment: Moment, kill: bool) -> Disk:
+    with pytest.MonkeyPatch.context() as patch:
+        disk = Disk(patch, at, moment, kill)
+        with suppress(Killed, DiskError):
+            run(folder)
+        return disk
+
+
+@pytest.mark.parametrize("every", [5, pytest.param(1, marks=pytest.mark.slow)])
+def test_wherever_it_ends_it_goes_on_to_the_same_files(every: int, tmp_path: Path) -> None:
+    wanted_in, trial = tmp_path / "wanted", 0
+    total = crash(wanted_in, 0, "before", False).count
+    wanted = content_of(wanted_in)
+    assert total > 50
+    assert [json.loads(line)["iteration"] for line in wanted[PROGRESS].splitlines()] == [1, 2, 3, 4]
+    moments: tuple[Moment, ...] = ("before", "half", "after")
+    for kill in (True, False):
+        for moment in moments:
+            for at in range(1, total + 1, every):
+                trial += 1
+                folder = tmp_path / str(trial)
+                crash(folder, at, moment, kill)
+                run(folder)
+                assert content_of(folder) == wanted, (kill, moment, at)
+
+
+def test_twice_in_a_row_too(tmp_path: Path) -> None:
+    crash(tmp_path / "wanted", 0, "before", False)
+    wanted = content_of(tmp_path / "wanted")
+    for first in range(1, 60, 11):
+        for second in range(1, 60, 7):
+            folder = tmp_path / f"{first}-{second}"
+            crash(folder, first, "after", True)
+            crash(folder, second, "before", True)
+            run(folder)
+            assert content_of(folder) == wanted, (first, second)
