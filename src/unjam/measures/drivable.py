@@ -1,12 +1,12 @@
 """Could a car have driven so? What an episode's audit says, and the verdict: the first reason against it."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from math import isfinite, isnan, nan
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
-from unjam.worlds.audit import BEYOND, Brakings
+from unjam.worlds.audit import BEYOND
 from unjam.worlds.record import Episode
 
 FLOOR_MET = 0.9
@@ -67,42 +67,20 @@ def people_max_braking(episode: Episode) -> float:
     return episode.audit.people.hardest
 
 
-def _beyond(brakings: Brakings, limit: float) -> float:
-    moments = brakings.moments
-    return 1e6 * brakings.beyond[BEYOND.index(limit)] / moments if moments else nan
+def brakings_beyond(who: Literal["people", "cavs"], limit: float) -> Callable[[Episode], float]:
+    """Return the metric of how often people or CAVs brake beyond one of BEYOND [m/s2]."""
 
+    def beyond(episode: Episode) -> float:
+        brakings = episode.audit.people if who == "people" else episode.audit.cavs
+        moments = brakings.moments
+        return 1e6 * brakings.beyond[BEYOND.index(limit)] / moments if moments else nan
 
-def cav_beyond_3_5(episode: Episode) -> float:
-    """CAVs' moments (vehicles times simulation steps) of braking beyond 3.5 m/s2 [per million].
-
-    ISO 15622 allows no more above 20 m/s.
-    """
-    return _beyond(episode.audit.cavs, 3.5)
-
-
-def cav_beyond_4_5(episode: Episode) -> float:
-    """CAVs' moments of braking beyond 4.5 m/s2 [per million]."""
-    return _beyond(episode.audit.cavs, 4.5)
-
-
-def cav_beyond_9(episode: Episode) -> float:
-    """CAVs' moments of braking beyond 9 m/s2 [per million]: more than dry asphalt allows."""
-    return _beyond(episode.audit.cavs, 9.0)
-
-
-def people_beyond_3_5(episode: Episode) -> float:
-    """People's moments (vehicles times simulation steps) of braking beyond 3.5 m/s2 [per million]."""
-    return _beyond(episode.audit.people, 3.5)
-
-
-def people_beyond_4_5(episode: Episode) -> float:
-    """People's moments of braking beyond 4.5 m/s2 [per million]."""
-    return _beyond(episode.audit.people, 4.5)
-
-
-def people_beyond_9(episode: Episode) -> float:
-    """People's moments of braking beyond 9 m/s2 [per million]: more than dry asphalt allows."""
-    return _beyond(episode.audit.people, 9.0)
+    whose = {"people": "People's", "cavs": "CAVs'"}[who]
+    beyond.__doc__ = (
+        f"{whose} moments (vehicles times simulation steps) of braking beyond {limit:g} m/s2 [per million]. "
+        "ISO 15622 allows 3.5 above 20 m/s; dry asphalt hardly 9."
+    )
+    return beyond
 
 
 def filter_share(episode: Episode) -> float:

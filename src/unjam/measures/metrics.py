@@ -7,9 +7,7 @@ from typing import Any
 import numpy as np
 
 from unjam.measures.drivable import (
-    cav_beyond_3_5,
-    cav_beyond_4_5,
-    cav_beyond_9,
+    brakings_beyond,
     cav_max_braking,
     cav_min_ttc,
     drivable,
@@ -18,9 +16,6 @@ from unjam.measures.drivable import (
     max_jerk,
     min_headway,
     overridden,
-    people_beyond_3_5,
-    people_beyond_4_5,
-    people_beyond_9,
     people_max_braking,
     share_short_headway,
     yielded,
@@ -257,13 +252,23 @@ METRICS: dict[str, Metric] = {
     "max_drac": Metric(max_drac, "CAV's largest braking needed (DRAC)", "m/s2"),
     "max_jerk": Metric(max_jerk, "CAV's largest jerk", "m/s3", 1),
     "cav_max_braking": Metric(cav_max_braking, "CAV's hardest braking", "m/s2"),
-    "cav_beyond_3_5": Metric(cav_beyond_3_5, "CAV's brakings beyond 3.5 m/s2", "per million", 0),
-    "cav_beyond_4_5": Metric(cav_beyond_4_5, "CAV's brakings beyond 4.5 m/s2", "per million", 0),
-    "cav_beyond_9": Metric(cav_beyond_9, "CAV's brakings beyond 9 m/s2", "per million", 0),
+    "cav_beyond_3_5": Metric(
+        brakings_beyond("cavs", 3.5), "CAV's brakings beyond 3.5 m/s2", "per million", 0
+    ),
+    "cav_beyond_4_5": Metric(
+        brakings_beyond("cavs", 4.5), "CAV's brakings beyond 4.5 m/s2", "per million", 0
+    ),
+    "cav_beyond_9": Metric(brakings_beyond("cavs", 9.0), "CAV's brakings beyond 9 m/s2", "per million", 0),
     "people_max_braking": Metric(people_max_braking, "people's hardest braking", "m/s2"),
-    "people_beyond_3_5": Metric(people_beyond_3_5, "people's brakings beyond 3.5 m/s2", "per million", 0),
-    "people_beyond_4_5": Metric(people_beyond_4_5, "people's brakings beyond 4.5 m/s2", "per million", 0),
-    "people_beyond_9": Metric(people_beyond_9, "people's brakings beyond 9 m/s2", "per million", 0),
+    "people_beyond_3_5": Metric(
+        brakings_beyond("people", 3.5), "people's brakings beyond 3.5 m/s2", "per million", 0
+    ),
+    "people_beyond_4_5": Metric(
+        brakings_beyond("people", 4.5), "people's brakings beyond 4.5 m/s2", "per million", 0
+    ),
+    "people_beyond_9": Metric(
+        brakings_beyond("people", 9.0), "people's brakings beyond 9 m/s2", "per million", 0
+    ),
     "filter_share": Metric(filter_share, "decisions in which the filter braked", "", 4),
     "overridden": Metric(overridden, "commands overridden in following", "", 4),
     "yielded": Metric(yielded, "commands overridden at a crossing", "", 4),
