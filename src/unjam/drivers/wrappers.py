@@ -162,11 +162,15 @@ class Filtered(Wrapper):
         """What comes out: the driver's limits, and a car's brakes."""
         return Limits(-max(self.action_limit, self.safety.braking), self.action_limit)
 
+    @cached_property
+    def _asked(self) -> Limits:
+        """Within which the driver may ask."""
+        return Limits.symmetric(self.action_limit)
+
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
         """Return what the filter lets pass of what the other driver wants, and the new memory."""
         wanted, after = self.driver.act(state, memory[INNER])
-        wanted = Limits.symmetric(self.action_limit).keep(wanted)
-        return self.safety.keep(wanted, Ahead(*state[:3]), self.time_step), {INNER: after}
+        return self.safety.keep(self._asked.keep(wanted), Ahead(*state[:3]), self.time_step), {INNER: after}
 
     def describe(self) -> str:
         """Return the other driver, and that it is filtered."""
