@@ -1,29 +1,22 @@
 """The page of a certificate: what is proven of a controller, what was tried, and where it was seen."""
 
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jinja2 import Environment, StrictUndefined
-from markupsafe import Markup
 from matplotlib import rc_context
 from matplotlib.figure import Figure
 
-from unjam import __version__
 from unjam.drivers.wrappers import Filtered
 from unjam.files import write_whole
 from unjam.reports.figures import CAV_COLOUR, LINES, MUTED, STYLE, data_uri, new_figure
+from unjam.reports.html import filled
 
 UNITS = (("own speed", "speed", "m/s"), ("leader's speed", "leader_speed", "m/s"), ("gap", "leader_gap", "m"))
 
 
 def write_certificate(name: str, driver: Filtered, certificate: dict[str, Any], target: Path) -> None:
     """Write the page of a controller; `certificate` is that of its file."""
-    page = files("unjam.reports") / "page"
-    template, style = (
-        (page / part).read_text(encoding="utf-8") for part in ("certificate.html", "report.css")
-    )
     worst, comfort = certificate["worst"], certificate["comfort"]
     cards = [
         ("Smallest gap", f"{worst['smallest_gap']:.2f} m", "in all that was tried"),
@@ -31,14 +24,10 @@ def write_certificate(name: str, driver: Filtered, certificate: dict[str, Any], 
         ("Hardest braking", f"{worst['hardest_braking']:.1f} m/s²", "in all that was tried"),
         ("Riding along", f"{comfort['acceleration']:.2f} m/s²", "r.m.s.; below 0.315 is comfortable"),
     ]
-    environment = Environment(
-        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
-    text = environment.from_string(template).render(
-        version=__version__,
+    text = filled(
+        "certificate.html",
         name=name,
         driver=driver.describe(),
-        style=Markup(style),
         worst=worst,
         cards=cards,
         notes=_notes(certificate),

@@ -48,15 +48,22 @@ def write_report(folders: Sequence[Path], target: Path) -> Path:
     return target
 
 
-def render(results: Sequence[Results]) -> str:
-    """Return the page as text."""
-    template, style, script = (
-        (files("unjam.reports") / "page" / name).read_text(encoding="utf-8")
-        for name in ("report.html", "report.css", "replay.js")
-    )
+def filled(template: str, **values: Any) -> str:
+    """Return a page of the folder `page/`, with the style of all, as text: what `values` say is escaped."""
     environment = Environment(
         autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
+    style = Markup(page_part("report.css"))
+    return environment.from_string(page_part(template)).render(version=__version__, style=style, **values)
+
+
+def page_part(name: str) -> str:
+    """Return a file of the folder `page/`."""
+    return (files("unjam.reports") / "page" / name).read_text(encoding="utf-8")
+
+
+def render(results: Sequence[Results]) -> str:
+    """Return the page as text."""
     columns = columns_of(results)
     panels = [replace(column.shown, driver=column.name) for column in columns if column.shown is not None]
     panels = panels[:MOST_PANELS]
@@ -64,8 +71,8 @@ def render(results: Sequence[Results]) -> str:
     sources = list(zip(names_of(results), results, strict=True))
     counts = [len(column.rows) for column in columns]
     drawn = [", ".join(f"{key} {value:g} m" for key, value in episode.drawn.items()) for episode in panels]
-    return environment.from_string(template).render(
-        version=__version__,
+    return filled(
+        "report.html",
         title=title_of(results),
         single=single is not None,
         leads=[(name, lead_of(result)) for name, result in sources],
@@ -79,8 +86,7 @@ def render(results: Sequence[Results]) -> str:
         episodes=list(dict.fromkeys((min(counts), max(counts)))),
         table=table_of(columns),
         sources=[(name, result, command_to_repeat(result)) for name, result in sources],
-        style=Markup(style),
-        script=Markup(script),
+        script=Markup(page_part("replay.js")),
         replay_data=Markup(json.dumps(replay_data(panels)).replace("<", "\\u003c")),
     )
 
