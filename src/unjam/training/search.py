@@ -193,14 +193,21 @@ def _command(base: RunConfig, folder: Path, number: int, values: dict[str, Any])
     return training_command(config, _trial_folder(folder, number), plan, log)
 
 
-def _study(base: RunConfig, space: Space, folder: Path) -> "Study":
+def quiet_optuna(verb: str) -> Any:
+    """Return Optuna, which says nothing but warnings; raise `MissingPartError` where it is not installed."""
     try:
         import optuna
-        from optuna.storages import JournalStorage
-        from optuna.storages.journal import JournalFileBackend
     except ImportError:
-        raise MissingPartError("search: optuna is not installed: pip install 'unjam[search]'") from None
+        raise MissingPartError(f"{verb}: optuna is not installed: pip install 'unjam[search]'") from None
     optuna.logging.set_verbosity(optuna.logging.WARNING)
+    return optuna
+
+
+def _study(base: RunConfig, space: Space, folder: Path) -> "Study":
+    optuna = quiet_optuna("search")
+    from optuna.storages import JournalStorage
+    from optuna.storages.journal import JournalFileBackend
+
     known = (folder / CONFIG).is_file()
     if folder.exists() and any(folder.iterdir()) and not known:
         raise InputError(f"out: {str(folder)!r} is not empty and no search; allowed: a new folder")

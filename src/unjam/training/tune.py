@@ -8,15 +8,15 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass, fields
 from math import inf
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, get_args, get_origin, get_type_hints
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import numpy as np
 
 from unjam.controller.file import SUFFIX, controller_bytes
 from unjam.drivers.driver import labelled
 from unjam.drivers.registry import DRIVERS, named_driver
-from unjam.errors import InputError, MissingPartError, UnjamError, wrong_name
-from unjam.files import make_folder, to_json, write_whole
+from unjam.errors import InputError, UnjamError, wrong_name
+from unjam.files import to_json, write_whole
 from unjam.manifest import manifest
 from unjam.measures.drivable import DRIVABLE, drivable_in_all
 from unjam.measures.metrics import measure
@@ -24,12 +24,9 @@ from unjam.scenarios import scenario_recipe
 from unjam.scenarios.scenario import Scenario
 from unjam.training.evaluate import raise_failure
 from unjam.training.folder import origin
-from unjam.training.search import Choice, Range, Space
+from unjam.training.search import Choice, Range, Space, quiet_optuna
 from unjam.training.seeds import tuning_seeds
 from unjam.worlds.workers import EpisodeTask, Workers
-
-if TYPE_CHECKING:
-    from optuna import Study
 
 TUNED = "tuned.json"
 EPISODES = 8
@@ -155,13 +152,16 @@ def tune(
         score = float(np.mean([row["return"] for row in rows])) if verdict == DRIVABLE else None
         return Setting(labelled(expert, values), values, score, verdict)
 
-    study, settings = _study(seed), list[Setting]()
+    optuna, settings = quiet_optuna("tune"), list[Setting]()
+    sampler = optuna.samplers.TPESampler(seed=seed, multivariate=True)
+    study = optuna.create_study(direction="maximize", sampler=sampler)
     for number in range(trials):
         trial = study.ask()
         for key, values in space.items():
             values.suggest(trial, key)
         setting = driven({key: _rounded(value) for key, value in trial.params.items()}, 0, EPISODES)
-        study.tell(trial, setting.score, state=None if setting.score is not None else _failed())
+        failed = None if setting.score is not None else optuna.trial.TrialState.FAIL
+        study.tell(trial, setting.score, state=failed)
         settings.append(setting)
         said = setting.verdict if setting.score is None else f"{setting.score:.0f}"
         on_line(f"{number + 1} of {trials}: {setting.driver}: {said}")
@@ -178,25 +178,9 @@ def tune(
     return found
 
 
-def _study(seed: int) -> "Study":
-    try:
-        import optuna
-    except ImportError:
-        raise MissingPartError("tune: optuna is not installed: pip install 'unjam[search]'") from None
-    optuna.logging.set_verbosity(optuna.logging.WARNING)
-    sampler = optuna.samplers.TPESampler(seed=seed, multivariate=True, warn_independent_sampling=False)
-    return optuna.create_study(direction="maximize", sampler=sampler)
-
-
 def _rounded(value: Any) -> Any:
     """Return a number with as many digits as anybody wants to read; words as they are."""
     return float(f"{value:.4g}") if isinstance(value, float) else value
-
-
-def _failed() -> Any:
-    from optuna.trial import TrialState
-
-    return TrialState.FAIL
 
 
 def _write(scenario: Scenario, expert: str, found: Tuned, folder: Path, reward: str, seed: int) -> None:
@@ -209,7 +193,6 @@ def _write(scenario: Scenario, expert: str, found: Tuned, folder: Path, reward: 
         "best": asdict(found.best),
         "default": asdict(found.default),
     }
-    make_folder(folder)
     driver = named_driver(found.best.driver, scenario.decision_step)
     tuned = {key: about[key] for key in ("reward", "seed", "actual_steps", "best", "default")}
     content = controller_bytes(driver, {**origin(scenario, driver), "tuned": tuned})
