@@ -276,17 +276,18 @@ class ClosedTraffic(Traffic[ClosedRoad]):
     def _audit(self, speeds: Floats, positions: Floats) -> Audit:
         """Return the physics of every simulation step; arrays of shape (vehicles, moments)."""
         step, loop = self.scenario.simulation_step, self.road.loop_length
+        floor = self.scenario.safety.time_headway
         states = loop_state(speeds, positions, self._near, loop).each(lambda values: values.T)
         followed = states.speed, states.leader_speed, states.leader_gap
         accelerations, driven = np.diff(speeds, axis=1) / step, np.zeros(len(speeds), bool)
         if not self._controlled:
-            return Audit(brakings(accelerations), following=following(*followed, step), floor=self._floor)
+            return Audit(brakings(accelerations), following=following(*followed, step), floor=floor)
         driven[self._places] = True
         before = [(end - states.route_position[:-1]) % loop for _, end in self.road.crossings]
         ways = [end - start + APPROACH for start, end in self.road.crossings]
         near = sum((left < way for left, way in zip(before, ways, strict=True)), np.zeros(1, bool))
         found = following(*followed, step, self._added() > SHIELD_ROUNDING / step, near)
-        return Audit(brakings(accelerations[~driven]), brakings(accelerations[driven]), found, self._floor)
+        return Audit(brakings(accelerations[~driven]), brakings(accelerations[driven]), found, floor)
 
     def last_applied(self) -> Floats:
         """Return what the CAVs were told in the last decision, once it was filtered [m/s2], shape (CAVs,)."""

@@ -172,6 +172,9 @@ class MergingTraffic(OpenTraffic[MergingRoad]):
         wanted[streams.on_junction(self.road.junctions)] = LEAVE_TO_SUMO
         self._simulation.command_speeds(streams.names, wanted.tolist())
 
+    def _everybody(self) -> tuple[Sequence[str], list[float]]:
+        return self._streams.names, self._streams.speeds.tolist()
+
     def _moment(self) -> Moment:
         streams = self._streams
         self._states_of_all = states = streams.states()

@@ -50,6 +50,11 @@ class OpenTraffic(Traffic[RoadKind]):
     def _command_people(self) -> None:
         """Ask for the speeds that people want, where SUMO does not drive them."""
 
+    def _everybody(self) -> tuple[Sequence[str], list[float]]:
+        """Return who is on the road after the last step, and their speeds [m/s], in one order."""
+        names = list(self._on_road)
+        return names, self._simulation.speeds(names)
+
     def _moment(self) -> Moment:
         """Return all vehicles on the road now."""
         raise NotImplementedError
@@ -112,7 +117,8 @@ class OpenTraffic(Traffic[RoadKind]):
 
     def _forget(self) -> None:
         """Begin the log of everybody's accelerations anew."""
-        self._watched, self._of_cav, self._on_road_changed = list[str](), b"", True
+        self._watched, self._of_cav = list[str](), b""
+        self._drives: Sequence[str] = ()
         self._last_speeds: list[float] = []
         self._changes, self._changed = array("d"), bytearray()
         """everybody's changes of speed in each simulation step [m/s], and whether a CAV's"""
@@ -181,23 +187,20 @@ class OpenTraffic(Traffic[RoadKind]):
         self._arrived += len(self._simulation.arrived())
         for name in left:
             self._on_road.pop(name, None)
-        self._on_road_changed |= bool(left or entered)
         self._moved(left, entered)
         for name in entered:
             self._on_road[name] = self._is_cav(name)
 
     def _watch(self) -> None:
         """Note how everybody's speed has changed in this step: people's and CAVs' apart."""
-        if self._on_road_changed:  # in few steps: the rest is quick
-            before = dict(zip(self._watched, self._last_speeds, strict=True))
-            self._watched = list(self._on_road)
-            driven = set(self.cavs) if self._controlled else set[str]()
-            self._of_cav = bytes(map(driven.__contains__, self._watched))
-            speeds = self._simulation.speeds(self._watched)
-            last = [before.get(name, speed) for name, speed in zip(self._watched, speeds, strict=True)]
-            self._on_road_changed = False
-        else:
-            speeds, last = self._simulation.speeds(self._watched), self._last_speeds
+        names, speeds = self._everybody()
+        last, driven = self._last_speeds, self.cavs if self._controlled else ()
+        if names != self._watched:  # in few steps: the rest is quick
+            before = dict(zip(self._watched, last, strict=True))
+            last = [before.get(name, speed) for name, speed in zip(names, speeds, strict=True)]
+        if names != self._watched or driven is not self._drives:
+            self._of_cav = bytes(map(set(driven).__contains__, names))
+            self._watched, self._drives = list(names), driven
         self._changes.fromlist(list(map(sub, speeds, last)))
         self._changed.extend(self._of_cav)
         self._last_speeds = speeds
@@ -208,9 +211,9 @@ class OpenTraffic(Traffic[RoadKind]):
         rows = [row for row, name in enumerate(self.cavs) if name in self._on_road]
         new = [name for name, chosen in self._on_road.items() if chosen and name not in known]
         self.kept = rows if new or len(rows) < len(known) else None
-        self.cavs = [*(self.cavs[row] for row in rows), *new]
+        if self.kept is not None:
+            self.cavs = [*(self.cavs[row] for row in rows), *new]
         self.entered += len(new)
-        self._on_road_changed |= bool(new)
         if self._controlled:
             simulation.take_control(new, scenario.actuation, scenario.right_of_way, self._cav_type)
         moment = self._moment()
@@ -269,7 +272,7 @@ class OpenTraffic(Traffic[RoadKind]):
         accelerations = np.array(self._changes) / self.scenario.simulation_step
         of_cav = np.array(self._changed, bool)
         people, cavs = brakings(accelerations[~of_cav]), brakings(accelerations[of_cav])
-        return Audit(people, cavs, followed, self._floor)
+        return Audit(people, cavs, followed, self.scenario.safety.time_headway)
 
     def _trajectories(self, driven: Driven) -> tuple[Trajectory, ...]:
         """Return the stays of at least one decision, in order of entry."""

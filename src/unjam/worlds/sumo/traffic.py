@@ -79,7 +79,6 @@ class Traffic(World[Episode], Generic[RoadKind]):
         self.log_fuel: list[list[float]] = []
         self._controlled = False
         self._cars = Cars(scenario.safety, scenario.actuator, scenario.simulation_step)
-        self._floor = scenario.safety.time_headway
         self._noise_generator = np.random.default_rng(noise_seed)
         self._exploration_generator = np.random.default_rng(exploration_seed)
         self._simulation = simulation
