@@ -214,6 +214,19 @@ def throughput_veh_per_h(episode: Episode) -> float:
     return float(driven / episode.loop_length / hours)
 
 
+def travel_time(episode: Episode) -> float:
+    """Mean time per vehicle that wanted to drive, waiting to enter included [s]; NaN on a closed road.
+
+    The integral over time of who is on the road or waits to be, over how many wanted to enter: nobody gains
+    by keeping vehicles out. Who is still under way at the end counts with the time so far.
+    """
+    if not len(episode.waiting):
+        return float("nan")
+    there = (~np.isnan(episode.speeds)).sum(axis=1)
+    demanded = len(episode.vehicle_ids) + episode.waiting[-1]
+    return float((there + episode.waiting)[1:].sum() * episode.step / demanded) if demanded else float("nan")
+
+
 def backlog_veh(episode: Episode) -> float:
     """Vehicles that wait to enter at the end; on a closed road nobody does."""
     return float(episode.waiting[-1]) if len(episode.waiting) else 0.0
@@ -277,6 +290,7 @@ METRICS: dict[str, Metric] = {
     "shield_max_braking": Metric(shield_max_braking, "hardest braking added", "m/s2"),
     "fuel_ml_per_km": Metric(fuel_ml_per_km, "fuel", "ml/km", 1),
     "throughput_veh_per_h": Metric(throughput_veh_per_h, "flow", "veh/h", 0),
+    "travel_time": Metric(travel_time, "travel time, waiting included", "s", 1),
     "backlog_veh": Metric(backlog_veh, "vehicles waiting to enter", "", 0),
 }
 
