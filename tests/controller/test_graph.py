@@ -9,7 +9,8 @@ import pytest
 
 from tests.controller.test_sample import perceived
 from unjam.controller.verify import check_graph, run_graph
-from unjam.drivers import LACC, Constant, LocalState
+from unjam.drivers import LACC, Constant
+from unjam.drivers.local_state import EVERYWHERE
 from unjam.errors import InputError, MissingPartError
 
 onnx = pytest.importorskip("onnx")
@@ -26,7 +27,7 @@ def graph(change: Change = lambda model: None, remembered: tuple[str, ...] = ())
     def value(name: str) -> Any:
         return rows(name, TensorProto.DOUBLE, ["cavs"])
 
-    inputs = [*LocalState._fields, *(f"memory.{name}" for name in remembered)]
+    inputs = [*EVERYWHERE, *(f"memory.{name}" for name in remembered)]
     outputs = ["acceleration", *(f"next.{name}" for name in remembered)]
     nodes = [helper.make_node("Sub", ["leader_speed", "speed"], ["acceleration"])]
     nodes += [helper.make_node("Add", [f"memory.{name}", "speed"], [f"next.{name}"]) for name in remembered]

@@ -9,6 +9,7 @@ from unjam.controller.file import description
 from unjam.drivers import IDM, Driver, FollowerStopper, LocalState, Pacer, PISaturation
 from unjam.drivers.check import random_state
 from unjam.drivers.from_file import FileDriver
+from unjam.drivers.local_state import EVERYWHERE
 from unjam.drivers.observation import observed
 from unjam.drivers.wrappers import Mixed
 from unjam.tree import leaves
@@ -41,7 +42,7 @@ def test_it_is_plain_json(name: str) -> None:
 
 def test_what_is_observed_is_in_the_order_of_a_local_state() -> None:
     said = description(IDM())["observation"]
-    assert [entry["name"] for entry in said] == list(LocalState._fields)
+    assert [entry["name"] for entry in said] == list(EVERYWHERE)
     assert {entry["unit"] for entry in said} == {"m", "m/s"}
 
 

@@ -22,7 +22,6 @@ from unjam.drivers import (
     Driver,
     FollowerStopper,
     Human,
-    LocalState,
     Pacer,
     PISaturation,
     ResidualDriver,
@@ -62,7 +61,7 @@ def longest_stay(scenario: Scenario, driver: Driver, simulation: Simulation) -> 
 
 def agree(driver: Driver, stay: Trajectory) -> None:
     """Driver and graph, given what was perceived, answer what was commanded on the road."""
-    states = LocalState(*(values[:-1] for values in stay.states))
+    states = stay.states.at(slice(-1))
     np.testing.assert_allclose(replay(driver, states, 1.0), stay.applied, rtol=0, atol=1e-9)
     part = onnx_graph(driver, 1.0)
     check_graph(part, driver)

@@ -26,7 +26,7 @@ def test_answers_are_those_of_a_driver_that_remembers() -> None:
     driver, states = residual(PISaturation(), hold=3), perceived()
     memory, expected = driver.initial_memory(1), []
     for step in range(len(states.speed)):
-        answer, memory = driver.act(LocalState(*(values[[step]] for values in states)), memory)
+        answer, memory = driver.act(states.at([step]), memory)
         expected.append(answer[0])
     np.testing.assert_array_equal(replay(driver, states, 1.0), np.clip(expected, -1.0, 1.0))
 

@@ -74,8 +74,8 @@ def test_varying_is_the_pacer_that_was_tuned_for_the_nearest_lap(lap: float) -> 
 def test_varying_rows_are_each_led_at_the_pace_of_their_own_lap() -> None:
     laps = list(TUNED)
     one_by_one = [wanted(Pacer(varying=True), state(gap=0.55 * lap, place=0.2, loop=lap)) for lap in laps]
-    columns = zip(*(state(gap=0.55 * lap, place=0.2, loop=lap) for lap in laps), strict=True)
-    rows = LocalState(*(np.concatenate(column) for column in columns))
+    first, *others = (state(gap=0.55 * lap, place=0.2, loop=lap) for lap in laps)
+    rows = first.each(lambda *columns: np.concatenate(columns), *others)
     pacer = Pacer(varying=True)
     acceleration, memory = pacer.act(rows, pacer.initial_memory(len(laps)))
     assert acceleration * pacer.time_constant == pytest.approx(one_by_one)

@@ -58,7 +58,7 @@ def test_plain_numbers_give_what_arrays_give(hold: int) -> None:
     for _ in range(25):
         state = random_state(generator, 1)
         expected, memory = driver.act(state, memory)
-        found, numbers = driver.act(LocalState(*(float(values[0]) for values in state)), numbers)
+        found, numbers = driver.act(state.each(lambda values: float(values[0])), numbers)
         assert found == pytest.approx(float(expected[0]), abs=1e-12)
 
 
@@ -75,7 +75,7 @@ def test_tensors_give_what_arrays_give(hold: int) -> None:
         state, noise = random_state(generator, 6), generator.normal(size=6)
         expected = driver.decide(state, memory, lambda: noise)  # noqa: B023
         memory = expected.memory
-        on_tensors = LocalState(*(torch.tensor(values) for values in state))
+        on_tensors = state.each(lambda values: torch.tensor(values))
         found = driver.decide(on_tensors, tensors, lambda: torch.tensor(noise))  # noqa: B023
         tensors = found.memory
         np.testing.assert_allclose(

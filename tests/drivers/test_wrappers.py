@@ -35,7 +35,7 @@ def test_it_drives_tensors_as_it_drives_arrays() -> None:
     mixed, state = Mixed((PI, IDM())), random_state(np.random.default_rng(1), 4)
     assert mixed.tensors
     expected, _ = mixed.act(state, mixed.initial_memory(4))
-    tensors = type(state)(*(torch.as_tensor(values) for values in state))
+    tensors = state.each(lambda values: torch.as_tensor(values))
     memory = mapped(torch.as_tensor, mixed.initial_memory(4))
     np.testing.assert_allclose(mixed.act(tensors, memory)[0].numpy(), expected, atol=1e-12)
 

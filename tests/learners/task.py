@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from stable_baselines3.common.policies import BasePolicy
 
 from unjam.drivers import LocalState, PISaturation
+from unjam.drivers.local_state import EVERYWHERE
 from unjam.drivers.network import Network
 from unjam.learners.algorithm_1 import Collected, Iteration, Training, Validated, algorithm_1
 from unjam.learners.learner import AgentSpec, make_learner, policy_spaces
@@ -69,7 +70,7 @@ def episode_of(network: Network, seed: tuple[int, ...], hold: int, target: Targe
     trajectory = Trajectory(
         vehicle="cav_0",
         start=0,
-        states=LocalState(*[np.zeros(DECISIONS + 1)] * len(LocalState._fields)),
+        states=LocalState(*[np.zeros(DECISIONS + 1)] * len(EVERYWHERE)),
         observations=observations,
         expert=nothing,
         residual=residual,

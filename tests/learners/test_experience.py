@@ -9,6 +9,7 @@ from stable_baselines3.common.buffers import ReplayBuffer, RolloutBuffer
 
 from tests.learners.task import make_policy, shake
 from unjam.drivers import LocalState
+from unjam.drivers.local_state import EVERYWHERE
 from unjam.learners.experience import (
     Experience,
     add_to_replay_buffer,
@@ -33,7 +34,7 @@ def make_trajectory(seed: int, decisions: int, hold: int = 1, terminated: bool =
     return Trajectory(
         vehicle="cav_0",
         start=0,
-        states=LocalState(*[np.zeros(decisions + 1)] * len(LocalState._fields)),
+        states=LocalState(*[np.zeros(decisions + 1)] * len(EVERYWHERE)),
         observations=generator.normal(size=(choices + 1, INPUTS)),
         expert=nothing,
         residual=np.repeat(generator.normal(size=choices), hold)[:decisions],

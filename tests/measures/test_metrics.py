@@ -71,9 +71,7 @@ def episode_of(
         "positions": positions,
         "gaps": states.leader_gap.T,
         "outline": np.column_stack([angles * radius, radius * np.cos(angles), radius * np.sin(angles)]),
-        "trajectories": tuple(
-            trajectory_of(LocalState(*(values[n] for values in states)), applied) for n in range(cavs)
-        ),
+        "trajectories": tuple(trajectory_of(states.at(n), applied) for n in range(cavs)),
     }
     return Episode(**{**values, **changes})
 
@@ -338,7 +336,8 @@ def test_a_failed_episode_has_its_reason_and_no_metrics() -> None:
 
 def test_a_row_has_the_episode_what_was_drawn_and_every_metric() -> None:
     row = measure(episode_of(steady(4.0), seed=(7, 1)))
-    assert set(row) == {"seed", "status", "reason", "error", "steps", "length", "floor", "drivable", *METRICS}
+    about = {"seed", "status", "reason", "error", "steps", "length", "floor", "lanes", "drivable"}
+    assert set(row) == about | set(METRICS)
     assert row["seed"] == [7, 1]
     assert row["length"] == LENGTH
     assert measure(episode_of(steady(4.0), seed=(7,)))["seed"] == 7

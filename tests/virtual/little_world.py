@@ -54,7 +54,7 @@ class LittleWorld:
         )
         speeds = stack_columns((speed, leader_speed, follower_speed))
         headways = as_column(leader_gap / speed.clip(1e-3, None))
-        terms = released(Outcome(speeds, as_column(applied), headways, crashed))
+        terms = released(Outcome(speeds, as_column(applied), headways, crashed, 0.0 * applied))
         reward = sum(terms.values()) + self.bonus * 0.1 * (state.leader_gap / 20.0) * ~crashed
         xp = namespace(speed)
         nothing = xp.zeros_like(speed)

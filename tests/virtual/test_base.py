@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from unjam.drivers import LocalState
 from unjam.drivers.check import random_state
-from unjam.drivers.local_state import LARGEST_GAP
+from unjam.drivers.local_state import EVERYWHERE, LARGEST_GAP
 from unjam.drivers.network import Network
 from unjam.physics import IDMParameters
 from unjam.scenarios import Ring, make_scenario
@@ -46,7 +46,9 @@ def test_moves_as_equations_5_and_6_and_euler_steps_say(seed: int, ring: Ring) -
     found = base_step("idm", ring, state, applied)
     for row in range(3):
         expected = literal_step(
-            {name: float(values[row]) for name, values in state._asdict().items()}, float(applied[row]), ring
+            {name: float(values[row]) for name, values in zip(EVERYWHERE, state, strict=False)},
+            float(applied[row]),
+            ring,
         )
         for name, value in expected.items():
             assert getattr(found, name)[row] == pytest.approx(value, abs=1e-9), name
@@ -58,9 +60,9 @@ def test_tensors_move_as_arrays_do(base: str, ring: Ring) -> None:
     generator = np.random.default_rng(1)
     state, applied = with_nobody(random_state(generator, 8)), generator.uniform(-1, 1, 8)
     expected = base_step(base, ring, state, applied)
-    tensors = LocalState(*(torch.tensor(values) for values in state))
+    tensors = state.each(lambda values: torch.tensor(values))
     found = base_step(base, ring, tensors, torch.tensor(applied))
-    for name in LocalState._fields:
+    for name in EVERYWHERE:
         np.testing.assert_allclose(getattr(found, name).numpy(), getattr(expected, name), atol=1e-12)
 
 
@@ -111,7 +113,7 @@ def expected_reward(name: str, speeds: list[float], headway: float, applied: flo
 def test_the_reward_takes_the_mean_speed_of_those_that_are_there(name: str, kind: Any) -> None:
     state = with_nobody(random_state(np.random.default_rng(5), 3))
     applied = np.array([0.5, -1.0, 0.0])
-    on_kind = LocalState(*(kind(values) for values in state))
+    on_kind = state.each(lambda values: kind(values))
     found = base_reward("idm", make_reward(name), on_kind, kind(applied), kind([False, False, False]))
     for row, absentee in enumerate(["leader_speed", "follower_speed", ""]):
         names = [n for n in ("speed", "leader_speed", "follower_speed") if n != absentee]

@@ -10,6 +10,7 @@ from unjam.drivers import IDM, Driver, LocalState, PISaturation, ResidualDriver
 from unjam.drivers.check import random_state
 from unjam.drivers.driver import Memory
 from unjam.drivers.from_file import FileDriver
+from unjam.drivers.local_state import EVERYWHERE, like_ones
 from unjam.errors import InputError
 from unjam.scenarios import Ring
 from unjam.tree import leaves, mapped
@@ -109,7 +110,7 @@ def test_on_tensors_it_drives_as_on_arrays(number: int, my_drivers: Path) -> Non
     for _ in range(50):
         state = random_state(generator, 4)
         expected, memory = expert.act(state, memory)
-        in_world = LocalState(*(torch.tensor(values, dtype=torch.float32) for values in state))
+        in_world = state.each(lambda values: torch.tensor(values, dtype=torch.float32))
         found, tensors = on_world.act(in_world, tensors)
         assert found.dtype == torch.float32
         np.testing.assert_allclose(found.numpy(), expected, atol=1e-4)
@@ -121,7 +122,7 @@ def test_on_tensors_it_drives_as_on_arrays(number: int, my_drivers: Path) -> Non
 
 
 def test_an_acceleration_that_is_not_finite_is_told(my_drivers: Path) -> None:
-    state = LocalState(*(torch.ones(3) for _ in LocalState._fields))
+    state = like_ones(EVERYWHERE, torch.ones, 3)
     with pytest.raises(InputError, match="virtual environment: acceleration is nan; allowed: finite"):
         on_tensors(FileDriver(my_drivers, "broken"), "cpu").act(state, {})
     with pytest.raises(InputError, match=r"shape \(4,\); allowed: \(3,\)"):

@@ -31,7 +31,7 @@ def shaken(seed: int = 0) -> EnvironmentModel:
 
 
 def some_inputs(rows: int) -> torch.Tensor:
-    state = LocalState(*(torch.tensor(v).float() for v in random_state(np.random.default_rng(1), rows)))
+    state = random_state(np.random.default_rng(1), rows).each(lambda v: torch.tensor(v).float())
     return model_inputs(state, torch.linspace(-1, 1, rows), torch.full((rows, 1), 0.4))
 
 

@@ -112,7 +112,7 @@ def replay(driver: ResidualDriver, data: ActualData, place: int) -> tuple[np.nda
     recording = data.recordings[place]
     memory, seen, residuals = driver.initial_memory(1), [], []
     for step in range(len(recording.states.speed)):
-        state = LocalState(*(values[step : step + 1] for values in recording.states))
+        state = recording.states.at(slice(step, step + 1))
         seen.append(driver.observation(state, memory)[0])
         decision = driver.decide(state, memory)
         residuals.append(decision.residual[0])

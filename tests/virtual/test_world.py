@@ -40,7 +40,7 @@ def model(members: int = 1, residual: dict[str, float] | None = None, drawn: int
 
 
 def some_state(rows: int, seed: int = 1) -> LocalState:
-    return LocalState(*(torch.tensor(v).float() for v in random_state(np.random.default_rng(seed), rows)))
+    return random_state(np.random.default_rng(seed), rows).each(lambda v: torch.tensor(v).float())
 
 
 def world(of: EnvironmentModel, noise: bool = False, ring: Ring = RING, seed: int = 3) -> VirtualDynamics:
@@ -77,9 +77,9 @@ def test_rows_at_once_step_as_single_rows(seed: int) -> None:
     found = together.step(state, applied, drawn)
     for row in range(5):
         here = slice(row, row + 1)
-        alone = together.step(LocalState(*(v[here] for v in state)), applied[here], drawn[here])
+        alone = together.step(state.at(here), applied[here], drawn[here])
         assert_close(alone.reward, found.reward[here])
-        assert_close(torch.stack(alone.state), torch.stack(found.state)[:, here])
+        assert_close(torch.stack(alone.state[:7]), torch.stack(found.state[:7])[:, here])
         assert torch.equal(alone.crashed, found.crashed[here])
         assert torch.equal(alone.bounded, found.bounded[:, here])
 
@@ -148,8 +148,10 @@ def test_noise_has_the_distribution_of_the_errors() -> None:
     error = torch.randn(len(noisy.noise), generator=torch_generator((5,), "cpu"))
     noisy.noise[:, TARGETS.index("leader_speed")] = 0.5 * error
     noisy.noise[:, TARGETS.index("leader_gap")] = 0.2 * error
-    state = LocalState(*(values.repeat(20_000) for values in some_state(1)))._replace(
-        leader_gap=torch.full((20_000,), 30.0), leader_speed=torch.full((20_000,), 9.0)
+    state = (
+        some_state(1)
+        .each(lambda values: values.repeat(20_000))
+        ._replace(leader_gap=torch.full((20_000,), 30.0), leader_speed=torch.full((20_000,), 9.0))
     )
     push, drawn = torch.zeros(20_000), torch.zeros(20_000, 1)
     found = world(noisy, noise=True).step(state, push, drawn).state
@@ -200,7 +202,7 @@ def test_the_same_seed_gives_the_same_bits() -> None:
     several = model(members=4)
     several.noise.normal_(generator=torch_generator((8,), "cpu"))
     one, again, other = (world(several, noise=True, seed=seed).step(state, push, drawn) for seed in (1, 1, 2))
-    assert torch.equal(torch.stack(one.state), torch.stack(again.state))
+    assert torch.equal(torch.stack(one.state[:7]), torch.stack(again.state[:7]))
     assert torch.equal(one.reward, again.reward)
     assert not torch.equal(one.reward, other.reward)
 
@@ -211,6 +213,7 @@ def test_a_users_reward_is_asked_through_numpy(my_drivers: Path) -> None:
         torch.tensor([[1.0], [-0.5]]),
         torch.ones(2, 1),
         torch.zeros(2, dtype=torch.bool),
+        torch.zeros(2),
     )
     found = reward_on_tensors(f"{my_drivers}:calm")(outcome)
     assert_close(found["speed"], torch.tensor([2.0, 3.0]))

@@ -76,9 +76,9 @@ def test_progress_is_told_now_and_then() -> None:
 def test_it_goes_on_from_a_memory() -> None:
     states = LocalState(*(np.full((6, 2), value) for value in (4.0, 5.0, 10.0, 3.0, 8.0, 20.0, 250.0)))
     whole = drive(RecordedWorld(states, Limits(-1.0, 1.0)), PI)
-    first = Drive(RecordedWorld(states.each(lambda values: values[:2]), Limits(-1.0, 1.0)), PI)
+    first = Drive(RecordedWorld(states.at(slice(2)), Limits(-1.0, 1.0)), PI)
     assert len(list(first)) == 2
-    rest = RecordedWorld(states.each(lambda values: values[2:]), Limits(-1.0, 1.0))
+    rest = RecordedWorld(states.at(slice(2, None)), Limits(-1.0, 1.0))
     np.testing.assert_array_equal(drive(rest, PI, memory=first.memory), whole[2:])
 
 

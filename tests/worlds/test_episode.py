@@ -129,7 +129,7 @@ def test_all_that_is_recorded_has_a_row_for_each_decision_and_one_for_the_end(
         assert np.isfinite(array).all()
     for trajectory in episode.trajectories:
         assert trajectory.start == 0
-        assert {values.shape for values in trajectory.states} == {(61,)}
+        assert {values.shape for values in trajectory.states if values is not None} == {(61,)}
         assert trajectory.observations.shape == (-(-60 // hold) + 1, 5)
         once = (trajectory.expert, trajectory.residual, trajectory.applied, trajectory.shield)
         assert {values.shape for values in once} == {(60,)}
@@ -191,10 +191,10 @@ def test_a_residual_drivers_record_adds_up(
             total = np.clip(trajectory.expert + trajectory.residual, -0.5, 0.5)
             np.testing.assert_array_equal(trajectory.applied, total)
             assert np.abs(trajectory.expert).max() <= 0.5
-            seen = local_vector(LocalState(*(values[::hold] for values in trajectory.states)))
+            seen = local_vector(trajectory.states.at(slice(None, None, hold)))
             looks = len(trajectory.observations) - 1
             np.testing.assert_allclose(trajectory.observations[:-1], seen[:looks], atol=1e-12)
-            end = local_vector(LocalState(*(values[-1:] for values in trajectory.states)))
+            end = local_vector(trajectory.states.at(slice(-1, None)))
             np.testing.assert_allclose(trajectory.observations[-1:], end, atol=1e-12)
     for trajectory in calm.trajectories:
         wanted = driver.network(trajectory.observations[:-1])
@@ -363,6 +363,6 @@ def test_a_trajectory_begins_with_what_its_expert_remembered_of_the_warmup(simul
     assert trajectory.memory["seen"] == 30
     memory = {name: values[None] for name, values in trajectory.memory.items()}
     for step in range(20):
-        seen = LocalState(*(values[step : step + 1] for values in trajectory.states))
+        seen = trajectory.states.at(slice(step, step + 1))
         expert, memory = driver.expert.act(seen, memory)
         assert np.clip(expert[0], -1.0, 1.0) == pytest.approx(trajectory.expert[step], abs=1e-12)

@@ -24,7 +24,8 @@ def outcomes(draw: st.DrawFn) -> Outcome:
     headways = draw(hnp.arrays(np.float64, (rows, cavs), elements=st.floats(-1, 1e5)))
     away = draw(hnp.arrays(np.bool_, (rows, cavs)))
     accelerations[away] = headways[away] = np.nan
-    return Outcome(speeds, accelerations, headways, draw(hnp.arrays(np.bool_, rows)))
+    waiting = draw(hnp.arrays(np.float64, rows, elements=st.integers(0, 50).map(float)))
+    return Outcome(speeds, accelerations, headways, draw(hnp.arrays(np.bool_, rows)), waiting)
 
 
 def there(values: np.ndarray) -> list[float]:
@@ -38,7 +39,7 @@ def mean(values: list[float]) -> float:
 
 def one(speeds: list[float], accelerations: list[float], crashed: bool = False) -> Outcome:
     headways = np.full((1, len(accelerations)), 10.0)
-    return Outcome(np.array([speeds]), np.array([accelerations]), headways, np.array([crashed]))
+    return Outcome(np.array([speeds]), np.array([accelerations]), headways, np.array([crashed]), np.zeros(1))
 
 
 def total(terms: dict[str, Any]) -> Any:
@@ -107,7 +108,9 @@ def test_released_merge_is_one_less_the_distance_from_twenty_and_lacking_headway
 def test_released_merge_by_hand(
     speeds: list[float], headways: list[float], crashed: bool, expected: float
 ) -> None:
-    outcome = Outcome(np.array([speeds]), np.zeros((1, 1)), np.array([headways]), np.array([crashed]))
+    outcome = Outcome(
+        np.array([speeds]), np.zeros((1, 1)), np.array([headways]), np.array([crashed]), np.zeros(1)
+    )
     assert total(REWARDS["released-merge"](outcome))[0] == pytest.approx(expected)
 
 
@@ -155,6 +158,13 @@ def test_tensors_earn_what_arrays_earn(outcome: Outcome, name: str) -> None:
 
 
 @given(outcomes())
+def test_travel_time_counts_who_is_there_and_who_waits(outcome: Outcome) -> None:
+    found = REWARDS["travel-time"](outcome)["travel"]
+    for row, waiting in enumerate(outcome.waiting.tolist()):
+        assert found[row] == pytest.approx(-(len(there(outcome.speeds[row])) + waiting) / 100.0)
+
+
+@given(outcomes())
 def test_power_is_flow_times_mean_speed_in_units_of_thirty_vehicles_at_twenty(outcome: Outcome) -> None:
     for numbers in (outcome, Outcome(*(torch.from_numpy(values) for values in outcome))):
         terms = REWARDS["power"](numbers)
@@ -182,7 +192,7 @@ def test_a_headway_is_gap_over_speed_and_very_long_for_a_standing_vehicle() -> N
 
 
 def test_rewards_are_found_by_name() -> None:
-    assert set(REWARDS) == {"released", "released-merge", "eq16", "eq16-as-printed", "power"}
+    assert set(REWARDS) == {"released", "released-merge", "eq16", "eq16-as-printed", "power", "travel-time"}
     assert make_reward("released") is released
 
 
@@ -192,6 +202,7 @@ def test_ones_own_reward_comes_from_a_file(my_drivers: Path) -> None:
         np.array([[1.0, -1.0], [0.5, 0.0]]),
         np.full((2, 2), 9.0),
         np.array([False, False]),
+        np.zeros(2),
     )
     terms = make_reward(f"{my_drivers}:calm")(outcome)
     assert {name: values.tolist() for name, values in terms.items()} == {
@@ -234,6 +245,6 @@ def test_what_ones_own_reward_raises_is_told_with_its_line(tmp_path: Path) -> No
 
 @pytest.mark.parametrize("name", ["fame", "", "Released", "released "])
 def test_an_unknown_reward_lists_the_known(name: str) -> None:
-    known = "released, released-merge, eq16, eq16-as-printed, power, path.py:name"
+    known = "released, released-merge, eq16, eq16-as-printed, power, travel-time, path.py:name"
     with pytest.raises(InputError, match=f"reward: {name!r} is not allowed; allowed: {known}"):
         make_reward(name)

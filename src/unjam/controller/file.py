@@ -211,7 +211,7 @@ def description(driver: Driver, action_limit: float | None = None) -> dict[str, 
     low, high = driver.limits or (None if action_limit is None else -action_limit, action_limit)
     remembered = leaves(driver.initial_memory(1))
     return {
-        "observation": [{"name": name, "unit": unit} for name, unit in STATE_UNITS.items()],
+        "observation": [{"name": name, "unit": STATE_UNITS[name]} for name in driver.perceives],
         "networks": _networks(driver),
         "memory": [_remembered(name, value[0]) for name, value in remembered],
         "action": {"name": "acceleration", "unit": "m/s2", "low": low, "high": high},

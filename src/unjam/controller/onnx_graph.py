@@ -5,6 +5,7 @@ import logging
 import warnings
 from collections.abc import Callable
 from contextlib import redirect_stdout
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,7 @@ from torch import Tensor, nn
 from unjam.controller.verify import graph_names, needed
 from unjam.drivers.command import Limits
 from unjam.drivers.driver import Driver, Memory
-from unjam.drivers.local_state import LocalState
+from unjam.drivers.local_state import LocalState, like_ones
 from unjam.drivers.speed_history import WrittenRows
 from unjam.errors import InputError
 from unjam.tree import leaves, rebuilt
@@ -37,8 +38,9 @@ class Whole(nn.Module):
 
     def forward(self, *arrays: Tensor) -> tuple[Tensor, ...]:
         """Return the acceleration [m/s2] and what is remembered, for the state and memory `arrays`."""
-        count = len(LocalState._fields)
-        state = LocalState(*arrays[:count])
+        names = self.driver.perceives
+        count = len(names)
+        state = LocalState(**dict(zip(names, arrays[:count], strict=True)))
         memory = _with_windows(dict(zip(self.remembered, arrays[count:], strict=True)))
         wanted, after = self.driver.act(state, rebuilt(self.example, memory))
         kept = dict(leaves(after))
@@ -84,7 +86,8 @@ def onnx_graph(driver: Driver, limit: float) -> bytes:
         raise InputError(f"onnx: {driver.describe()} is not allowed; allowed: drivers that run on tensors")
     exact = {torch.ops.aten.scalar_tensor.default: _exact_constant()}
     inputs, outputs = graph_names(driver)
-    state = [torch.ones(ROWS, dtype=torch.float64) for _ in LocalState._fields]
+    ones = partial(torch.ones, dtype=torch.float64)
+    state = [value for value in like_ones(driver.perceives, ones, ROWS) if value is not None]
     memory = (rows for _, rows in leaves(driver.initial_memory(ROWS)))
     arrays = (*state, *(torch.as_tensor(value, dtype=torch.float64) for value in memory))
     rows = torch.export.Dim("cavs")

@@ -8,7 +8,7 @@ from safetensors.numpy import load, save
 
 from unjam.drivers.command import Limits
 from unjam.drivers.driver import Driver
-from unjam.drivers.local_state import LocalState
+from unjam.drivers.local_state import BY_SECTION, EVERYWHERE, SECTIONS_AHEAD, LocalState
 from unjam.errors import InputError
 from unjam.worlds.drive import drive
 from unjam.worlds.world import RecordedWorld
@@ -21,7 +21,8 @@ ANSWER = "acceleration"
 
 def sample_bytes(driver: Driver, states: LocalState, limit: float) -> bytes:
     """Return the part of an archive with `states`, arrays of shape (T,), and the answers of `driver`."""
-    arrays = {name: np.array(values, np.float64) for name, values in states._asdict().items()}
+    seen = {name: values for name, values in states._asdict().items() if values is not None}
+    arrays = {name: np.array(values, np.float64) for name, values in seen.items()}
     return save({**arrays, ANSWER: replay(driver, states, limit)})
 
 
@@ -32,13 +33,15 @@ def read_sample(part: bytes) -> tuple[LocalState, Floats]:
         InputError: an array is missing, unknown, of another shape or type, or an acceleration is not finite.
     """
     arrays: dict[str, Any] = load(part)
-    names = {*LocalState._fields, ANSWER}
-    if arrays.keys() != names:
-        wrong = min(arrays.keys() ^ names)
-        raise InputError(f"sample: {wrong!r} is {'missing' if wrong in names else 'unknown'}")
+    needed, known = {*EVERYWHERE, ANSWER}, {*LocalState._fields, ANSWER}
+    wrong = (needed - arrays.keys()) | (arrays.keys() - known)
+    if wrong:
+        first = min(wrong)
+        raise InputError(f"sample: {first!r} is {'missing' if first in needed else 'unknown'}")
     answers = arrays.pop(ANSWER)
     for name, values in {**arrays, ANSWER: answers}.items():
-        if values.ndim != 1 or values.shape != answers.shape or values.dtype != np.float64:
+        shape = (len(values), SECTIONS_AHEAD) if name in BY_SECTION else answers.shape
+        if values.ndim != len(shape) or values.shape != shape or values.dtype != np.float64:
             raise InputError(f"sample: {name!r} has shape {values.shape} of {values.dtype}; allowed: numbers")
     if not np.isfinite(answers).all():
         raise InputError("sample: a recorded acceleration is not finite")
@@ -56,5 +59,5 @@ def replay(driver: Driver, states: LocalState, limit: float) -> Floats:
     Returns:
         Accelerations [m/s2], shape (T,).
     """
-    world = RecordedWorld(states.each(lambda values: values[:, None]), Limits.symmetric(limit))
+    world = RecordedWorld(states.at(np.s_[:, None]), Limits.symmetric(limit))
     return drive(world, driver).ravel()

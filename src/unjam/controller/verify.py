@@ -41,7 +41,7 @@ OPERATORS = {
     *("Abs", "Add", "And", "Cast", "Clip", "Concat", "Constant", "Cos", "Div", "Equal", "Expand", "Floor"),
     *("Gather", "GatherElements", "GatherND", "Gemm", "Greater", "GreaterOrEqual", "Identity", "IsNaN"),
     *("Less", "LessOrEqual", "MatMul", "Max", "Min", "Mod", "Mul", "Neg", "Not", "Or", "Pow", "Relu"),
-    "Reciprocal",
+    *("Reciprocal", "ReduceMean"),
     *("Reshape", "ScatterElements", "Shape", "Sin", "Slice", "Sqrt", "Squeeze", "Sub", "Tanh", "Transpose"),
     *("Unsqueeze", "Where"),
 }
@@ -159,7 +159,7 @@ def _compare(who: str, found: np.ndarray, recorded: np.ndarray, tolerance: float
 def graph_names(driver: Driver) -> tuple[list[str], list[str]]:
     """Return the names of a graph's inputs (state, memory) and outputs (acceleration, memory after it)."""
     remembered = [name for name, _ in leaves(driver.initial_memory(1))]
-    inputs = [*LocalState._fields, *(f"memory.{name}" for name in remembered)]
+    inputs = [*driver.perceives, *(f"memory.{name}" for name in remembered)]
     return inputs, [ANSWER, *(f"next.{name}" for name in remembered)]
 
 
@@ -213,7 +213,8 @@ def run_graph(part: bytes, driver: Driver, states: LocalState) -> Floats:
     try:
         session = runtime.InferenceSession(part, options, providers=["CPUExecutionProvider"])
         for step in range(len(answers)):
-            seen = [values[step : step + 1] for values in states]
+            now = states.at(slice(step, step + 1))
+            seen = [getattr(now, name) for name in driver.perceives]
             acceleration, *memory = session.run(None, dict(zip(inputs, [*seen, *memory], strict=True)))
             answers[step] = acceleration[0]
     except Exception as error:  # the runtime's own kinds of error

@@ -6,7 +6,7 @@ import numpy as np
 
 from unjam.drivers.command import as_rows
 from unjam.drivers.driver import Memory
-from unjam.drivers.local_state import LocalState
+from unjam.drivers.local_state import SECTIONS_AHEAD, LocalState
 from unjam.errors import InputError
 from unjam.tree import leaves, mapped
 
@@ -32,11 +32,11 @@ def check_driver(driver: Any, rows: int = 8, steps: int = 50, seed: int = 0) -> 
     for method in ("initial_memory", "act"):
         if not callable(getattr(driver, method, None)):
             raise InputError(f"driver: has no {method}(); see unjam.drivers.Driver")
-    generator = np.random.default_rng(seed)
+    generator, told = np.random.default_rng(seed), bool(getattr(driver, "told", ()))
     memory = driver.initial_memory(rows)
     single = [driver.initial_memory(1) for _ in range(rows)]
     for step in range(steps):
-        state = random_state(generator, rows)
+        state = random_state(generator, rows, told)
         before = mapped(np.array, memory)  # a copy
         acceleration, after = driver.act(state, memory)
         acceleration = check_acceleration(acceleration, rows, f"step {step}")
@@ -46,7 +46,7 @@ def check_driver(driver: Any, rows: int = 8, steps: int = 50, seed: int = 0) -> 
         if not np.array_equal(acceleration, again):
             raise InputError(f"driver: step {step}: the same state and memory gave another acceleration")
         for row in range(rows):
-            one = state.each(lambda values: values[row : row + 1])  # noqa: B023
+            one = state.at(slice(row, row + 1))
             answer, single[row] = driver.act(one, single[row])
             alone, among = float(np.asarray(answer)[0]), float(acceleration[row])
             if not abs(alone - among) <= TOLERANCE:
@@ -63,12 +63,17 @@ def check_acceleration(acceleration: Any, rows: int, where: str) -> np.ndarray:
     return array
 
 
-def random_state(generator: np.random.Generator, rows: int) -> LocalState:
-    """Return random surroundings, standing and close vehicles among them."""
+def random_state(generator: np.random.Generator, rows: int, told: bool = False) -> LocalState:
+    """Return random surroundings, standing and close vehicles among them; `told`: of the road ahead too."""
     speeds = generator.uniform(0.0, 12.0, (3, rows)) * (generator.random((3, rows)) > 0.2)
     gaps = generator.uniform(0.5, 60.0, (2, rows))
     position = generator.uniform(0.0, 230.0, rows)
-    return LocalState(speeds[0], speeds[1], gaps[0], speeds[2], gaps[1], position, np.full(rows, 230.0))
+    near = speeds[0], speeds[1], gaps[0], speeds[2], gaps[1], position, np.full(rows, 230.0)
+    if not told:
+        return LocalState(*near)
+    speeds = generator.uniform(0.0, 30.0, (2, rows, SECTIONS_AHEAD))
+    allowed, to_merge = generator.uniform(20.0, 30.0, rows), generator.uniform(-500.0, 2000.0, rows)
+    return LocalState(*near, allowed, to_merge, *speeds)
 
 
 def _equal(memory: Memory, other: Memory) -> bool:

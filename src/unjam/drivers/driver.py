@@ -8,7 +8,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from unjam.drivers.command import Command, Limits
-from unjam.drivers.local_state import LocalState, Observed
+from unjam.drivers.local_state import EVERYWHERE, LocalState, Observed
 from unjam.physics.arrays import Array
 from unjam.tree import Arrays, mapped
 
@@ -64,6 +64,9 @@ class Driver:
     needs_loop: ClassVar[bool] = False
     """True where it must know its place on a closed road"""
 
+    told: ClassVar[tuple[str, ...]] = ()
+    """fields of a `LocalState` that it looks at and that only some roads offer"""
+
     observed_memory: ClassVar[tuple[Observed, ...]] = ()
     """what `memory_features` are, in order"""
 
@@ -118,6 +121,12 @@ class Driver:
     def shown(self) -> tuple[Observed, ...] | None:
         """What its own network sees, in order; None without one."""
         return None
+
+    @property
+    def perceives(self) -> tuple[str, ...]:
+        """The fields of a `LocalState` that it is given."""
+        asked = {*EVERYWHERE, *self.told}.union(*(held.perceives for held in self.inner.values()))
+        return tuple(name for name in LocalState._fields if name in asked)
 
     def describe(self) -> str:
         """Return it in a few words: its name and the parameters that differ from the defaults."""

@@ -1,6 +1,6 @@
 """What a CAV perceives, in every world."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from math import pi
 from typing import Any, NamedTuple
 
@@ -30,19 +30,54 @@ class LocalState(NamedTuple):
     loop_length: Array
     """length of the closed road [m]; NaN on an open one"""
 
+    # What only some roads offer; None elsewhere.
+
+    allowed_speed: Array = None
+    """as fast as it may and wants to drive here [m/s]"""
+    to_merge: Array = None
+    """how far ahead a ramp's lane begins to run beside the road [m]; negative behind it"""
+    lane_speeds: Array = None
+    """mean speeds in its own lane of the sections of `SECTION` metres ahead, its own first, as a message
+    said: (n, SECTIONS_AHEAD) [m/s]; where nobody is, what is allowed"""
+    road_speeds: Array = None
+    """the same over all lanes of the main road"""
+
     def each(self, function: Callable[..., Any], *others: "LocalState") -> "LocalState":
         """Return `function` of each quantity, and of the same quantity of the other states."""
-        return LocalState(*map(function, self, *others))
+        return LocalState(
+            *(None if values[0] is None else function(*values) for values in zip(self, *others, strict=True))
+        )
+
+    def at(self, index: Any) -> "LocalState":
+        """Return the state of some rows or moments, as an array's `index` says."""
+        return self.each(lambda values: values[index])
 
 
 LARGEST_GAP = 100.0
 """The gap that stands for `nobody there` [m]."""
 
+SECTION = 100.0
+"""of a road whose mean speeds are told [m]"""
+SECTIONS_AHEAD = 11
+
 SPEED_SCALE = 10.0
 """what speeds are divided by before a network sees them [m/s]"""
 
-STATE_UNITS = dict(zip(LocalState._fields, ("m/s", "m/s", "m", "m/s", "m", "m", "m"), strict=True))
+_UNITS = ("m/s", "m/s", "m", "m/s", "m", "m", "m", "m/s", "m", "m/s", "m/s")
+STATE_UNITS = dict(zip(LocalState._fields, _UNITS, strict=True))
 """units of a `LocalState`, in its order"""
+
+
+EVERYWHERE = tuple(name for name in LocalState._fields if name not in LocalState._field_defaults)
+"""what every road offers"""
+BY_SECTION = ("lane_speeds", "road_speeds")
+"""what has a number for each section ahead"""
+
+
+def like_ones(names: Sequence[str], ones: Callable[..., Any], rows: int = 1) -> LocalState:
+    """Return a state of which `names` are there, all ones: for drivers that are asked what they answer."""
+    shapes = {name: (rows, SECTIONS_AHEAD) if name in BY_SECTION else (rows,) for name in names}
+    return LocalState(**{name: ones(shape) for name, shape in shapes.items()})
 
 
 class Observed(NamedTuple):

@@ -14,15 +14,24 @@ from pydantic import AfterValidator
 
 from unjam.drivers.driver import Driver, Memory, Recipe
 from unjam.drivers.from_file import FileReference, is_file_reference
-from unjam.drivers.local_state import SPEED_SCALE, LocalState, Observed, lap_angle
+from unjam.drivers.local_state import (
+    SECTION,
+    SECTIONS_AHEAD,
+    SPEED_SCALE,
+    LocalState,
+    Observed,
+    lap_angle,
+    like_ones,
+)
 from unjam.errors import InputError
-from unjam.physics.arrays import Array, as_column, join_columns, namespace, stack_columns
+from unjam.physics.arrays import Array, as_column, clip, join_columns, namespace, stack_columns
 
 RELATIVE_SPEED_SCALE = 5.0
 GAP_SCALE = 20.0
 ACCELERATION_SCALE = 1.0
 LOOP_LENGTH_SCALE = 250.0
 ROUTE_POSITION_SCALE = 100.0
+TO_MERGE_SCALE = 1000.0
 
 
 class Seen(NamedTuple):
@@ -44,8 +53,11 @@ class Feature:
     """answers them, about unit size, shape (n, m); a tuple of m for plain numbers; None: there are none"""
     numbers: tuple[Observed, ...] | None
     """what they are, in order; None: what the expert remembers is its own to say"""
-    needs: Literal["", "loop", "coordinate"] = ""
-    """what the road must have: `loop` no ends, `coordinate` a position along it"""
+    needs: Literal["", "loop", "coordinate", "message"] = ""
+    """what the road must have: `loop` no ends, `coordinate` a position along it, `message` a service that
+    tells of the road ahead"""
+    told: tuple[str, ...] = ()
+    """fields of a `LocalState` that it looks at and that only some roads offer"""
     plain: bool = True
     """whether it takes plain numbers and tensors; otherwise it is asked through NumPy"""
 
@@ -80,6 +92,19 @@ def lap_place(state: LocalState) -> Array:
     return stack_columns((xp.cos(angle), xp.sin(angle)))
 
 
+def _speeds_ahead(told: Array, own: Array) -> Array:
+    """Return speeds of the sections ahead less the own one, over `SPEED_SCALE`, shape (n, sections)."""
+    return (told - own[..., None]) / SPEED_SCALE
+
+
+def _sections(whose: str) -> tuple[Observed, ...]:
+    """Return what a feature of the sections ahead says of itself."""
+    return tuple(
+        Observed(f"speed {whose} {SECTION * number:g} m ahead - own", SPEED_SCALE, "m/s")
+        for number in range(SECTIONS_AHEAD)
+    )
+
+
 FEATURES: dict[str, Feature] = {
     "local": Feature(
         lambda seen: local_vector(seen.state),
@@ -111,9 +136,36 @@ FEATURES: dict[str, Feature] = {
         (Observed("position along the road", ROUTE_POSITION_SCALE, "m"),),
         needs="coordinate",
     ),
+    "allowed_speed": Feature(
+        lambda seen: as_column((seen.state.allowed_speed - seen.state.speed) / SPEED_SCALE),
+        (Observed("wanted speed - own", SPEED_SCALE, "m/s"),),
+        needs="message",
+        told=("allowed_speed",),
+    ),
+    "to_merge": Feature(
+        lambda seen: as_column(clip(seen.state.to_merge / TO_MERGE_SCALE, -1.0, 2.0)),
+        (Observed("way to where a ramp joins", TO_MERGE_SCALE, "m"),),
+        needs="message",
+        told=("to_merge",),
+    ),
+    "lane_speeds": Feature(
+        lambda seen: _speeds_ahead(seen.state.lane_speeds, seen.state.speed),
+        _sections("in its lane"),
+        needs="message",
+        told=("lane_speeds",),
+        plain=False,
+    ),
+    "road_speeds": Feature(
+        lambda seen: _speeds_ahead(seen.state.road_speeds, seen.state.speed),
+        _sections("on the road"),
+        needs="message",
+        told=("road_speeds",),
+        plain=False,
+    ),
 }
 """all that a network can be shown: the paper's five numbers; the expert's acceleration; what the expert
-remembers; the length of the closed road; the place on it; the position along a road with ends"""
+remembers; the length of the closed road; the place on it; the position along a road with ends; on motorways
+the wanted speed, the way to where a ramp joins, and the speeds ahead in its lane and on all"""
 
 
 def _known(name: str) -> str:
@@ -146,8 +198,7 @@ def _own_feature(name: str) -> Feature:
             return found
         return namespace(like).as_tensor(found, dtype=like.dtype, device=like.device)
 
-    one = np.ones(1)
-    found = look(Seen(LocalState(*([one] * len(LocalState._fields))), one, Driver(), {}))
+    found = look(Seen(like_ones(LocalState._fields, np.ones), np.ones(1), Driver(), {}))
     if found.ndim != 2 or len(found) != 1:
         raise InputError(
             f"{reference}: answers shape {found.shape} for one CAV; allowed: (n,) or (n, m) for n"
@@ -175,8 +226,7 @@ def observed(names: Sequence[str], expert: Driver) -> tuple[Observed, ...]:
 
 def observation_size(names: Sequence[str], expert: Driver) -> int:
     """Return how many numbers the network sees with this expert."""
-    one = np.ones(1)
-    state = LocalState(*([one] * len(LocalState._fields)))
+    state = like_ones(LocalState._fields, np.ones)
     acceleration, memory = expert.act(state, expert.initial_memory(1))
     if np.shape(acceleration) != (1,):
         shape = np.shape(acceleration)

@@ -13,6 +13,7 @@ from unjam.drivers.car_following import ACC, BCM, IDM, LACC, OVM, Constant, Huma
 from unjam.drivers.driver import Driver, Recipe
 from unjam.drivers.follower_stopper import FollowerStopper
 from unjam.drivers.from_file import FileDriver, FileReference, is_file_reference
+from unjam.drivers.motorway_experts import Cruise, JamAhead
 from unjam.drivers.network import network_from_arrays
 from unjam.drivers.observation import FEATURES, FeatureName, observation_size
 from unjam.drivers.pi_saturation import PISaturation
@@ -24,7 +25,10 @@ from unjam.errors import InputError, wrong
 from unjam.parameters import STRICT, Count, NotNegative, Positive, build, split_parameters
 from unjam.tree import Arrays
 
-_KINDS = (Human, IDM, PISaturation, FollowerStopper, ACC, LACC, BCM, OVM, Pacer, JamAbsorber, Constant)
+_KINDS = (
+    *(Human, IDM, PISaturation, FollowerStopper, ACC, LACC, BCM, OVM, Pacer, JamAbsorber, Cruise, JamAhead),
+    Constant,
+)
 DRIVERS: dict[str, type[Driver]] = {kind.name: kind for kind in _KINDS}
 
 Held = Callable[[Recipe, str], Driver]

@@ -46,6 +46,11 @@ class ResidualDriver(Wrapper):
         return self.expert.plain_numbers and all(feature(name).plain for name in self.parts)
 
     @property
+    def told(self) -> tuple[str, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """What the features look at."""
+        return tuple(name for part in self.parts for name in feature(part).told)
+
+    @property
     def observed_memory(self) -> tuple[Observed, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
         """What the expert's `memory_features` are."""
         return self.expert.observed_memory

@@ -145,7 +145,8 @@ class SteppedRoad:
         speeds, state = np.array(traffic.speeds), traffic.perceive()
         headways = time_headway(state.leader_gap, state.speed)[: len(kept)]
         applied = traffic.last_applied()[kept]
-        outcome = Outcome(speeds[None], applied[None], headways[None], np.array([traffic.crashed]))
+        crashed, waiting = np.array([traffic.crashed]), np.array([float(traffic.waiting)])
+        outcome = Outcome(speeds[None], applied[None], headways[None], crashed, waiting)
         terms = {name: float(values[0]) for name, values in self._reward(outcome).items()}
         left = {name: seen[row] for row, name in enumerate(before) if row not in kept}
         terminated = traffic.crashed

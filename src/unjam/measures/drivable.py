@@ -13,6 +13,12 @@ FLOOR_MET = 0.9
 """share of the demanded time headway that must be left at any moment"""
 USUAL_FLOOR = 1.0
 """time headway that is demanded where a road names none [s]"""
+SMALLEST_WITH_LANES = 0.8
+"""time headway behind who was followed for long that must be left at any moment, where others cut in [s]"""
+SHARE_BELOW_FLOOR = 1e-3
+"""of that time, how much may be below the floor"""
+HARDEST_AFTER_CUT_IN = 9.0
+"""braking just after somebody has cut in [m/s2]: what dry asphalt allows"""
 SMALLEST_TTC = 1.0
 """[s]"""
 HARDEST_BRAKING = 6.0
@@ -60,6 +66,14 @@ def max_jerk(episode: Episode) -> float:
 def cav_max_braking(episode: Episode) -> float:
     """Hardest braking of a CAV [m/s2]; NaN where nobody is automated."""
     return episode.audit.cavs.hardest if episode.audit.cavs.moments else nan
+
+
+def cut_in_max_braking(episode: Episode) -> float:
+    """Hardest braking of a CAV in the 3 s after somebody else came before it [m/s2], on roads with lanes.
+
+    It is not part of the other brakings of CAVs; NaN where nobody may cut in.
+    """
+    return episode.audit.cut_in.hardest if episode.audit.cut_in.moments else nan
 
 
 def people_max_braking(episode: Episode) -> float:
@@ -110,13 +124,15 @@ def drivable(row: dict[str, Any], people_alone: float = 0.0) -> str:
     """
     if row["status"] == "failed" or isnan(row["cav_max_braking"]):
         return ""
-    floor = row.get("floor") or USUAL_FLOOR
-    checks = (
+    floor, lanes = row.get("floor") or USUAL_FLOOR, row.get("lanes", False)
+    smallest = SMALLEST_WITH_LANES if lanes else FLOOR_MET * floor
+    checks = [
         (row["collisions"] > 0, f"{row['collisions']:.0f} vehicles in contact"),
         (
-            row["min_headway"] < FLOOR_MET * floor - TOLERANCE,
+            row["min_headway"] < smallest - TOLERANCE,
             f"follows at {row['min_headway']:.2f} s (floor {floor:g} s)",
         ),
+        *(_with_lanes(row, floor) if lanes else ()),
         (row["cav_min_ttc"] < SMALLEST_TTC - TOLERANCE, f"{row['cav_min_ttc']:.2f} s to a collision"),
         (
             row["cav_max_braking"] > HARDEST_BRAKING + TOLERANCE,
@@ -128,8 +144,20 @@ def drivable(row: dict[str, Any], people_alone: float = 0.0) -> str:
             f"people brake beyond 4.5 m/s2 {row['people_beyond_4_5']:.0f} times in a million moments "
             f"({people_alone:.0f} without CAVs)",
         ),
-    )
+    ]
     return next((reason for fails, reason in checks if fails), DRIVABLE)
+
+
+def _with_lanes(row: dict[str, Any], floor: float) -> tuple[tuple[bool, str], ...]:
+    """Return what is asked besides where others may cut in."""
+    short, braking = row["share_short_headway"], row["cut_in_max_braking"]
+    return (
+        (short > SHARE_BELOW_FLOOR, f"follows below {floor:g} s in {100 * short:.2g} % of the time"),
+        (
+            braking > HARDEST_AFTER_CUT_IN + TOLERANCE,
+            f"brakes with {braking:.1f} m/s2 where somebody cuts in",
+        ),
+    )
 
 
 def verdicts(rows_by_driver: dict[str, list[dict[str, Any]]]) -> dict[str, str]:

@@ -10,6 +10,7 @@ from unjam.measures.drivable import (
     brakings_beyond,
     cav_max_braking,
     cav_min_ttc,
+    cut_in_max_braking,
     drivable,
     filter_share,
     max_drac,
@@ -33,6 +34,8 @@ CALM_SECONDS = 60.0
 """how long traffic must stay calm before its wave counts as dissolved"""
 PETROL_DENSITY = 742.0
 """[mg/ml], as in SUMO's PollutantsInterface"""
+LAST_OF_PEAK = 600.0
+"""end of a peak of demand in which flow is counted [s]: then it is capacity, not demand"""
 CELLS = 512
 """places along the road at which the speed is looked at"""
 LATER = 8.0
@@ -205,8 +208,13 @@ def fuel_ml_per_km(episode: Episode) -> float:
 
 def throughput_veh_per_h(episode: Episode) -> float:
     """Flow [veh/h]: on a closed road distance driven by all vehicles over length and time (Edie 1963); of a
-    road with ends, the vehicles that left it over time.
+    road with ends, the vehicles that left it over time, where demand has a peak in its last ten minutes.
     """
+    if episode.peak[1] > 0:
+        end = min(round(episode.peak[1] / episode.step), episode.steps)
+        begin = max(0, end - round(LAST_OF_PEAK / episode.step))
+        last = (~np.isnan(episode.speeds)).cumsum(axis=0).argmax(axis=0)
+        return float(((last >= begin) & (last < end)).sum() * 3600.0 / max(end - begin, 1) / episode.step)
     hours = episode.steps * episode.step / 3600.0
     if np.isnan(episode.loop_length):
         return episode.arrived / hours
@@ -265,6 +273,7 @@ METRICS: dict[str, Metric] = {
     "max_drac": Metric(max_drac, "CAV's largest braking needed (DRAC)", "m/s2"),
     "max_jerk": Metric(max_jerk, "CAV's largest jerk", "m/s3", 1),
     "cav_max_braking": Metric(cav_max_braking, "CAV's hardest braking", "m/s2"),
+    "cut_in_max_braking": Metric(cut_in_max_braking, "CAV's hardest braking after a cut-in", "m/s2"),
     "cav_beyond_3_5": Metric(
         brakings_beyond("cavs", 3.5), "CAV's brakings beyond 3.5 m/s2", "per million", 0
     ),
@@ -308,6 +317,7 @@ def measure(episode: Episode) -> dict[str, Any]:
         "steps": episode.steps,
         **episode.drawn,
         "floor": episode.audit.floor,
+        "lanes": episode.audit.lanes,
         **{name: metric.function(episode) if episode.ok else np.nan for name, metric in METRICS.items()},
     }
     return {**row, "drivable": drivable(row)}

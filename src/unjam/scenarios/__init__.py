@@ -7,13 +7,14 @@ from unjam.errors import wrong
 from unjam.parameters import build, changed, nested
 from unjam.scenarios.figure_eight import FigureEight
 from unjam.scenarios.merge import Merge
+from unjam.scenarios.on_ramp import ON_RAMPS, OnRamp
 from unjam.scenarios.own_network import OwnNetwork, own_network
 from unjam.scenarios.population import read_population
 from unjam.scenarios.ring import Ring
 from unjam.scenarios.road import Road
 from unjam.scenarios.scenario import Scenario
 
-__all__ = ["SCENARIOS", "FigureEight", "Merge", "Ring", "Road", "Scenario", "make_scenario"]
+__all__ = ["SCENARIOS", "FigureEight", "Merge", "OnRamp", "Ring", "Road", "Scenario", "make_scenario"]
 
 SCENARIOS: dict[str, Scenario] = {
     "ring": Ring(),
@@ -22,9 +23,10 @@ SCENARIOS: dict[str, Scenario] = {
     "figure-eight": FigureEight(),
     "figure-eight-30": FigureEight(radius=(30, 30)),
     "merge": Merge(),
+    **ON_RAMPS,
 }
 
-KINDS = {kind.title: kind for kind in (Ring, FigureEight, Merge, OwnNetwork)}
+KINDS = {kind.title: kind for kind in (Ring, FigureEight, Merge, OnRamp, OwnNetwork)}
 """All kinds of road, by their title."""
 
 

@@ -11,7 +11,7 @@ from pydantic.dataclasses import dataclass
 from unjam.parameters import STRICT, Count, NotNegative
 from unjam.physics.idm import equilibrium_speed
 from unjam.scenarios.ring import Lap, Loop, Place
-from unjam.scenarios.road import Edge, Line, Node, RoadNetwork, as_line
+from unjam.scenarios.road import Connection, Edge, Line, Node, RoadNetwork, as_line
 from unjam.scenarios.scenario import VEHICLE_LENGTH, HumanControl
 
 CROSSING_RADIUS = 3.1
@@ -149,4 +149,6 @@ def _network(radius: float, upper: Line, lower: Line, speed: float) -> RoadNetwo
         Edge("upper_ring", "at_top", "at_right", arc, MAJOR, upper),
         Edge("lower_ring", "at_left", "at_bottom", arc, MAJOR, lower),
     )
-    return RoadNetwork(nodes, edges, speed, connections=(("bottom", "top"), ("right", "left")))
+    return RoadNetwork(
+        nodes, edges, speed, connections=(Connection("bottom", "top"), Connection("right", "left"))
+    )

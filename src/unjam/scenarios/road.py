@@ -1,11 +1,12 @@
 """One episode's road and traffic, as a scenario draws it: geometry, vehicles, demand."""
 
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from unjam.drivers.roadside import Roadside
 from unjam.physics.idm import IDMParameters
 from unjam.sumo_files import SumoFiles
 
@@ -33,7 +34,7 @@ class Node(NamedTuple):
 
 
 class Edge(NamedTuple):
-    """A stretch of road between two nodes, with one lane."""
+    """A stretch of road between two nodes."""
 
     name: str
     begin: str
@@ -44,6 +45,19 @@ class Edge(NamedTuple):
     """larger goes first where edges meet"""
     shape: Line = ()
     """empty: straight"""
+    lanes: int = 1
+    speed: float | None = None
+    """what it allows [m/s]; None: what the network does"""
+
+
+class Connection(NamedTuple):
+    """An edge that another one follows, or a lane that follows a lane; lanes count from 0 at the right."""
+
+    before: str
+    after: str
+    lane: int | None = None
+    """None: all lanes, as the simulator connects them"""
+    lane_after: int | None = None
 
 
 @dataclass(frozen=True)
@@ -53,11 +67,11 @@ class RoadNetwork:
     nodes: tuple[Node, ...]
     edges: tuple[Edge, ...]
     speed: float
-    """what every edge allows [m/s]"""
+    """what every edge allows that says nothing else [m/s]"""
     links: bool = True
     """whether ways across junctions have a length of their own"""
-    connections: tuple[tuple[str, str], ...] = ()
-    """pairs of edges that follow each other; empty: all that are possible"""
+    connections: tuple[Connection, ...] = ()
+    """empty: all that are possible"""
 
 
 class Route(NamedTuple):
@@ -76,10 +90,13 @@ class Entry(NamedTuple):
     route: str
     position: float
     """of its front bumper on the first edge [m]"""
-    speed: float = 0.0
-    """[m/s]"""
+    speed: float | Literal["last"] = 0.0
+    """[m/s]; `last`: as fast as who entered before"""
     time: float = 0.0
     """[s]"""
+    lane: int = 0
+    kind: str = ""
+    """of the road's `kinds`; empty: as the scenario's people"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -122,6 +139,37 @@ class ClosedRoad(BuiltRoad):
     """the road's centre line: rows (coordinate along the route, x, y) [m]"""
 
 
+class Person(NamedTuple):
+    """How somebody drives on a motorway, as SUMO's car-following models take it."""
+
+    model: str
+    """SUMO's name of the car-following model"""
+    time_headway: float
+    """[s]"""
+    acceleration: float
+    """[m/s2]"""
+    deceleration: float
+    """comfortable [m/s2]"""
+    gap: float
+    """to who stands ahead [m]"""
+    speed_factor: float
+    """wanted speed over what the road allows"""
+
+
+class Lane(NamedTuple):
+    """A lane of an edge, and which way it is part of: a way is lanes one after the other."""
+
+    name: str
+    """the simulator's"""
+    way: int
+    start: float
+    """where along the main road it begins [m]"""
+    speed: float
+    """what it allows [m/s]"""
+    closing: bool = False
+    """whether it leads nowhere and is there to change lanes: nobody is commanded on its edge"""
+
+
 class Origin(NamedTuple):
     """Where a vehicle of a merging road comes from."""
 
@@ -142,6 +190,28 @@ class MergingRoad(BuiltRoad):
     junctions: tuple[float, float]
     """lengths of the ways across the junction, of main road and ramp [m]; they end where the ways meet, and
     there SUMO drives commanded people itself"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class MotorwayRoad(BuiltRoad):
+    """A main road with lanes that ramps join; people differ, overtake, come and go."""
+
+    kinds: dict[str, Person]
+    """the people that there are, by name"""
+    cav_ids: frozenset[str]
+    """vehicles that a driver drives"""
+    lanes: tuple[Lane, ...]
+    """of all edges"""
+    merge: float
+    """where along the main road the ramp's lane begins to run beside it [m]"""
+    length: float
+    """of the main road [m]"""
+    vehicle_length: float
+    """of every vehicle [m]"""
+    peak: tuple[float, float]
+    """from when to when the most vehicles want to enter [s]"""
+    roadside: Roadside
+    """what CAVs are told of the road ahead"""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -20,12 +20,14 @@ from unjam.scenarios.road import Road
 VEHICLE_LENGTH = 5.0
 """[m], of every vehicle"""
 
-Actuation = Literal["shielded", "raw", "flow"]
+Actuation = Literal["shielded", "raw", "flow", "cruise"]
 """How SUMO carries out a CAV's command.
 
 `shielded`: exactly, until it is unsafe; then SUMO brakes, and the override is counted.
 `raw`: exactly, always; a collision ends the episode.
 `flow`: as in Flow, the CAV is also bound by SUMO's human model and can never accelerate beyond it.
+`cruise`: the CAV's own ACC follows and keeps its distance; commands can only hold it back. With lanes, where
+SUMO makes room for who changes them, it is the one that works.
 """
 
 HumanControl = Literal["native", "commanded"]
@@ -39,6 +41,24 @@ far more timid where roads cross.
 
 
 @dataclass(frozen=True, config=STRICT)
+class CruiseControl:
+    """A CAV's own ACC, an IDM as SUMO has it.
+
+    What makes an ACC worse than people is weak acceleration, not a long headway. With 1 s it follows below
+    0.8 s for moments.
+    """
+
+    time_headway: Positive = 1.1
+    """[s]"""
+    acceleration: Positive = 2.5
+    """[m/s2]"""
+    deceleration: Positive = 2.0
+    """comfortable [m/s2]"""
+    gap: Positive = 2.0
+    """to who stands ahead [m]"""
+
+
+@dataclass(frozen=True, config=STRICT)
 class Scenario:
     """What all scenarios share; each kind of road adds its own."""
 
@@ -49,6 +69,8 @@ class Scenario:
     """whether the road is a loop"""
     has_coordinate: ClassVar[bool] = True
     """whether vehicles have a position along the road"""
+    has_message: ClassVar[bool] = False
+    """whether vehicles are told how fast the road ahead is"""
     people_gap: ClassVar[float] = 0.0
     """gap that SUMO keeps for commanded people [m]"""
 
@@ -66,7 +88,9 @@ class Scenario:
     """largest acceleration that a CAV may ask for, in either direction [m/s2]"""
     actuation: Actuation = "shielded"
     """how SUMO carries out a CAV's command: `shielded` exactly until it is unsafe, then SUMO brakes; `raw`
-    exactly; `flow` bound by the human IDM"""
+    exactly; `flow` bound by the human IDM; `cruise` bound by the CAV's own ACC"""
+    cruise: CruiseControl = field(default_factory=CruiseControl)
+    """the CAV's own ACC, where it is what follows"""
     safety: SafetyFilter = field(default_factory=SafetyFilter)
     """the filter between driver and road, of every CAV, in every simulation step"""
     actuator: Actuator = field(default_factory=Actuator)

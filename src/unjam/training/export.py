@@ -132,4 +132,5 @@ def _perceived(road: Scenario, driver: Driver) -> LocalState:
     raise_failure([measure(episode)] if not episode.ok else [])
     longest = max(episode.trajectories, key=lambda trajectory: len(trajectory.applied))
     decisions = min(len(longest.applied), SAMPLED)
-    return LocalState(*(values[:decisions] for values in longest.states))
+    seen = longest.states.at(slice(decisions))
+    return LocalState(**{name: values for name, values in seen._asdict().items() if name in driver.perceives})

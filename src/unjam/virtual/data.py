@@ -52,7 +52,7 @@ class Transitions(NamedTuple):
 
     def chosen(self, rows: NDArray[np.int64]) -> "Transitions":
         """Return the decisions with these indices."""
-        states, following = (each.each(lambda values: values[rows]) for each in (self.states, self.following))
+        states, following = (each.at(rows) for each in (self.states, self.following))
         others = (self.reward[rows], self.crashed[rows], self.held_out[rows])
         return Transitions(states, self.applied[rows], self.drawn[rows], following, *others)
 
@@ -96,10 +96,10 @@ class ActualData:
             raise InputError("virtual environment: there are no actual decisions to learn from")
         recordings = self.recordings
         return Transitions(
-            states=_joined([r.states.each(lambda values: values[:-1]) for r in recordings]),
+            states=_joined([r.states.at(slice(-1)) for r in recordings]),
             applied=np.concatenate([r.applied for r in recordings]),
             drawn=np.concatenate([np.tile(r.drawn, (len(r.reward), 1)) for r in recordings]),
-            following=_joined([r.states.each(lambda values: values[1:]) for r in recordings]),
+            following=_joined([r.states.at(slice(1, None)) for r in recordings]),
             reward=np.concatenate([r.reward for r in recordings]),
             crashed=np.concatenate([_crashes(r) for r in recordings]),
             held_out=np.concatenate(self.held_out(holdout)),
@@ -134,7 +134,7 @@ class ActualData:
         """Return the states at `choices`, rows (recording, decision), arrays of shape (rows,)."""
         first = np.cumsum([0, *(len(recording.states.speed) for recording in self.recordings)])
         rows = first[choices[:, 0]] + choices[:, 1]
-        return _joined([recording.states for recording in self.recordings]).each(lambda values: values[rows])
+        return _joined([recording.states for recording in self.recordings]).at(rows)
 
 
 def is_held_out(episode: int, share: float) -> bool:
@@ -170,7 +170,7 @@ def remembered(expert: Driver, recordings: Sequence[Recording], choices: NDArray
         return found
     last = int(choices[:, 1].max())
     steps = [np.arange(last).clip(0, len(recording.applied)) for recording in used]
-    states = [kept.states.each(lambda values: values[at]) for kept, at in zip(used, steps, strict=True)]  # noqa: B023
+    states = [kept.states.at(at) for kept, at in zip(used, steps, strict=True)]
     order = np.argsort(choices[:, 1], kind="stable")
     bounds = np.searchsorted(choices[order, 1], np.arange(last + 2))
 

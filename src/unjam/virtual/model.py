@@ -135,7 +135,7 @@ def base_reward(base: str, reward: Reward, following: LocalState, applied: Array
         xp.where(nobody_behind, nan, following.follower_speed),
     )
     headway = time_headway(following.leader_gap, following.speed)
-    outcome = Outcome(stack_columns(speeds), as_column(applied), as_column(headway), crashed)
+    outcome = Outcome(stack_columns(speeds), as_column(applied), as_column(headway), crashed, 0.0 * applied)
     return sum(reward(outcome).values())
 
 

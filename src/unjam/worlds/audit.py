@@ -60,6 +60,10 @@ class Audit:
     following: Following = field(default_factory=Following)
     floor: float = 0.0
     """time headway that was demanded of CAVs [s]"""
+    lanes: bool = False
+    """whether others may cut in: `following` is then of those who follow the same for long"""
+    cut_in: Brakings = field(default_factory=Brakings)
+    """how hard CAVs braked just after somebody else came before them; not part of `cavs`"""
 
 
 def brakings(accelerations: Any) -> Brakings:

@@ -83,7 +83,8 @@ def rewarded(episode: Episode, reward: Reward) -> Episode:
     """Return an episode with what was earned in it; raise `InputError` where a term is not finite."""
     # Columns one behind the other: sums over vehicles are rounded in the order of memory.
     speeds = np.asfortranarray(episode.speeds)
-    outcome = outcome_of(speeds, episode.trajectories, episode.status == "collision")
+    crashed = episode.status == "collision"
+    outcome = outcome_of(speeds, episode.trajectories, crashed, episode.waiting)
     terms = _checked(reward(outcome), episode.steps)
     trajectories = tuple(
         replace(each, terms={name: values[each.during] for name, values in terms.items()})

@@ -153,6 +153,8 @@ class Episode:
     """where each vehicle of a merging road came from"""
     arrived: int = 0
     """vehicles that left at the end of their route"""
+    peak: tuple[float, float] = (0.0, 0.0)
+    """from when to when the most vehicles want to enter [s]; (0, 0) where there is no peak"""
     waiting: Floats = field(default_factory=lambda: np.zeros(0))
     """vehicles that wanted to enter and could not, at each moment, shape (T + 1,); (0,) of a closed road"""
     lines: Floats = field(default_factory=lambda: np.zeros((0, 2)))
@@ -186,13 +188,16 @@ def failed_episode(seed: tuple[int, ...], reason: str, error: str) -> Episode:
     return Episode(seed=seed, status="failed", reason=reason, error=error)
 
 
-def outcome_of(speeds: Floats, trajectories: Sequence[Trajectory], crashed: bool) -> Outcome:
+def outcome_of(
+    speeds: Floats, trajectories: Sequence[Trajectory], crashed: bool, waiting: Floats | None = None
+) -> Outcome:
     """Return what a reward function sees of a whole episode.
 
     Args:
         speeds: of all vehicles, shape (T + 1, N).
         trajectories: of CAVs.
         crashed: whether the last decision ended in a collision.
+        waiting: how many wanted to enter and could not, shape (T + 1,); None: nobody.
     """
     steps = len(speeds) - 1
     accelerations, headways = (np.full((steps, len(trajectories)), np.nan) for _ in range(2))
@@ -201,4 +206,5 @@ def outcome_of(speeds: Floats, trajectories: Sequence[Trajectory], crashed: bool
         headways[each.during, column] = time_headway(each.states.leader_gap[1:], each.states.speed[1:])
     collided = np.zeros(steps, bool)
     collided[-1:] = crashed
-    return Outcome(speeds[1:], accelerations, headways, collided)
+    kept_out = np.zeros(steps) if waiting is None or not len(waiting) else waiting[1:]
+    return Outcome(speeds[1:], accelerations, headways, collided, kept_out)

@@ -36,6 +36,8 @@ class Outcome(NamedTuple):
     """time headways of the CAVs after the step, gap over speed [s], shape (rows, CAVs); NaN likewise"""
     crashed: Array
     """whether there was a collision, shape (rows,)"""
+    waiting: Array
+    """vehicles that want to enter and cannot, shape (rows,)"""
 
 
 Reward = Callable[[Outcome], dict[str, Array]]
@@ -112,6 +114,16 @@ def power(outcome: Outcome) -> dict[str, Array]:
     return {"power": flow * _mean(outcome.speeds) / MERGE_SPEED * ~outcome.crashed}
 
 
+def travel_time(outcome: Outcome) -> dict[str, Array]:
+    """Reward short travel times: minus how many are on the road or wait to be, in hundreds.
+
+    Whoever wants to drive is given by the demand, so that the sum over an episode is, but for its scale, the
+    mean travel time with waiting: nothing is earned by keeping vehicles out.
+    """
+    there = (~namespace(outcome.speeds).isnan(outcome.speeds)).sum(-1)
+    return {"travel": -(there + outcome.waiting) / 100.0}
+
+
 def too_close(outcome: Outcome) -> Array:
     """Term: minus the seconds that CAVs' time headways lack to 1 s."""
     return -_sum(at_least(LONGEST_PENALISED_HEADWAY - outcome.headways, 0.0))
@@ -141,6 +153,7 @@ REWARDS: dict[str, Reward] = {
     "eq16": eq16,
     "eq16-as-printed": eq16_as_printed,
     "power": power,
+    "travel-time": travel_time,
 }
 
 

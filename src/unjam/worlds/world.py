@@ -112,7 +112,7 @@ class RecordedWorld:
     def perceive(self) -> LocalState:
         """Return what was perceived at this moment; after the last one, at the last."""
         moment = min(len(self._answers), len(self.states.speed) - 1)
-        return self.states.each(lambda values: values[moment])
+        return self.states.at(moment)
 
     def advance(self, command: Command | None) -> None:
         """Note what was asked for, and go on to the next moment."""

@@ -88,7 +88,7 @@ def test_leader_and_follower_of_a_stay_were_there_as_recorded(counted: Episode) 
             row = trajectory.start + moment
             own, others = counted.positions[row, column], np.delete(counted.positions[row], column)
             speeds = np.delete(counted.speeds[row], column)
-            states = LocalState(*(values[moment] for values in trajectory.states))
+            states = trajectory.states.at(moment)
             for gap, speed, place in (
                 (states.leader_gap, states.leader_speed, own + 5.0 + states.leader_gap),
                 (states.follower_gap, states.follower_speed, own - 5.0 - states.follower_gap),
@@ -160,7 +160,7 @@ def test_a_residual_driver_counts_its_looks_from_each_entry(hold: int, simulatio
         total = np.clip(trajectory.expert + trajectory.residual, -1.0, 1.0)
         np.testing.assert_allclose(trajectory.applied, total, atol=1e-12)
         looks = [*range(0, steps, hold), steps]
-        seen = local_vector(LocalState(*(values[looks] for values in trajectory.states)))
+        seen = local_vector(trajectory.states.at(looks))
         np.testing.assert_allclose(trajectory.observations, seen, atol=1e-12)
         chosen, _ = trajectory.choices
         np.testing.assert_array_equal(trajectory.residual, np.repeat(chosen, hold)[:steps])
@@ -179,7 +179,7 @@ def test_what_stays_say_is_enough_to_drive_them_again(simulation: Simulation) ->
     for trajectory in episode.trajectories:
         memory = {name: values[None] for name, values in trajectory.memory.items()}
         for step in range(len(trajectory.applied)):
-            state = LocalState(*(values[step : step + 1] for values in trajectory.states))
+            state = trajectory.states.at(slice(step, step + 1))
             expert, memory = driver.expert.act(state, memory)
             assert np.clip(expert[0], -1, 1) == pytest.approx(trajectory.expert[step], abs=1e-12)
 
@@ -196,7 +196,7 @@ def test_a_driver_that_remembers_nothing_drives_whoever_comes(simulation: Simula
     function = FunctionDriver(lambda state: 0.1 * (state.leader_speed - state.speed))
     episode = run_episode(MERGE, function, (2,), simulation=simulation)
     for trajectory in episode.trajectories:
-        states = LocalState(*(values[:-1] for values in trajectory.states))
+        states = trajectory.states.at(slice(-1))
         wanted = np.clip(0.1 * (states.leader_speed - states.speed), -1, 1)
         np.testing.assert_allclose(trajectory.applied, wanted, atol=1e-12)
 

@@ -11,6 +11,7 @@ from tests.worlds.test_record import fingerprint
 from unjam.drivers import IDM, PISaturation
 from unjam.errors import EpisodeError, UnjamError
 from unjam.scenarios import Ring, make_scenario
+from unjam.scenarios.road import Connection
 from unjam.worlds.episode import run_episode
 from unjam.worlds.sumo import make_traffic
 from unjam.worlds.sumo.files import Files, files_of, network_file
@@ -129,7 +130,7 @@ def test_sumos_own_words_come_from_the_child_process_too(road: Files) -> None:
 BROKEN_ROADS = {
     ("nodes", ()): "No nodes loaded",
     ("edges", ()): "No edges loaded",
-    ("connections", (("edge_0", "elsewhere"),)): "elsewhere",
+    ("connections", (Connection("edge_0", "elsewhere"),)): "elsewhere",
 }
 
 

@@ -136,7 +136,7 @@ def test_who_enters_beyond_the_meeting_place_is_there() -> None:
 def test_an_empty_road_has_nobody_on_it() -> None:
     streams = Streams()
     streams.move([], 0.2)
-    assert [values.shape for values in streams.states()] == [(0,)] * 7
+    assert {values.shape for values in streams.states() if values is not None} == {(0,)}
     assert streams.on_junction(WAYS).shape == (0,)
 
 

@@ -5,15 +5,21 @@ from typing import Any
 
 import numpy as np
 
-from unjam.scenarios.road import ClosedRoad, MergingRoad, OwnRoad, Road
+from unjam.scenarios.road import ClosedRoad, MergingRoad, MotorwayRoad, OwnRoad, Road
 from unjam.scenarios.scenario import Scenario
 from unjam.worlds.sumo.closed import ClosedTraffic
 from unjam.worlds.sumo.merging import MergingTraffic
+from unjam.worlds.sumo.motorway import MotorwayTraffic
 from unjam.worlds.sumo.own import OwnTraffic
 from unjam.worlds.sumo.simulation import Simulation
 from unjam.worlds.sumo.traffic import Seed, Traffic
 
-KINDS: dict[type[Road], Any] = {ClosedRoad: ClosedTraffic, MergingRoad: MergingTraffic, OwnRoad: OwnTraffic}
+KINDS: dict[type[Road], Any] = {
+    ClosedRoad: ClosedTraffic,
+    MergingRoad: MergingTraffic,
+    MotorwayRoad: MotorwayTraffic,
+    OwnRoad: OwnTraffic,
+}
 """the traffic of each kind of road"""
 
 

@@ -96,7 +96,7 @@ class ClosedTraffic(Traffic[ClosedRoad]):
                 : round(HISTORY / scenario.decision_step)
             ]
             states = loop_state(*self.speeds_and_positions(), self._near, self.road.loop_length)
-            history = states.each(lambda values: values[:, moments[::-1]])
+            history = states.at(np.s_[:, moments[::-1]])
         self._controlled = controlled
         if controlled:
             self._simulation.take_control(self.road.cav_ids, scenario.actuation, scenario.right_of_way)

@@ -18,7 +18,16 @@ import numpy as np
 
 from unjam.errors import DISK_ERRNOS, EpisodeError, MissingPartError, disk_error
 from unjam.physics.idm import IDMParameters
-from unjam.scenarios.road import BuiltRoad, Edge, Node, OwnRoad, Road, RoadNetwork
+from unjam.scenarios.road import (
+    BuiltRoad,
+    Connection,
+    Edge,
+    MotorwayRoad,
+    Node,
+    OwnRoad,
+    Road,
+    RoadNetwork,
+)
 from unjam.scenarios.scenario import VEHICLE_LENGTH, Scenario
 from unjam.sumo_files import read_lanes
 from unjam.worlds.record import Floats
@@ -87,26 +96,47 @@ def _own_files(scenario: Scenario, road: OwnRoad) -> Files:
 def _traffic_xml(scenario: Scenario, road: BuiltRoad) -> str:
     """Return the XML of types, routes and vehicles of an episode."""
     own = road.people if scenario.human_control == "native" else {}
-    humans = {"human": scenario.humans, **{f"of_{name}": one for name, one in own.items()}}
-    lines = [_vehicle_type(name, scenario, **_human_layer(scenario, one)) for name, one in humans.items()]
-    lines.append(_cav_type(scenario))
+    if isinstance(road, MotorwayRoad):
+        lines = _motorway_types(scenario, road)
+    else:
+        humans = {"human": scenario.humans, **{f"of_{name}": one for name, one in own.items()}}
+        lines = [_vehicle_type(name, scenario, **_human_layer(scenario, one)) for name, one in humans.items()]
+        lines.append(_cav_type(scenario))
     for route in road.routes:
         laps = route.laps if route.laps > 1 else None
         lines.append(_element("route", id=route.name, edges=" ".join(route.edges), repeat=laps))
     for entry in road.entries:
         attributes = {
             "id": entry.name,
-            "type": f"of_{entry.name}" if entry.name in own else "human",
+            "type": entry.kind or (f"of_{entry.name}" if entry.name in own else "human"),
             # SUMO would not let a driver who keeps a large distance begin closer than that.
-            "insertionChecks": "none" if entry.name in own else None,
+            "insertionChecks": "collision" if entry.kind else "none" if entry.name in own else None,
             "route": entry.route,
             "depart": f"{entry.time:.2f}",
-            "departPos": repr(entry.position),
+            "departPos": "base" if entry.kind else repr(entry.position),
             "departSpeed": entry.speed,
-            "departLane": 0,
+            "departLane": entry.lane,
         }
         lines.append(_element("vehicle", **attributes))
     return "\n".join(["<routes>", *lines, "</routes>"])
+
+
+def _motorway_types(scenario: Scenario, road: MotorwayRoad) -> list[str]:
+    """Return the XML of each person's type, and of the CAV's that may replace him: it wants to be as fast."""
+    lines = []
+    for name, person in road.kinds.items():
+        alike = {"length": road.vehicle_length, "emissionClass": scenario.emission_class}
+        alike |= {"speedFactor": person.speed_factor, "speedDev": 0.0, "emergencyDecel": 9.0}
+        follows = {
+            "carFollowModel": person.model,
+            "tau": person.time_headway,
+            "accel": person.acceleration,
+            "decel": person.deceleration,
+            "minGap": person.gap,
+        }
+        lines.append(_element("vType", id=name, **alike, **follows))
+        lines.append(_element("vType", **{"id": CAV_TYPES.format(name), **alike, **_cav_layer(scenario)}))
+    return lines
 
 
 def _own_types_xml(scenario: Scenario, road: OwnRoad) -> str:
@@ -115,7 +145,7 @@ def _own_types_xml(scenario: Scenario, road: OwnRoad) -> str:
     for name, attributes in road.files.types.items():
         kept = {key: value for key, value in attributes.items() if key in KEPT or key.startswith("lc")}
         calm = {"id": CAV_TYPES.format(name), "sigma": 0.0, "speedDev": 0.0}
-        types.append({**kept, **calm, **_obedient_layer(scenario)})
+        types.append({**kept, **calm, **_cav_layer(scenario)})
     return _document("additional", "vType", types)
 
 
@@ -162,7 +192,22 @@ def _cav_type(scenario: Scenario) -> str:
         layer = _human_layer(scenario, scenario.humans)
         layer["minGap"] = max(layer["minGap"], SMALLEST_CAV_GAP)
         return _vehicle_type("cav", scenario, color=CAV_COLOUR, **layer)
-    return _vehicle_type("cav", scenario, **_obedient_layer(scenario), maxSpeed=scenario.top_speed)
+    return _vehicle_type("cav", scenario, **_cav_layer(scenario), maxSpeed=scenario.top_speed)
+
+
+def _cav_layer(scenario: Scenario) -> Attributes:
+    """Return how a CAV follows in SUMO: as its own ACC does, or as it is told."""
+    cruise = scenario.cruise
+    if scenario.actuation != "cruise":
+        return _obedient_layer(scenario)
+    return {
+        "color": CAV_COLOUR,
+        "carFollowModel": "IDM",
+        "tau": cruise.time_headway,
+        "accel": cruise.acceleration,
+        "decel": cruise.deceleration,
+        "minGap": cruise.gap,
+    }
 
 
 def _obedient_layer(scenario: Scenario) -> Attributes:
@@ -230,7 +275,7 @@ def network_file(network: RoadNetwork) -> Path:
         ("--edge-files", "road.edg.xml"): _document("edges", "edge", edges),
     }
     if network.connections:
-        pairs = ({"from": before, "to": after} for before, after in network.connections)
+        pairs = map(_connection, network.connections)
         files["--connection-files", "road.con.xml"] = _document("connections", "connection", pairs)
     options = ["--no-turnarounds", "true", *([] if network.links else ["--no-internal-links", "true"])]
     content = "\n".join([sumo_version(), *options, *files.values()])
@@ -274,10 +319,15 @@ def _node(node: Node) -> Attributes:
     return {"id": node.name, "x": f"{node.x:.6f}", "y": f"{node.y:.6f}", "type": kind, "radius": node.radius}
 
 
+def _connection(connection: Connection) -> Attributes:
+    ends = {"from": connection.before, "to": connection.after}
+    return {**ends, "fromLane": connection.lane, "toLane": connection.lane_after}
+
+
 def _edge(edge: Edge, speed: float) -> Attributes:
     ends = {"id": edge.name, "from": edge.begin, "to": edge.end}
     shape = " ".join(f"{x:.6f},{y:.6f}" for x, y in edge.shape) or None
-    lane = {"numLanes": 1, "speed": speed, "length": repr(edge.length)}
+    lane = {"numLanes": edge.lanes, "speed": edge.speed or speed, "length": repr(edge.length)}
     return {**ends, **lane, "priority": edge.priority, "shape": shape}
 
 

@@ -183,7 +183,7 @@ class MergingTraffic(OpenTraffic[MergingRoad]):
 
     def _states(self, names: Sequence[str]) -> LocalState:
         places = [self._streams.names.index(name) for name in names]
-        return self._states_of_all.each(lambda values: values[places])
+        return self._states_of_all.at(places)
 
     def record(self, driven: Driven) -> Episode:
         """Return what happened since the start; positions are checked against SUMO's odometer."""

@@ -110,7 +110,7 @@ class OpenTraffic(Traffic[RoadKind]):
         self._log_filtered: list[list[float]] = []
         self._log_shield: list[list[float]] = []
         self._log_places: list[Floats] = []
-        self._waiting: list[int] = []
+        self._log_waiting: list[int] = []
         self._arrived = 0
         self._forget()
         self._look()
@@ -123,6 +123,11 @@ class OpenTraffic(Traffic[RoadKind]):
         self._changes, self._changed = array("d"), bytearray()
         """everybody's changes of speed in each simulation step [m/s], and whether a CAV's"""
 
+    @property
+    def waiting(self) -> int:
+        """How many want to enter now and cannot."""
+        return self._log_waiting[-1]
+
     def perceive(self) -> LocalState:
         """Return what the CAVs perceive now: arrays of shape (CAVs,)."""
         return self._log_states[-1]
@@ -130,7 +135,7 @@ class OpenTraffic(Traffic[RoadKind]):
     def advance(self, command: Command | None) -> None:
         """Simulate one decision, held over its simulation steps; None: the CAVs stay human."""
         scenario, names = self.scenario, self.cavs
-        step = scenario.simulation_step
+        step, obeys = scenario.simulation_step, scenario.actuation != "cruise"
         wanted = self._told(command) if self._controlled else []
         before = self._log_states[-1].speed
         shield = dict.fromkeys(names, 0.0)
@@ -141,12 +146,12 @@ class OpenTraffic(Traffic[RoadKind]):
             self._simulate(commanded)
             still = [name for name in commanded if name in self._on_road]
             for name, moved in zip(still, self._simulation.speeds(still), strict=True):
-                shield[name] = max(shield[name], (commanded[name] - moved) / step)
+                shield[name] = max(shield[name], (commanded[name] - moved) / step * obeys)
             if self.crashed:
                 break
         self.decisions += 1
         self._look()
-        if not self._controlled:
+        if not (self._controlled and obeys):
             after = dict(zip(self._log_moments[-1].names, self.speeds, strict=True))
             changes = (after.get(name, speed) - speed for name, speed in zip(names, before, strict=True))
             wanted = [change / scenario.decision_step for change in changes]
@@ -221,7 +226,7 @@ class OpenTraffic(Traffic[RoadKind]):
         self._log_moments.append(moment)
         self._log_cavs.append(self.cavs)
         self._log_states.append(self._states(self.cavs))
-        self._waiting.append(len(simulation.waiting()))
+        self._log_waiting.append(len(simulation.waiting()))
         if self.full:
             self._log_places.append(simulation.places(moment.names))
 
@@ -251,7 +256,7 @@ class OpenTraffic(Traffic[RoadKind]):
             gaps=gaps,
             fuel=fuel,
             arrived=self._arrived,
-            waiting=np.array(self._waiting, np.float64),
+            waiting=np.array(self._log_waiting, np.float64),
             lines=self._lines() if self.full else np.zeros((0, 2)),
             places=places,
             trajectories=trajectories,
@@ -293,9 +298,7 @@ class OpenTraffic(Traffic[RoadKind]):
                     number=number,
                     start=start,
                     rows=np.array([row for _, row in places]),
-                    states=LocalState(
-                        *(np.array([values[time][row] for time, row in places]) for values in states)
-                    ),
+                    states=LocalState(*(_stay(values, places) for values in states)),
                     applied=np.array([self._log_applied[time][row] for time, row in places[:-1]]),
                     filtered=np.array([self._log_filtered[time][row] for time, row in places[:-1]]),
                     shield=np.array([self._log_shield[time][row] for time, row in places[:-1]]),
@@ -314,3 +317,8 @@ class OpenTraffic(Traffic[RoadKind]):
         names, speeds = self._log_moments[-1].names, np.array(self.speeds)
         cavs = np.array([name in self.cavs for name in names], bool)
         return Scene(self._lines(), self._simulation.places(names), speeds, cavs)
+
+
+def _stay(values: Sequence[Any], places: Sequence[tuple[int, int]]) -> Any:
+    """Return what a CAV was told of one quantity at its moments and rows; None where the road offers none."""
+    return None if values[0] is None else np.array([values[time][row] for time, row in places])

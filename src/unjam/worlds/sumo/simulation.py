@@ -23,7 +23,7 @@ from unjam.worlds.sumo.files import Files, sumo_program, sumo_words
 Backend = Literal["libsumo", "traci", "gui"]
 """`libsumo`: in this process; `traci`: SUMO as a child process; `gui`: the same, with its window."""
 
-SPEED_MODES = {"shielded": 31, "raw": 30, "flow": 25}
+SPEED_MODES = {"shielded": 31, "raw": 30, "flow": 25, "cruise": 31}
 """SUMO's speed mode bits for each way of actuation: bit 0 is the check for a safe speed."""
 WITHOUT_RIGHT_OF_WAY = 1
 """the bit that stays where vehicles need not obey the right of way: who is surprised on a junction then stops
@@ -74,9 +74,12 @@ class Simulation:
         call = partial(_function, self._sumo)
         self._get_speed = call("vehicle", "getSpeed")
         self._get_distance = call("vehicle", "getDistance")
+        self._get_along = call("vehicle", "getLanePosition")
         self._get_fuel = call("vehicle", "getFuelConsumption")
         self._set_speed = call("vehicle", "setSpeed")
         self._set_previous_speed = call("vehicle", "setPreviousSpeed")
+        self.on_lane: Callable[[str], Sequence[str]] = call("lane", "getLastStepVehicleIDs")
+        """whose front bumpers are on a lane"""
         self.vehicle_count: Callable[[], int] = call("vehicle", "getIDCount")
         """how many vehicles are on the road"""
         self.colliding_count: Callable[[], int] = call("simulation", "getCollidingVehiclesNumber")
@@ -162,6 +165,10 @@ class Simulation:
     def speeds(self, ids: Sequence[str]) -> list[float]:
         """Return the speeds of `ids` [m/s]."""
         return list(map(self._get_speed, ids))
+
+    def along_lanes(self, ids: Sequence[str]) -> list[float]:
+        """Return how far each of `ids` is along its lane [m]."""
+        return list(map(self._get_along, ids))
 
     def left(self) -> list[str]:
         """Return who left the road in the last step: at the end of its route, or moved away by SUMO."""

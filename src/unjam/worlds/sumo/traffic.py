@@ -100,6 +100,11 @@ class Traffic(World[Episode], Generic[RoadKind]):
         return len(self.cavs)
 
     @property
+    def waiting(self) -> int:
+        """How many want to enter now and cannot."""
+        return 0
+
+    @property
     def expects_cavs(self) -> bool:
         """Whether a CAV may still enter."""
         return False

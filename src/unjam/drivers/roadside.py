@@ -1,0 +1,67 @@
+"""What a roadside or cloud service tells of the road: mean speeds by lane and section, late and smoothed."""
+
+from collections import deque
+from math import exp
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+from pydantic.dataclasses import dataclass
+
+from unjam.drivers.local_state import SECTION, SECTIONS_AHEAD
+from unjam.parameters import STRICT, NotNegative
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, config=STRICT)
+class Roadside:
+    """How a message differs from what is there now."""
+
+    age: NotNegative = 0.0
+    """time from measurement to arrival [s]"""
+    smoothing: NotNegative = 0.0
+    """time constant of exponential smoothing [s]"""
+    loss: Annotated[float, Field(ge=0, lt=1)] = 0.0
+    """share of messages that are lost: the last one that came is used"""
+
+
+class Messages:
+    """Mean speeds of all sections, as they arrive decision by decision."""
+
+    def __init__(
+        self, roadside: Roadside, ways: int, length: float, step: float, generator: np.random.Generator
+    ) -> None:
+        """Begin without a message; `step` is the time between two decisions [s], `length` the road's [m]."""
+        self._shape = ways, int(np.ceil(length / SECTION))
+        self._kept = exp(-step / roadside.smoothing) if roadside.smoothing else 0.0
+        self._late: deque[Floats] = deque(maxlen=1 + round(roadside.age / step))
+        self._loss, self._generator = roadside.loss, generator
+        self._smooth: Floats | None = None
+        self._arrived = np.zeros(0)
+
+    def measure(self, ways: NDArray[np.intp], places: Floats, speeds: Floats, allowed: float) -> None:
+        """Take who is where and how fast; a section where nobody is counts as `allowed` [m/s].
+
+        Arrays of shape (vehicles,): the way that each is on, its place along the road [m], its speed.
+        """
+        rows, sections = self._shape
+        cell = ways * sections + (places // SECTION).astype(np.intp).clip(0, sections - 1)
+        count, total = (np.bincount(cell, weight, rows * sections) for weight in (None, speeds))
+        # the last row is of all ways of the main road, which are those from 1 on
+        count, total = (each.reshape(self._shape).astype(np.float64) for each in (count, total))
+        count, total = (np.vstack([each, each[1:].sum(0)]) for each in (count, total))
+        mean = np.where(count > 0, total / count.clip(1), allowed)
+        if self._smooth is not None:
+            mean = self._kept * self._smooth + (1.0 - self._kept) * mean
+        self._smooth = mean
+        self._late.append(np.pad(mean, ((0, 0), (0, SECTIONS_AHEAD)), constant_values=allowed))
+        if not self._arrived.size or self._loss == 0 or self._generator.random() >= self._loss:
+            self._arrived = self._late[0]
+
+    def ahead(self, ways: NDArray[np.intp], places: Floats) -> tuple[Floats, Floats]:
+        """Return the speeds of the sections ahead, on the own way and on the whole main road: (n, ahead)."""
+        first = (places // SECTION).astype(np.intp).clip(0, self._shape[1] - 1)
+        columns = first[:, None] + np.arange(SECTIONS_AHEAD)
+        return self._arrived[ways[:, None], columns], self._arrived[-1][columns]

@@ -1,0 +1,260 @@
+"""The on-ramp: a motorway of one or two lanes that a ramp joins, among people who differ and overtake."""
+
+from collections.abc import Iterator
+from dataclasses import field, replace
+from typing import Annotated, ClassVar, Literal
+
+import numpy as np
+from pydantic import Field, model_validator
+from pydantic.dataclasses import dataclass
+
+from unjam.drivers.roadside import Roadside
+from unjam.drivers.safety import SafetyFilter
+from unjam.parameters import STRICT, Count, NotNegative, Positive
+from unjam.scenarios.road import (
+    Connection,
+    Edge,
+    Entry,
+    Lane,
+    MotorwayRoad,
+    Node,
+    Person,
+    RoadNetwork,
+    Route,
+)
+from unjam.scenarios.scenario import Actuation, Scenario
+
+BEFORE, MERGING, AFTER, RAMP = 2000.0, 300.0, 700.0, 400.0
+"""lengths of the motorway before the ramp's lane runs beside it, with it, behind it, and of the ramp [m]"""
+MOTORWAY_SPEED, RAMP_SPEED = 27.78, 22.22
+"""what they allow [m/s]"""
+RAMP_ENTRY_SPEED = 15.0
+"""[m/s]"""
+RAMP_HEADWAY = 2.0
+"""smallest time between two vehicles that want to enter the ramp [s]"""
+KINDS = 200
+"""how many different people there are"""
+APART = 60.0
+"""of the nodes where motorway and ramp begin [m]"""
+
+Arrival = tuple[float, str, int, float | Literal["last"]]
+Interval = Annotated[tuple[float, float], Field(min_length=2, max_length=2)]
+
+
+@dataclass(frozen=True, config=STRICT)
+class OnRamp(Scenario):
+    """A motorway of 3 km that a ramp joins after 2 km, with a peak of demand just beyond what it carries.
+
+    People are SUMO's extended intelligent drivers, each different, who change lanes. In the peak a jam comes
+    where the ramp joins, in nine of ten episodes, and sends waves back. A CAV replaces a person and wants to
+    drive as fast; its own ACC follows, and its driver can hold it back upstream of where the ramp joins.
+    """
+
+    title: ClassVar[str] = "on-ramp"
+    reward: ClassVar[str] = "travel-time"
+    closed: ClassVar[bool] = False
+    has_message: ClassVar[bool] = True
+
+    lanes: Literal[1, 2] = 2
+    """of the motorway"""
+    inflow: Positive = 3200.0
+    """vehicles that want to enter the motorway in the peak [veh/h]"""
+    ramp_flow: NotNegative = 500.0
+    """vehicles that want to enter the ramp in the peak [veh/h]"""
+    calm_inflow: NotNegative = 1800.0
+    """before and after the peak [veh/h]"""
+    calm_ramp_flow: NotNegative = 250.0
+    """before and after the peak [veh/h]"""
+    peak: Interval = (300.0, 1500.0)
+    """from when to when it lasts [s]"""
+    entry_headway: NotNegative = 1.1
+    """smallest time between two vehicles that want to enter a lane of the motorway [s]"""
+    cav_share: Annotated[float, Field(ge=0, le=1)] = 0.1
+    """share of all vehicles that are CAVs; a larger share contains the smaller one"""
+    following: Literal["EIDM", "IDM"] = "EIDM"
+    """SUMO's model of how people follow"""
+    time_headways: Interval = (1.0, 1.8)
+    """between which people's lie [s]"""
+    accelerations: Interval = (1.0, 1.5)
+    """between which people's lie [m/s2]"""
+    decelerations: Interval = (1.5, 2.0)
+    """between which people's comfortable ones lie [m/s2]"""
+    gaps: Interval = (2.0, 2.5)
+    """between which people's lie in a standing queue [m]"""
+    speed_spread: NotNegative = 0.1
+    """standard deviation of people's wanted speed over what the road allows, which is 1, at most 0.2 off"""
+    vehicle_length: Positive = 4.8
+    """[m]"""
+    roadside: Roadside = field(default_factory=Roadside)
+    """how late and how smooth CAVs are told of the speeds ahead"""
+    simulation_step: Positive = 0.5
+    steps_per_decision: Count = 2
+    horizon: Count = 2400
+    """decisions in an episode"""
+    action_limit: Positive = 2.5
+    actuation: Actuation = "cruise"
+    safety: SafetyFilter = field(default_factory=lambda: SafetyFilter(active=False))
+    """none: the CAV's own ACC keeps its distance"""
+    noise: Annotated[float, Field(ge=0, le=0)] = 0.0
+    """none beside that of the people's own model"""
+    emission_class: str = "HBEFA4/PC_petrol_Euro-6d"
+
+    @model_validator(mode="after")
+    def _fits(self) -> "OnRamp":
+        for name in ("time_headways", "accelerations", "decelerations", "gaps", "peak"):
+            low, high = getattr(self, name)
+            if not 0 <= low <= high or (high == 0 and name != "peak"):
+                raise ValueError(f"{name}: ({low:g}, {high:g}) is not allowed; allowed: 0 < low <= high")
+        for name, flow in (("inflow", self.inflow), ("calm_inflow", self.calm_inflow)):
+            most = 3600.0 * self.lanes / max(self.entry_headway, 1e-9)
+            if flow >= most:
+                raise ValueError(f"{name}: {flow:g} is not allowed; allowed: < {most:.0f}, by entry_headway")
+        for name, flow in (("ramp_flow", self.ramp_flow), ("calm_ramp_flow", self.calm_ramp_flow)):
+            if flow >= 3600.0 / RAMP_HEADWAY:
+                raise ValueError(f"{name}: {flow:g} is not allowed; allowed: < {3600.0 / RAMP_HEADWAY:.0f}")
+        if self.human_control != "native" or self.population:
+            which = "human_control" if self.human_control != "native" else "population"
+            raise ValueError(
+                f"{which}: {getattr(self, which)!r} is not allowed on the on-ramp, where SUMO drives people"
+            )
+        return self
+
+    def draw(self, generator: np.random.Generator) -> MotorwayRoad:
+        """Return the road with who wants to enter it; random are the people, when they come, who is a CAV."""
+        kinds = {f"person_{number}": self._person(generator) for number in range(KINDS)}
+        entries, chosen = list[Entry](), set[str]()
+        for number, (time, route, lane, speed) in enumerate(sorted(self._arrivals(generator))):
+            name, kind = f"vehicle_{number}", f"person_{generator.integers(KINDS)}"
+            if generator.random() < self.cav_share:
+                chosen.add(name)
+            entries.append(Entry(name, route, 0.0, speed, time, lane, kind))
+        return MotorwayRoad(
+            network=_network(self.lanes),
+            routes=_ROUTES,
+            entries=tuple(entries),
+            limit_speed=MOTORWAY_SPEED,
+            kinds=kinds,
+            cav_ids=frozenset(chosen),
+            lanes=_lanes(self.lanes),
+            merge=BEFORE,
+            length=BEFORE + MERGING + AFTER,
+            vehicle_length=self.vehicle_length,
+            peak=self.peak,
+            roadside=self.roadside,
+        )
+
+    def _person(self, generator: np.random.Generator) -> Person:
+        def between(interval: tuple[float, float]) -> float:
+            return round(float(generator.uniform(*interval)), 4)
+
+        return Person(
+            model=self.following,
+            time_headway=between(self.time_headways),
+            acceleration=between(self.accelerations),
+            deceleration=between(self.decelerations),
+            gap=between(self.gaps),
+            speed_factor=round(float(np.clip(generator.normal(1.0, self.speed_spread), 0.8, 1.2)), 4),
+        )
+
+    def _arrivals(self, generator: np.random.Generator) -> Iterator[Arrival]:
+        """Yield when vehicles want to enter, on which route, in which lane, and how fast."""
+        for lane in range(self.lanes):
+            flows = self.calm_inflow / self.lanes, self.inflow / self.lanes
+            for time in self._times(generator, *flows, self.entry_headway):
+                yield time, "motorway", lane, "last"
+        for time in self._times(generator, self.calm_ramp_flow, self.ramp_flow, RAMP_HEADWAY):
+            yield time, "ramp", 0, RAMP_ENTRY_SPEED
+
+    def _times(
+        self, generator: np.random.Generator, calm: float, peak: float, smallest: float
+    ) -> Iterator[float]:
+        """Yield times with shifted exponential headways, period by period [s]; flows in veh/h."""
+        begin = 0.0
+        for end, flow in ((self.peak[0], calm), (self.peak[1], peak), (self.seconds, calm)):
+            time = begin
+            while flow:
+                time += smallest + float(generator.exponential(3600.0 / flow - smallest))
+                if time >= min(end, self.seconds):
+                    break
+                yield round(time, 2)
+            begin = max(begin, end)
+
+    @property
+    def top_speed(self) -> float:
+        """What the road allows [m/s]."""
+        return MOTORWAY_SPEED
+
+    @property
+    def people_in_words(self) -> str:
+        """How people drive."""
+        return f"{KINDS} different people, {self.following} with SUMO's lane changes"
+
+    def possible_cavs(self) -> tuple[str, ...]:
+        """Return the ids that CAVs may have: any vehicle's."""
+        most = int(self.seconds / 3600.0 * 2.0 * (self.inflow + self.ramp_flow))
+        return tuple(f"vehicle_{number}" for number in range(most))
+
+    def facts(self) -> list[tuple[str, str]]:
+        """Return the road's own facts for `unjam scenarios`."""
+        lanes = "one lane" if self.lanes == 1 else f"{self.lanes} lanes"
+        begin, end = self.peak
+        return [
+            ("road", f"motorway of {(BEFORE + MERGING + AFTER) / 1000:g} km, {lanes}, with a ramp"),
+            (
+                "vehicles",
+                f"{self.inflow:g} + {self.ramp_flow:g} veh/h from {begin:g} to {end:g} s, "
+                f"else {self.calm_inflow:g} + {self.calm_ramp_flow:g} ({100 * self.cav_share:g} % CAV)",
+            ),
+            ("limit", f"{MOTORWAY_SPEED:.2f} m/s"),
+            ("limit is", "what the motorway allows"),
+        ]
+
+
+def _network(lanes: int) -> RoadNetwork:
+    nodes = (
+        Node("entrance", -BEFORE, 0.0),
+        Node("ramp_entrance", -RAMP + 1.0, -APART),
+        Node("joins", 0.0, 0.0),
+        Node("closes", MERGING, 0.0),
+        Node("exit", MERGING + AFTER, 0.0),
+    )
+    edges = (
+        Edge("motorway", "entrance", "joins", BEFORE, lanes=lanes),
+        Edge("ramp", "ramp_entrance", "joins", RAMP, speed=RAMP_SPEED),
+        Edge("merging", "joins", "closes", MERGING, lanes=lanes + 1),
+        Edge("after", "closes", "exit", AFTER, lanes=lanes),
+    )
+    connections = (
+        *(Connection("motorway", "merging", lane, lane + 1) for lane in range(lanes)),
+        Connection("ramp", "merging", 0, 0),
+        *(Connection("merging", "after", lane + 1, lane) for lane in range(lanes)),
+    )
+    return RoadNetwork(nodes, edges, MOTORWAY_SPEED, links=False, connections=connections)
+
+
+def _lanes(lanes: int) -> tuple[Lane, ...]:
+    """Return all lanes; way 0 is the ramp and the lane beside the motorway in which it ends."""
+    found = [
+        Lane("ramp_0", 0, BEFORE - RAMP, RAMP_SPEED),
+        Lane("merging_0", 0, BEFORE, MOTORWAY_SPEED, closing=True),
+    ]
+    for lane in range(lanes):
+        found += [
+            Lane(f"motorway_{lane}", lane + 1, 0.0, MOTORWAY_SPEED),
+            Lane(f"merging_{lane + 1}", lane + 1, BEFORE, MOTORWAY_SPEED, closing=True),
+            Lane(f"after_{lane}", lane + 1, BEFORE + MERGING, MOTORWAY_SPEED),
+        ]
+    return tuple(found)
+
+
+_ROUTES = (Route("motorway", ("motorway", "merging", "after")), Route("ramp", ("ramp", "merging", "after")))
+
+ON_RAMP = OnRamp()
+ON_RAMPS = {
+    "on-ramp": ON_RAMP,
+    "on-ramp-1": replace(
+        ON_RAMP, lanes=1, inflow=1400.0, ramp_flow=350.0, calm_inflow=900.0, calm_ramp_flow=125.0
+    ),
+    "on-ramp-steady": replace(ON_RAMP, peak=(300.0, 2400.0)),
+}
+"""the roads of this kind that have a name"""

@@ -1,0 +1,56 @@
+"""Do the experts of motorways hold back where the road ahead is slow, and nowhere else?"""
+
+import numpy as np
+import pytest
+
+from unjam.drivers.local_state import EVERYWHERE, SECTIONS_AHEAD, LocalState, like_ones
+from unjam.drivers.motorway_experts import FREELY, Cruise, JamAhead
+from unjam.drivers.registry import named_driver
+from unjam.errors import InputError
+
+
+def state(speed: float, ahead: float, to_merge: float = 500.0, allowed: float = 28.0) -> LocalState:
+    """One CAV; the first five sections ahead are as fast as `ahead`, those behind them free."""
+    speeds = np.full((1, SECTIONS_AHEAD), allowed)
+    speeds[0, :5] = ahead
+    values = (speed, speed, 50.0, speed, 50.0, 1500.0, np.nan)
+    near = LocalState(*(np.array([value]) for value in values))
+    told = {"allowed_speed": np.array([allowed]), "to_merge": np.array([to_merge])}
+    return near._replace(**told, lane_speeds=speeds, road_speeds=speeds - 1.0)
+
+
+def answer(driver: JamAhead, *args: float) -> float:
+    return float(driver.act(state(*args), {})[0][0])
+
+
+def test_it_drives_towards_the_mean_speed_ahead_and_never_brakes_hard_for_it() -> None:
+    driver = JamAhead()
+    assert answer(driver, 20.0, 19.5) == pytest.approx(-0.5)
+    assert answer(driver, 20.0, 10.0) == -1.5
+    assert answer(driver, 4.0, 1.0) == pytest.approx(1.0)  # towards the lowest, 5 m/s
+    assert answer(JamAhead(time_constant=2.0), 20.0, 19.0) == pytest.approx(-0.5)
+    assert answer(JamAhead(margin=0.4), 20.0, 19.5) == pytest.approx(-0.1)
+
+
+def test_it_never_asks_for_more_than_is_allowed() -> None:
+    assert answer(JamAhead(), 27.9, 40.0) == pytest.approx(0.1)
+
+
+def test_behind_the_merge_and_without_a_message_it_holds_nobody_back() -> None:
+    assert answer(JamAhead(), 20.0, 5.0, -1.0) == FREELY
+    alone = like_ones(EVERYWHERE, np.ones)
+    assert JamAhead().act(alone, {})[0].tolist() == [FREELY]
+    assert Cruise().act(alone, {})[0].tolist() == [FREELY]
+
+
+def test_sections_and_lanes_are_the_users_to_choose() -> None:
+    mixed = (3 * 10.0 + 2 * 28.0) / 5  # sections 2 to 6, of which 2, 3 and 4 are slow
+    assert answer(JamAhead(first=2, last=6), 17.0, 10.0) == pytest.approx(mixed - 17.0)
+    assert answer(JamAhead(all_lanes=True), 20.0, 20.0) == pytest.approx(-1.0)
+    with pytest.raises(InputError, match="last: 2 is not allowed; allowed: >= first, 3"):
+        named_driver("jam-ahead:first=3,last=2", 1.0)
+
+
+def test_it_says_what_it_must_be_told() -> None:
+    assert JamAhead().perceives == LocalState._fields
+    assert Cruise().perceives == EVERYWHERE

@@ -1,0 +1,138 @@
+"""Is what is said of a motorway what SUMO does there, and who may command what where?"""
+
+import libsumo
+import numpy as np
+import pytest
+
+from unjam.drivers import Human
+from unjam.drivers.command import Command
+from unjam.drivers.motorway_experts import Cruise, JamAhead
+from unjam.measures.metrics import measure
+from unjam.scenarios import OnRamp
+from unjam.worlds.episode import run_episode
+from unjam.worlds.record import Episode
+from unjam.worlds.sumo import make_traffic
+from unjam.worlds.sumo.motorway import MotorwayTraffic
+from unjam.worlds.sumo.simulation import Simulation
+
+BUSY = OnRamp(peak=(0.0, 240.0), cav_share=0.2, horizon=240)
+
+
+def motorway(simulation: Simulation, scenario: OnRamp = BUSY) -> MotorwayTraffic:
+    traffic = make_traffic(scenario, (3,), simulation)
+    assert isinstance(traffic, MotorwayTraffic)
+    traffic.start(controlled=True)
+    return traffic
+
+
+@pytest.fixture(scope="module")
+def capped() -> Episode:
+    return run_episode(BUSY, JamAhead(), (3,), full=True)
+
+
+def test_leaders_and_gaps_are_sumos(simulation: Simulation) -> None:
+    traffic, compared = motorway(simulation), 0
+    for _ in range(150):
+        traffic.advance(Command(np.full(traffic.rows, 100.0)))
+        seen = traffic.perceive()
+        for row, name in enumerate(traffic.cavs):
+            leader, gap = libsumo.vehicle.getLeader(name, 90.0) or ("", 0.0)
+            if not leader or libsumo.vehicle.getRoadID(name) in ("ramp", "merging"):
+                continue  # there SUMO looks across lanes
+            true_gap = gap + libsumo.vehicle.getMinGap(name)
+            if true_gap < 90.0:
+                assert seen.leader_gap[row] == pytest.approx(true_gap, abs=1e-6)
+                assert seen.leader_speed[row] == libsumo.vehicle.getSpeed(leader)
+                compared += 1
+            assert seen.speed[row] == libsumo.vehicle.getSpeed(name)
+    assert compared > 500
+
+
+def test_a_cav_is_held_back_upstream_and_left_alone_where_the_lane_closes(simulation: Simulation) -> None:
+    traffic, held, free = motorway(simulation), [], []
+    for _ in range(200):
+        before = dict(zip(traffic.cavs, traffic.perceive().speed.tolist(), strict=True))
+        traffic.advance(Command(np.full(traffic.rows, -0.1)))
+        seen = traffic.perceive()
+        for row, name in enumerate(traffic.cavs):
+            if name in before and before[name] > 10.0:
+                change = seen.speed[row] - before[name]
+                (held if seen.to_merge[row] > 60.0 else free).append(change)
+    assert len(held) > 200
+    assert max(held) <= -0.1 + 1e-9
+    assert max(free) > 0.5
+
+
+def test_who_is_not_held_back_drives_as_its_own_acc_does(simulation: Simulation) -> None:
+    episode = run_episode(BUSY, Cruise(), (3,), simulation=simulation)
+    assert episode.status == "completed"
+    assert measure(episode)["shield_override_share"] == 0.0
+    fastest = max(trajectory.applied.max() for trajectory in episode.trajectories)
+    assert 1.5 < fastest <= 2.5
+
+
+def test_cavs_want_to_drive_as_fast_as_those_whom_they_replace(simulation: Simulation) -> None:
+    traffic = motorway(simulation)
+    for _ in range(60):
+        traffic.advance(Command(np.full(traffic.rows, 100.0)))
+    kinds = {entry.name: entry.kind for entry in traffic.road.entries}
+    for row, name in enumerate(traffic.cavs):
+        factor = traffic.road.kinds[kinds[name]].speed_factor
+        assert libsumo.vehicle.getSpeedFactor(name) == pytest.approx(factor)
+        assert libsumo.vehicle.getTypeID(name) == f"cav_of_{kinds[name]}"
+        assert traffic.perceive().allowed_speed[row] == libsumo.vehicle.getAllowedSpeed(name)
+
+
+def test_the_message_is_the_mean_speed_of_the_lane_ahead(simulation: Simulation) -> None:
+    traffic = motorway(simulation)
+    for _ in range(120):
+        traffic.advance(Command(np.full(traffic.rows, 100.0)))
+    state, checked = traffic.perceive(), 0
+    for row, name in enumerate(traffic.cavs):
+        lane = libsumo.vehicle.getLaneID(name)
+        if not lane.startswith("motorway"):
+            continue
+        section = int(libsumo.vehicle.getLanePosition(name) // 100)
+        there = libsumo.lane.getLastStepVehicleIDs(lane)
+        speeds = [
+            libsumo.vehicle.getSpeed(other)
+            for other in there
+            if int(libsumo.vehicle.getLanePosition(other) // 100) == section
+        ]
+        assert state.lane_speeds[row, 0] == pytest.approx(np.mean(speeds))
+        checked += 1
+    assert checked > 5
+
+
+def test_people_alone_are_the_same_whoever_would_be_automated(simulation: Simulation) -> None:
+    one, other = (
+        run_episode(
+            OnRamp(peak=(0.0, 60.0), horizon=60, cav_share=share), Human(), (1,), simulation=simulation
+        )
+        for share in (0.05, 0.5)
+    )
+    np.testing.assert_array_equal(one.speeds, other.speeds)
+
+
+def test_the_audit_tells_cut_ins_from_following(capped: Episode) -> None:
+    audit = capped.audit
+    assert audit.lanes
+    assert audit.floor == 1.0
+    assert audit.cut_in.moments > 100
+    assert audit.cavs.moments > audit.cut_in.moments
+    everybody = audit.people.moments + audit.cavs.moments + audit.cut_in.moments
+    there = (~np.isnan(capped.speeds[1:])).sum()
+    assert everybody == pytest.approx(2 * there, rel=0.02)
+    assert 0.5 < audit.following.headway < 3.0
+    row = measure(capped)
+    assert row["drivable"] == "drivable"
+    assert row["cav_max_braking"] < 4.0
+
+
+def test_where_each_came_from_and_the_peak_are_recorded(capped: Episode) -> None:
+    assert set(capped.branches) == {"motorway", "ramp"}
+    assert capped.peak == (0.0, 240.0)
+    assert np.nanmax(capped.positions) <= 3000.0
+    stays = [trajectory for trajectory in capped.trajectories if len(trajectory.applied) > 60]
+    assert stays
+    assert all((np.diff(stay.states.to_merge) <= 1e-9).all() for stay in stays)
