@@ -39,8 +39,8 @@ def test_where_nothing_passes_nothing_is_recommended_and_the_quickest_is_shown()
     judged = [QUICK_AND_WRONG, Judged(0.2, "pi", replace(GOOD, failed=1))]
     assert recommended(judged) is None
     assert headline(judged) == (
-        "No CAVs are recommended on this road: of 2 shares judged on fresh seeds none passes the rule; "
-        "1 of them slow the traffic or lose flow."
+        "No CAVs are recommended on this road: none of the shares judged on fresh seeds passes the rule "
+        "(1 of 2 slow traffic or lose flow)."
     )
     assert shown_beside(judged) == QUICK_AND_WRONG
 
@@ -48,5 +48,5 @@ def test_where_nothing_passes_nothing_is_recommended_and_the_quickest_is_shown()
 def test_where_nobody_was_judged_nothing_is_recommended_or_shown() -> None:
     assert shown_beside([]) is None
     assert headline([]) == (
-        "No CAVs are recommended on this road: all that was tried was set aside on the seeds that chose."
+        "No CAVs are recommended on this road: all that was tried slows traffic, loses flow, or failed."
     )

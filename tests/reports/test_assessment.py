@@ -21,7 +21,11 @@ from unjam.training.evaluate import Evaluation, save_evaluation
 from unjam.worlds.record import Episode
 
 HELPS = Judged(0.1, "acc", GOOD)
-HARMS = Judged(0.2, "idm:a=1,b=<2>", replace(GOOD, travel_time=between(3, 5), drivable="brakes with 9 m/s2"))
+HARMS = Judged(
+    0.2,
+    "idm:time_headway=1,max_acceleration=2.5,b=<2>",
+    replace(GOOD, travel_time=between(3, 5), drivable="brakes with 9 m/s2"),
+)
 UNKNOWN = replace(GOOD, travel_time=Estimate(float("nan"), float("nan"), float("nan"), 0), drivable="")
 
 
@@ -78,7 +82,7 @@ def cells_of(page: str, label: str) -> list[str]:
 def test_the_page_leads_with_the_words_of_the_rule(page: str) -> None:
     assert headline([HELPS, HARMS]) in page
     assert HELPS.words in page
-    assert "20 % CAVs that drive as idm:a=1,b=&lt;2&gt;: not recommended, for travel time is longer" in page
+    assert "max_acceleration=2.5,b=&lt;2&gt;: not recommended, for travel time is longer" in page
     assert "The CAVs are those recommended." in page
 
 

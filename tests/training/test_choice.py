@@ -111,9 +111,11 @@ def test_an_option_that_fails_is_set_aside_with_the_reason() -> None:
 
 def test_where_all_harm_nobody_is_chosen() -> None:
     drive = MadeUp({ACC: shifted(5), PI: shifted(6)})
-    found = choose([ACC, PI], drive, drive.budget, 0.01, quiet)
+    lines: list[str] = []
+    found = choose([ACC, PI], drive, drive.budget, 0.01, lines.append)
     assert found.finalists == []
     assert set(found.set_aside) == {ACC, PI}
+    assert lines[-1] == "choosing, 6 seeds: 0 of 2 left, all are set aside"
 
 
 def test_each_batch_is_told_in_a_line() -> None:

@@ -56,11 +56,10 @@ def headline(judged: Sequence[Judged]) -> str:
     best = recommended(judged)
     if best is None:
         if not judged:
-            return f"{NONE}: all that was tried was set aside on the seeds that chose."
+            return f"{NONE}: all that was tried slows traffic, loses flow, or failed."
         worse = sum(bool(harm_of(each.effect)) for each in judged)
-        harm = f"; {worse} of them slow the traffic or lose flow" if worse else ""
-        shares = f"{len(judged)} share{'s' * (len(judged) > 1)}"
-        return f"{NONE}: of {shares} judged on fresh seeds none passes the rule{harm}."
+        harm = f" ({worse} of {len(judged)} slow traffic or lose flow)" if worse else ""
+        return f"{NONE}: none of the shares judged on fresh seeds passes the rule{harm}."
     return (
         f"{percent(best.share)} CAVs are recommended on this road, driving as {best.driver}: travel time "
         f"{signed(best.effect.travel_time, 1)} s a vehicle ({100 * best.effect.relative_time:+.1f} %)."

@@ -164,5 +164,7 @@ def _order(effect: Effect) -> tuple[bool, bool, float]:
 
 def _wide(widths: Sequence[float], precision: float) -> str:
     """Return how wide the widest interval is, in words."""
-    widest = max(widths, default=float("nan"))
+    if not widths:
+        return "all are set aside"
+    widest = max(widths)
     return f"travel time known to ±{100 * widest:.1f} % of people's (wanted: ±{100 * precision:g} %)"
