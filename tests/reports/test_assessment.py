@@ -41,6 +41,7 @@ def folder_of(folder: Path, judged: list[Judged]) -> Path:
         {"share": each.share, "driver": each.driver, "set_aside": "", "chosen": True, "effect": asdict(GOOD)}
         for each in (HELPS, HARMS)
     ]
+    tried[0]["set_aside"] = "slower than people"
     tried.append({**tried[0], "driver": "pi", "set_aside": "failed: no CAV", "effect": asdict(UNKNOWN)})
     people: dict[str, Any] = dict.fromkeys(METRICS, asdict(Estimate(78.5, 70.0, 80.0, 20)))
     document = {
@@ -117,6 +118,7 @@ def test_where_nothing_is_recommended_the_page_says_so_and_why(tmp_path: Path) -
     assert "No CAVs are recommended on this road" in page
     assert "they are not recommended" in page
     assert "10 % CAVs: not recommended, for every driver was set aside" in page
+    assert "The quickest, acc: slower than people." in page
 
 
 def test_where_nothing_was_judged_there_is_still_a_page(tmp_path: Path) -> None:

@@ -57,7 +57,7 @@ def render_assessment(folder: Path) -> str:
     return filled(
         "assessment.html",
         found=found,
-        without=[share for share in found["shares"] if share not in [each["share"] for each in judged]],
+        without=_without(found),
         cards=_cards(found),
         columns=[ALONE, *(f"{percent(each['share'])}: {each['driver']}" for each in judged)],
         table=_table(found),
@@ -89,6 +89,16 @@ def _estimate(value: Any) -> Any:
         mean, low, high = (nan if value[key] is None else value[key] for key in ("mean", "low", "high"))
         return Estimate(mean, low, high, value["count"])
     return nan if value is None else value
+
+
+def _without(found: dict[str, Any]) -> list[tuple[float, dict[str, Any]]]:
+    """Return the shares at which nobody was judged, with the quickest that was tried there."""
+    judged = [each["share"] for each in found["judged"]]
+    return [
+        (share, min(tried, key=lambda each: each["effect"]["travel_time"].mean))
+        for share in found["shares"]
+        if share not in judged and (tried := [each for each in found["tried"] if each["share"] == share])
+    ]
 
 
 def _cards(found: dict[str, Any]) -> list[tuple[str, str, str]]:
