@@ -8,7 +8,9 @@ import pytest
 from playwright.sync_api import Browser, ConsoleMessage, Page, Request, Route, sync_playwright
 
 import unjam
+from tests.reports.test_assessment import HARMS, HELPS, folder_of
 from unjam.measures.metrics import METRICS
+from unjam.reports.assessment import write_assessment
 
 CHROMIUM = shutil.which("chromium")
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium found: apt-get install chromium")
@@ -60,6 +62,13 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return unjam.train(
         unjam.load_config(changes=changes), tmp_path_factory.mktemp("train") / "ring-001"
     ).report
+
+
+@pytest.fixture(scope="module")
+def assessed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The page of `unjam assess`."""
+    folder = folder_of(tmp_path_factory.mktemp("assess"), [HELPS, HARMS])
+    return write_assessment(folder, folder / "assessment.html")
 
 
 @pytest.fixture(scope="module")
@@ -141,6 +150,7 @@ class Opener:
         pytest.param("driven", 2, marks=pytest.mark.slow),
         pytest.param("merged", 2, marks=pytest.mark.slow),
         ("trained", 7),
+        ("assessed", 2),
     ],
 )
 def test_every_picture_is_there(
@@ -155,7 +165,7 @@ def test_every_picture_is_there(
 @pytest.mark.parametrize(
     "size", [PHONE, *map(slowly, (LAPTOP, (320, 640), (820, 1180)))], ids=lambda size: str(size[0])
 )
-@pytest.mark.parametrize("report", ["driven", "merged", "trained"])
+@pytest.mark.parametrize("report", ["driven", "merged", "trained", "assessed"])
 def test_nothing_is_wider_than_the_screen(
     open_page: Opener, request: pytest.FixtureRequest, report: str, size: tuple[int, int]
 ) -> None:

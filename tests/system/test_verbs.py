@@ -43,7 +43,7 @@ METRICS_OF_THE_DESIGN = [
     "speed_limit_ratio_steady",
 ]
 
-VERBS = ["scenarios", "drivers", "drive", "train", "evaluate", "model", "fit-drivers", "report"]
+VERBS = ["scenarios", "drivers", "drive", "assess", "train", "evaluate", "model", "fit-drivers", "report"]
 VERBS += ["reproduce", "search", "export", "verify", "watch", "bench", "doctor"]
 
 
@@ -133,6 +133,47 @@ def test_drive_on_your_own_network(unjam: Run, tmp_path: Path) -> None:
         unjam("drive", file, "--cav-types", "truck,passenger", "-d", "idm", *common, "--no-report")
     )
     assert types["episodes"][0]["steps"] == 150
+
+
+QUESTION = ["assess", "straight.sumocfg", "--shares", "0,0.5", "-d", "acc", "--set", "horizon=120"]
+
+
+def test_assess_answers_in_words_in_json_and_on_a_page(unjam: Run, tmp_path: Path) -> None:
+    straight(tmp_path, '<flow id="f" type="car" route="along" begin="0" end="20" period="2"/>', length=100.0)
+    ran = unjam(*QUESTION, "-n", 36, "--out", "said")
+    assert ran.returncode == 0, ran.stderr
+    answer, *shares = ran.stdout.splitlines()
+    assert "recommended on this road" in answer
+    assert [line.startswith("- 50 % CAVs that drive as acc: ") for line in shares] == [True]
+    assert "choosing, 2 seeds: 1 of 1 left" in ran.stderr
+    assert "judging, 10 fresh seeds" in ran.stderr
+    assert "report: said/assessment.html" in ran.stderr
+    found = document(unjam(*QUESTION, "-n", 36, "--json", pictures=False))
+    assert found["folder"] == "runs/assess-straight-001"
+    assert found["headline"] == answer
+    assert [f"- {each['words']}" for each in found["judged"]] == shares
+    kept = {path.name for path in (tmp_path / "said").iterdir()}
+    assert kept == {
+        *("assessment.html", "assessment.json", "choosing"),
+        *("evaluation.json", "episodes.parquet", "shown.safetensors"),
+    }
+    assert unjam("report", "said", pictures=False).returncode == 0, "the rows are those of drive"
+
+
+@pytest.mark.slow
+def test_assess_that_is_interrupted_leaves_nothing_half_written(unjam: Run, tmp_path: Path) -> None:
+    straight(tmp_path, '<flow id="f" type="car" route="along" begin="0" end="20" period="2"/>', length=100.0)
+    command = [str(UNJAM), *QUESTION, "-n", "5000", "--precision", "1e-9", "--out", "said"]
+    with subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stderr is not None
+        assert "choosing" in process.stderr.readline()
+        workers = children_of(process.pid)
+        process.send_signal(signal.SIGINT)
+        _, words = process.communicate(timeout=10)
+    assert process.returncode == 130
+    assert "Traceback" not in words
+    assert not list((tmp_path / "said").iterdir())
+    wait_until(lambda: not any(Path(f"/proc/{worker}").exists() for worker in workers))
 
 
 def test_an_episode_that_fails_keeps_the_others(unjam: Run, my_drivers: Path) -> None:

@@ -10,6 +10,7 @@ from typing import Annotated
 import typer
 
 from unjam import __version__
+from unjam.cli.assess import assess
 from unjam.cli.drive import drive, watch
 from unjam.cli.machine import bench, doctor
 from unjam.cli.parts import drivers, fit_drivers, scenarios
@@ -46,7 +47,7 @@ def _root(
 
 
 for verb in (
-    *(scenarios, drivers, drive, train, evaluate, model, fit_drivers),
+    *(scenarios, drivers, drive, assess, train, evaluate, model, fit_drivers),
     *(report, tune, search, reproduce, export, certify, verify, watch, bench, doctor),
 ):
     app.command()(verb)

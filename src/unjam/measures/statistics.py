@@ -25,11 +25,14 @@ class Estimate:
     """values that it is the mean of"""
 
 
-def estimate(values: Sequence[float], statistic: Callable[..., Any] = np.mean) -> Estimate:
+def estimate(
+    values: Sequence[float], statistic: Callable[..., Any] = np.mean, confidence: float = CONFIDENCE
+) -> Estimate:
     """Return the mean of `values` and its 95 % percentile bootstrap interval; NaN values are left out.
 
     The interval is deterministic: its resamples come from a fixed seed. Of one value it is NaN. Another
-    `statistic` than the mean takes the values and an axis, like NumPy's.
+    `statistic` than the mean takes the values and an axis, like NumPy's; another `confidence` is that of the
+    interval.
     """
     finite = np.array([value for value in values if np.isfinite(value)], float)
     mean = float(statistic(finite, axis=0)) if len(finite) else float("nan")
@@ -37,7 +40,7 @@ def estimate(values: Sequence[float], statistic: Callable[..., Any] = np.mean) -
         end = mean if len(finite) > 1 else float("nan")
         return Estimate(mean, end, end, len(finite))
     found = bootstrap(
-        (finite,), statistic, confidence_level=CONFIDENCE, n_resamples=RESAMPLES, method="percentile", rng=0
+        (finite,), statistic, confidence_level=confidence, n_resamples=RESAMPLES, method="percentile", rng=0
     )
     low, high = found.confidence_interval
     return Estimate(mean, float(low), float(high), len(finite))
@@ -54,11 +57,23 @@ def summarise(rows: Sequence[dict[str, Any]]) -> dict[str, Estimate]:
 
 
 def paired_difference(
-    rows: Sequence[dict[str, Any]], others: Sequence[dict[str, Any]], name: str
+    rows: Sequence[dict[str, Any]],
+    others: Sequence[dict[str, Any]],
+    name: str,
+    confidence: float = CONFIDENCE,
 ) -> Estimate:
     """Return the estimate of the difference, same seeds paired, of a metric between two sets of rows."""
     other = {str(row["seed"]): row[name] for row in others}
-    return estimate([row[name] - other[str(row["seed"])] for row in rows if str(row["seed"]) in other])
+    differences = [row[name] - other[str(row["seed"])] for row in rows if str(row["seed"]) in other]
+    return estimate(differences, confidence=confidence)
+
+
+def signed(gain: Estimate, digits: int = 0) -> str:
+    """Return a difference with its sign and, where it has one, its interval."""
+    if not gain.count:
+        return "–"
+    interval = "" if np.isnan(gain.low) else f" [{gain.low:+.{digits}f}, {gain.high:+.{digits}f}]"
+    return f"{gain.mean:+.{digits}f}{interval}"
 
 
 def interquartile_mean(values: Any, axis: int = -1) -> Any:

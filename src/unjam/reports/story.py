@@ -8,7 +8,7 @@ import numpy as np
 
 from unjam.measures.drivable import verdicts
 from unjam.measures.metrics import METRICS, Metric
-from unjam.measures.statistics import Estimate, estimate_of, paired_difference
+from unjam.measures.statistics import Estimate, estimate_of, paired_difference, signed
 from unjam.reports.results import Results, Shown
 
 CLOSE_HEADWAY = 1.0
@@ -112,12 +112,6 @@ def _lead_of_drives(result: Results) -> str:
         f"{label} on {scenario}, {len(rows)} episodes: all vehicles drive {speed.mean:.2f} m/s on average, "
         f"and in steady state {100 * ratios[label].mean:.0f}\u00a0% of the limit."
     )
-
-
-def signed(gain: Estimate) -> str:
-    """Return a difference with its sign and, where it has one, its interval."""
-    interval = "" if np.isnan(gain.low) else f" [{gain.low:+.0f}, {gain.high:+.0f}]"
-    return f"{gain.mean:+.0f}{interval}"
 
 
 def notes_of(result: Results) -> list[str]:

@@ -74,8 +74,24 @@ def evaluate(
     progress: Progress | None = None,
 ) -> Evaluation:
     """Run every driver on every seed, and measure."""
+    on_road = {label: (scenario, driver) for label, driver in drivers.items()}
+    return evaluate_each(on_road, seeds, workers, reward, progress)
+
+
+def evaluate_each(
+    drivers: dict[str, tuple[Scenario, Driver]],
+    seeds: Sequence[tuple[int, ...]],
+    workers: Workers,
+    reward: str = "",
+    progress: Progress | None = None,
+    pictured: bool = True,
+) -> Evaluation:
+    """Run every driver, each on a road of its own, on every seed, and measure.
+
+    An episode of each is kept for pictures; not so where none are `pictured`, for it needs much memory.
+    """
     pairs = [(label, index) for index in range(len(seeds)) for label in drivers]
-    tasks = [EpisodeTask(scenario, drivers[label], seeds[index], reward, full=True) for label, index in pairs]
+    tasks = [EpisodeTask(*drivers[label], seeds[index], reward, full=True) for label, index in pairs]
 
     def on_progress(task: int, steps: int) -> None:
         if progress is not None:
@@ -83,7 +99,7 @@ def evaluate(
 
     def measured(task: int, episode: Episode) -> tuple[dict[str, Any], Episode | None]:
         _, index = pairs[task]
-        return measure(episode), episode if index == 0 and episode.ok else None
+        return measure(episode), episode if pictured and index == 0 and episode.ok else None
 
     rows: Rows = {label: [] for label in drivers}
     shown: dict[str, Episode] = {}

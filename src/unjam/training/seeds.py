@@ -1,4 +1,4 @@
-"""Seeds in four families that never meet: what chose settings never judges them.
+"""Seeds in five families that never meet: what chose settings never judges them.
 
 A training draws its episodes from (its seed, iteration, episode), its seed being smaller than any number
 here; the others begin with a number of their own.
@@ -14,10 +14,18 @@ VALIDATE = 1_000_033
 TUNE = 1_000_037
 """first number of the seeds that choose an expert's parameters"""
 
+CHOOSE = 1_000_081
+"""first number of the seeds that choose who drives on a road of the user's own"""
 
-def held_out_seeds(count: int) -> list[tuple[int, ...]]:
-    """Return the seeds of final evaluations."""
-    return [(JUDGE, index) for index in range(count)]
+
+def held_out_seeds(count: int, first: int = 0) -> list[tuple[int, ...]]:
+    """Return the seeds of final evaluations, from number `first` on."""
+    return [(JUDGE, index) for index in range(first, first + count)]
+
+
+def choosing_seeds(count: int, first: int = 0) -> list[tuple[int, ...]]:
+    """Return seeds that choose among drivers on a road of the user's own, from number `first` on."""
+    return [(CHOOSE, index) for index in range(first, first + count)]
 
 
 def tuning_seeds(count: int, first: int = 0) -> list[tuple[int, ...]]:

@@ -1,0 +1,110 @@
+"""What CAVs change on a road, beside people alone on the same seeds, and what speaks against them.
+
+The rule is one for all roads: travel time must be shown to fall; flow must be shown not to; a car must be
+able to drive so; and people must not brake hard more often than where they are alone.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from unjam.measures.drivable import DRIVABLE, drivable_in_all
+from unjam.measures.statistics import CONFIDENCE, Estimate, estimate_of, paired_difference, signed
+
+FLOW_LOST = 0.01
+"""share of people's flow that the interval must exclude as a loss"""
+LEAST_JUDGED = 10
+"""seeds without which nothing is recommended: an interval of fewer is too narrow to be trusted"""
+
+TIME, FLOW, FUEL = "travel_time", "throughput_veh_per_h", "fuel_ml_per_km"
+HARD = "people_beyond_4_5"
+
+
+@dataclass(frozen=True)
+class Effect:
+    """CAVs against people alone: differences with the same seeds paired."""
+
+    travel_time: Estimate
+    """[s] per vehicle that wanted to drive, waiting included"""
+    flow: Estimate
+    """[veh/h]"""
+    fuel: Estimate
+    """[ml/km]"""
+    hard_braking: Estimate
+    """people's moments of braking beyond 4.5 m/s2 [per million]"""
+    collisions: float
+    """vehicles in contact, all episodes together"""
+    failed: int
+    """episodes that did not run"""
+    drivable: str
+    """verdict on the CAVs themselves: `drivable`, or the first reason why not"""
+    people_time: float
+    """mean travel time of people alone on these seeds [s]"""
+    people_flow: float
+    """[veh/h]"""
+
+    @property
+    def width(self) -> float:
+        """Half the interval of travel time, as a share of people's travel time; NaN of one seed."""
+        return (self.travel_time.high - self.travel_time.low) / 2.0 / self.people_time
+
+    @property
+    def relative_time(self) -> float:
+        """Difference of travel time, as a share of people's."""
+        return self.travel_time.mean / self.people_time
+
+
+def effect_of(
+    rows: Sequence[dict[str, Any]], people: Sequence[dict[str, Any]], confidence: float = CONFIDENCE
+) -> Effect:
+    """Return what the rows of `measure` of a driver show beside those of people alone.
+
+    People may have been driven on more seeds; only those that both have count.
+    """
+    seeds = {str(row["seed"]) for row in rows}
+    people = [row for row in people if str(row["seed"]) in seeds]
+    ran = [row for row in rows if row["status"] != "failed"]
+    differences = (paired_difference(rows, people, name, confidence) for name in (TIME, FLOW, FUEL, HARD))
+    return Effect(
+        *differences,
+        collisions=float(sum(row["collisions"] for row in ran)),
+        failed=len(rows) - len(ran),
+        drivable=drivable_in_all([{**row, HARD: 0.0} for row in rows]),
+        people_time=estimate_of(people, TIME).mean,
+        people_flow=estimate_of(people, FLOW).mean,
+    )
+
+
+def harm_of(effect: Effect) -> str:
+    """Return what CAVs are shown to make worse, travel time or flow; empty where nothing is shown."""
+    if effect.travel_time.low > 0:
+        return f"travel time is longer than people's alone: {signed(effect.travel_time, 1)} s"
+    if effect.flow.high < 0:
+        return f"flow is lower than people's alone: {signed(effect.flow)} veh/h"
+    return ""
+
+
+def reasons_against(effect: Effect) -> list[str]:
+    """Return all reasons against recommending what was measured; none where there is nothing against it."""
+    harm, most = harm_of(effect), FLOW_LOST * effect.people_flow
+    # Written so that a NaN, of too few seeds, is a reason against.
+    checks = (
+        (effect.travel_time.count >= LEAST_JUDGED, f"{effect.travel_time.count} fresh seeds are too few"),
+        (not effect.failed, f"{effect.failed} episodes failed"),
+        (not harm, harm),
+        (
+            effect.travel_time.low > 0 or effect.travel_time.high < 0,
+            f"travel time is not shown to be shorter: {signed(effect.travel_time, 1)} s",
+        ),
+        (
+            effect.flow.high < 0 or effect.flow.low >= -most,
+            f"flow may be lower by more than {100 * FLOW_LOST:g} %: {signed(effect.flow)} veh/h",
+        ),
+        (effect.drivable == DRIVABLE, f"no car could drive so: {effect.drivable or 'no CAV drove'}"),
+        (
+            effect.hard_braking.mean <= 0,
+            "people brake beyond 4.5 m/s² more often than alone: "
+            f"{signed(effect.hard_braking)} times in a million moments",
+        ),
+    )
+    return [reason for fine, reason in checks if not fine]

@@ -1,0 +1,120 @@
+"""Does the rule refuse whatever is not shown to help, and say why?"""
+
+from dataclasses import replace
+from math import nan
+from typing import Any
+
+import pytest
+
+from unjam.measures.effect import LEAST_JUDGED, Effect, effect_of, harm_of, reasons_against
+from unjam.measures.statistics import Estimate
+
+USUAL: dict[str, Any] = {
+    "status": "completed",
+    "floor": 1.0,
+    "collisions": 0.0,
+    "min_headway": 0.95,
+    "cav_min_ttc": 1.5,
+    "cav_max_braking": 5.0,
+    "overridden": 0.0,
+    "travel_time": 100.0,
+    "throughput_veh_per_h": 2000.0,
+    "fuel_ml_per_km": 80.0,
+    "people_beyond_4_5": 30.0,
+}
+
+
+def rows_of(times: list[float], **changes: Any) -> list[dict[str, Any]]:
+    """A row per travel time, with seeds from zero."""
+    return [{**USUAL, "seed": [7, seed], "travel_time": time, **changes} for seed, time in enumerate(times)]
+
+
+def between(low: float, high: float, count: int = 20) -> Estimate:
+    return Estimate((low + high) / 2, low, high, count)
+
+
+NONE = Estimate(0.0, 0.0, 0.0, 20)
+GOOD = Effect(
+    travel_time=between(-6.0, -2.0),
+    flow=between(-10.0, 30.0),
+    fuel=NONE,
+    hard_braking=between(-9.0, 3.0),
+    collisions=0.0,
+    failed=0,
+    drivable="drivable",
+    people_time=100.0,
+    people_flow=2000.0,
+)
+
+
+def test_differences_are_paired_and_only_on_seeds_that_both_have() -> None:
+    people = rows_of([100.0, 120.0, 140.0, 999.0])
+    found = effect_of(rows_of([98.0, 117.0, 136.0], throughput_veh_per_h=1990.0), people)
+    assert (found.travel_time.mean, found.travel_time.count) == (-3.0, 3)
+    assert -4.0 <= found.travel_time.low < found.travel_time.high <= -2.0
+    assert found.flow == Estimate(-10.0, -10.0, -10.0, 3)
+    assert (found.people_time, found.people_flow) == (120.0, 2000.0)
+    assert found.relative_time == -3.0 / 120.0
+    assert found.width == (found.travel_time.high - found.travel_time.low) / 2 / 120.0
+
+
+def test_an_effect_knows_contacts_failures_and_the_verdict_on_the_cavs_alone() -> None:
+    rows = rows_of([99.0, 98.0, nan], people_beyond_4_5=500.0)
+    rows[0]["collisions"] = 2.0
+    rows[2] |= {"status": "failed", "collisions": nan}
+    found = effect_of(rows, rows_of([100.0] * 3))
+    assert (found.collisions, found.failed, found.travel_time.count) == (2.0, 1, 2)
+    assert found.drivable == "2 vehicles in contact (1 of 3)"
+    assert found.hard_braking.mean == 470.0
+    assert effect_of(rows_of([99.0], people_beyond_4_5=500.0), rows_of([100.0])).drivable == "drivable"
+
+
+def test_more_confidence_is_a_wider_interval() -> None:
+    people, rows = rows_of([100.0] * 12), rows_of([99.0 + 0.3 * number for number in range(12)])
+    assert effect_of(rows, people, 0.99).width > effect_of(rows, people).width > 0
+
+
+def test_nothing_speaks_against_what_helps_and_harms_nobody() -> None:
+    assert reasons_against(GOOD) == []
+    assert harm_of(GOOD) == ""
+    assert reasons_against(replace(GOOD, flow=NONE, hard_braking=NONE)) == []
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"travel_time": between(-6, -2, LEAST_JUDGED - 1)}, "9 fresh seeds are too few"),
+        ({"failed": 3}, "3 episodes failed"),
+        ({"travel_time": between(1, 3)}, "travel time is longer than people's alone: +2.0 [+1.0, +3.0] s"),
+        (
+            {"travel_time": between(-6, 0)},
+            "travel time is not shown to be shorter: -3.0 [-6.0, +0.0] s",
+        ),
+        ({"flow": between(-8, -2)}, "flow is lower than people's alone: -5 [-8, -2] veh/h"),
+        ({"flow": between(-21, 40)}, "flow may be lower by more than 1 %: +10 [-21, +40] veh/h"),
+        ({"drivable": "brakes with 7 m/s2 (1 of 9)"}, "no car could drive so: brakes with 7 m/s2 (1 of 9)"),
+        ({"drivable": ""}, "no car could drive so: no CAV drove"),
+        (
+            {"hard_braking": between(-1, 9)},
+            "people brake beyond 4.5 m/s² more often than alone: +4 [-1, +9] times in a million moments",
+        ),
+    ],
+)
+def test_each_failing_is_one_reason(changes: dict[str, Any], reason: str) -> None:
+    assert reasons_against(replace(GOOD, **changes)) == [reason]
+
+
+def test_speed_does_not_excuse_a_loss_of_flow_and_all_reasons_are_told() -> None:
+    found = replace(GOOD, travel_time=between(-60, -50), flow=between(-99, -50), drivable="2 in contact")
+    assert [reason.split(":")[0] for reason in reasons_against(found)] == [
+        "flow is lower than people's alone",
+        "no car could drive so",
+    ]
+
+
+def test_one_seed_has_no_interval_and_proves_nothing() -> None:
+    found = effect_of(rows_of([50.0]), rows_of([100.0]))
+    reasons = reasons_against(found)
+    assert any("too few" in reason for reason in reasons)
+    assert any("not shown to be shorter" in reason for reason in reasons)
+    assert any("flow may be lower" in reason for reason in reasons)

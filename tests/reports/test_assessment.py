@@ -1,0 +1,132 @@
+"""Does the page of an assessment say what its folder says, alone and in full?"""
+
+import json
+import re
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.measures.test_effect import GOOD, between
+from unjam.errors import InputError
+from unjam.manifest import manifest
+from unjam.measures.metrics import METRICS
+from unjam.measures.recommendation import Judged, headline, recommended
+from unjam.measures.statistics import Estimate
+from unjam.reports.assessment import ASSESSMENT_FILE, render_assessment, write_assessment
+from unjam.scenarios import Ring, scenario_recipe
+from unjam.training.evaluate import Evaluation, save_evaluation
+from unjam.worlds.record import Episode
+
+HELPS = Judged(0.1, "acc", GOOD)
+HARMS = Judged(
+    0.2,
+    "idm:time_headway=1,max_acceleration=2.5,b=<2>",
+    replace(GOOD, travel_time=between(3, 5), drivable="brakes with 9 m/s2"),
+)
+UNKNOWN = replace(GOOD, travel_time=Estimate(float("nan"), float("nan"), float("nan"), 0), drivable="")
+
+
+def episode(generator: np.random.Generator) -> Episode:
+    speeds = generator.uniform(1, 9, (50, 3))
+    return Episode((1,), "completed", vehicle_ids=("a", "b", "c"), speeds=speeds, positions=speeds.cumsum(0))
+
+
+def folder_of(folder: Path, judged: list[Judged]) -> Path:
+    """A folder as `unjam assess` writes it, of made-up numbers."""
+    best, generator = recommended(judged), np.random.default_rng(0)
+    tried = [
+        {"share": each.share, "driver": each.driver, "set_aside": "", "chosen": True, "effect": asdict(GOOD)}
+        for each in (HELPS, HARMS)
+    ]
+    tried[0]["set_aside"] = "slower than people"
+    tried.append({**tried[0], "driver": "pi", "set_aside": "failed: no CAV", "effect": asdict(UNKNOWN)})
+    people: dict[str, Any] = dict.fromkeys(METRICS, asdict(Estimate(78.5, 70.0, 80.0, 20)))
+    document = {
+        "scenario": "my & road.sumocfg",
+        "headline": headline(judged),
+        "recommended": best and {"share": best.share, "driver": best.driver},
+        "judged": [{**asdict(each), "reasons": each.reasons, "words": each.words} for each in judged],
+        "tried": tried,
+        "people": people,
+        "road": scenario_recipe(Ring()),
+        "people_drive": "as the vehicle types of its files say",
+        "drivers": {"acc": {"time_gap": 1.1}, "pi": {}, HARMS.driver: {}},
+        "shares": [0.1, 0.2],
+        "precision": 0.02,
+        "budget": {"episodes": 400, "minutes": 30.0},
+        "episodes": {"choosing": 60, "all": 120},
+        "seeds": {"choosing": 12, "judging": 20 if judged else 0},
+        "manifest": manifest(),
+    }
+    rows = [{"seed": 1, "status": "completed", **dict.fromkeys(METRICS, 1.0)}]
+    shown = {label: episode(generator) for label in ("human", "acc, 10 %")}
+    about = {key: document[key] for key in ("scenario", "manifest")}
+    save_evaluation(folder, Evaluation({"human": rows, "acc, 10 %": rows}, shown), about)
+    (folder / ASSESSMENT_FILE).write_text(json.dumps(document, default=float).replace("NaN", "null"))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory: pytest.TempPathFactory) -> str:
+    return render_assessment(folder_of(tmp_path_factory.mktemp("both"), [HELPS, HARMS]))
+
+
+def cells_of(page: str, label: str) -> list[str]:
+    row = re.search(rf"<tr><th scope=\"row\">{label}.*?</tr>", page, re.DOTALL)
+    assert row is not None, label
+    return [re.sub(r"<.*?>", "", cell) for cell in re.findall(r"<td.*?>(.*?)</td>", row[0])]
+
+
+def test_the_page_leads_with_the_words_of_the_rule(page: str) -> None:
+    assert headline([HELPS, HARMS]) in page
+    assert HELPS.words in page
+    assert "max_acceleration=2.5,b=&lt;2&gt;: not recommended, for travel time is longer" in page
+    assert "The CAVs are those recommended." in page
+
+
+def test_the_tables_have_people_as_they_are_and_cavs_beside_them(page: str) -> None:
+    assert cells_of(page, "recommended") == ["", "yes", "no"]
+    assert cells_of(page, "could a car drive so") == ["", "drivable", "brakes with 9 m/s2"]
+    assert cells_of(page, "travel time, waiting") == ["78.5", "-4.0 [-6.0, -2.0]", "+4.0 [+3.0, +5.0]"]
+    assert cells_of(page, "travel time, of people") == ["", "-4.0", "+4.0"]
+    assert cells_of(page, "flow")[1:] == ["+10 [-10, +30]"] * 2
+    assert cells_of(page, "fresh seeds") == ["20", "20", "20"]
+    *numbers, seeds, drives, became = cells_of(page, "10 %:<wbr> pi")
+    assert numbers == ["–", "+10 [-10, +30]", "+0.0 [+0.0, +0.0]", "0"]
+    assert (seeds, drives, became) == ("0", "–", "failed: no CAV")
+
+
+def test_the_page_says_what_was_assumed_and_needs_no_network(page: str) -> None:
+    for words in (
+        "as the vehicle types of its files say",
+        "time_gap 1.1",
+        "12 chose, 20 others judged; 120 episodes of at most 400 or 30 minutes",
+        "±2 % of people's",
+        "time headway of 1 s",
+    ):
+        assert words in page.replace("&#39;", "'"), words
+    assert page.count("data:image/svg+xml;base64,") == 2
+    assert "my &amp; road.sumocfg" in page
+    assert not re.search(r"(src|href)=\"(?!data:)", page)
+
+
+def test_where_nothing_is_recommended_the_page_says_so_and_why(tmp_path: Path) -> None:
+    page = render_assessment(folder_of(tmp_path, [HARMS]))
+    assert "No CAVs are recommended on this road" in page
+    assert "they are not recommended" in page
+    assert "10 % CAVs: not recommended, for every driver was set aside" in page
+    assert "The quickest, acc: slower than people." in page
+
+
+def test_where_nothing_was_judged_there_is_still_a_page(tmp_path: Path) -> None:
+    page = render_assessment(folder_of(tmp_path, []))
+    assert "Judged on fresh seeds" not in page
+    assert "All that was tried" in page
+
+
+def test_a_folder_without_an_assessment_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"has no assessment.json"):
+        write_assessment(tmp_path, tmp_path / "page.html")

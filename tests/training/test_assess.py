@@ -1,0 +1,118 @@
+"""Is a question checked before anything is driven, and its answer written whole, from rows that it keeps?"""
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.worlds.sumo.own_roads import straight
+from unjam.errors import InputError
+from unjam.reports.results import read_results, read_rows
+from unjam.training.assess import (
+    CHOOSING,
+    DRIVERS_OF_OPEN_ROADS,
+    Assessment,
+    Question,
+    assess,
+    question,
+)
+from unjam.training.choice import PEOPLE, Option
+from unjam.worlds.workers import Workers
+
+FLOW = '<flow id="f" type="car" route="along" begin="0" end="40" period="2"/>'
+
+
+@pytest.fixture(scope="module")
+def file(tmp_path_factory: pytest.TempPathFactory) -> str:
+    return str(straight(tmp_path_factory.mktemp("road"), FLOW, length=200.0, end=30.0))
+
+
+@pytest.fixture(scope="module")
+def asked(file: str) -> Question:
+    return question(file, [0.5], 40, 0.02, None, ["acc", "idm"], {"horizon": 150})
+
+
+@pytest.fixture(scope="module")
+def answer(asked: Question, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Assessment]:
+    with Workers(2) as workers:
+        yield assess(asked, tmp_path_factory.mktemp("answer") / "out", workers)
+
+
+def test_a_question_has_all_shares_and_drivers_and_people_alone(file: str) -> None:
+    usual = question(file, [0.2, 0.0, 0.1], 400, 0.02)
+    assert usual.shares == (0.1, 0.2)
+    assert len(usual.options) == 2 * len(DRIVERS_OF_OPEN_ROADS)
+    road, driver = usual.setup(PEOPLE)
+    assert (road, driver.native) == (usual.road, True)
+    road, driver = usual.setup(Option(0.2, "pi"))
+    assert road.cav_share == 0.2  # pyright: ignore[reportAttributeAccessIssue]
+    assert driver.name == "pi"
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"shares": [0.1, 1.2]}, "shares: 1.2 is not allowed; allowed: >= 0, <= 1"),
+        ({"shares": [float("nan")]}, "shares: nan"),
+        ({"shares": [0.0]}, "shares: '0' is not allowed; allowed: one above 0"),
+        ({"episodes": 109}, "episodes: 109 is not allowed; allowed: >= 110 for 2 shares and 4 drivers"),
+        ({"minutes": 0.0}, "minutes: 0.0"),
+        ({"precision": 1.0}, "precision: 1.0"),
+        ({"drivers": ["human"]}, "driver: 'human' is not allowed; allowed: people alone are driven anyway"),
+        ({"drivers": ["pacer"]}, "driver: 'pacer' is not allowed; allowed: one that needs no closed road"),
+        ({"drivers": ["ghost"]}, "driver: 'ghost'"),
+        ({"changes": {"cav_share": 0.5}}, "cav_share: it is not allowed here"),
+        ({"changes": {"ghost": 1}}, "ghost: unknown name"),
+    ],
+)
+def test_what_is_wrong_is_told_at_once(changes: dict[str, Any], words: str, file: str) -> None:
+    with pytest.raises(InputError, match=words.replace("+", r"\+")):
+        question(file, **{"shares": [0.1, 0.2], "episodes": 400, "precision": 0.02, **changes})
+
+
+def test_a_road_of_the_package_is_refused() -> None:
+    with pytest.raises(InputError, match=r"scenario: 'ring' is not allowed; allowed: your own .sumocfg file"):
+        question("ring", [0.1], 400, 0.02)
+
+
+def test_all_rows_are_kept_those_that_chose_apart(asked: Question, answer: Assessment) -> None:
+    folder = answer.page.parent
+    chose, judged = read_rows(folder / CHOOSING), read_rows(folder)
+    (found,) = answer.judged
+    assert set(chose) == {"human", "acc, 50 %", "idm, 50 %"}
+    assert set(judged) == {"human", f"{found.driver}, 50 %"}
+    assert not {str(row["seed"]) for row in chose["human"]} & {str(row["seed"]) for row in judged["human"]}
+    driven = sum(map(len, [*chose.values(), *judged.values()])) + 2
+    assert answer.document["episodes"]["all"] == driven <= asked.episodes
+    assert all(row["status"] == "completed" for rows in judged.values() for row in rows)
+    assert [*read_results(folder).shown] == list(judged)
+
+
+def test_the_document_is_that_of_the_folder_and_says_what_is_judged(answer: Assessment) -> None:
+    written = json.loads((answer.page.parent / "assessment.json").read_text())
+    assert written == answer.document
+    (found,) = answer.judged
+    (said,) = written["judged"]
+    assert (said["driver"], said["reasons"], said["words"]) == (found.driver, found.reasons, found.words)
+    assert said["effect"]["travel_time"]["mean"] == found.effect.travel_time.mean
+    assert (written["recommended"] is None) == bool(found.reasons)
+    assert written["people"]["travel_time"]["count"] == written["seeds"]["judging"] >= 10
+    assert written["manifest"]["packages"]["libsumo"]
+
+
+def test_the_answer_does_not_depend_on_the_number_of_workers(
+    asked: Question, answer: Assessment, tmp_path: Path
+) -> None:
+    with Workers(1) as workers:
+        again = assess(asked, tmp_path / "again", workers)
+    assert again.judged == answer.judged
+    assert again.document["tried"] == answer.document["tried"]
+
+
+def test_a_folder_with_something_in_it_is_left_alone(asked: Question, tmp_path: Path) -> None:
+    (tmp_path / "precious.txt").write_text("keep me")
+    with Workers(1) as workers, pytest.raises(InputError, match="is not empty"):
+        assess(asked, tmp_path, workers)
+    assert [path.name for path in tmp_path.iterdir()] == ["precious.txt"]
