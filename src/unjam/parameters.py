@@ -2,7 +2,7 @@
 
 from typing import Annotated, Any, TypeVar
 
-from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic import BeforeValidator, ConfigDict, Field, TypeAdapter, ValidationError
 
 from unjam.errors import InputError
 
@@ -16,6 +16,17 @@ Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
 Count = Annotated[int, Field(ge=1)]
 CountOrNone = Annotated[int, Field(ge=0)]
+
+
+def as_range(value: Any) -> Any:
+    """Return (230, 230) for 230, which is the range of one value, and everything else as it is."""
+    if isinstance(value, str):
+        raise ValueError("a number, or two like (220, 270)")
+    return (value, value) if isinstance(value, int | float) else value
+
+
+OneOrRange = BeforeValidator(as_range)
+"""lets a parameter that is a range be a single number too"""
 
 Checked = TypeVar("Checked")
 

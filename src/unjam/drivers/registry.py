@@ -82,8 +82,16 @@ def recipe_of(driver: Driver) -> tuple[Recipe, Arrays]:
     for part in _within(recipe):
         if part["kind"] == "named" and not part["name"]:
             allowed = f"{driver_names()} (put your class in a file: path.py:name)"
-            raise wrong("driver", type(driver).__name__, allowed)
+            raise wrong("driver", driver.describe(), allowed)
     return recipe, driver.arrays()
+
+
+def travels(driver: Driver) -> bool:
+    """Return whether another process can make a driver; what a notebook defines drives where it is."""
+    try:
+        return bool(recipe_of(driver))
+    except InputError:
+        return False
 
 
 def driver_from_recipe(recipe: Recipe, arrays: Arrays) -> Driver:
@@ -197,7 +205,6 @@ def _within(recipe: Any) -> Iterator[Recipe]:
 
 def free_label(driver: Driver, taken: dict[str, Driver]) -> str:
     """Return the description of a driver, numbered where another driver has it already."""
-    recipe_of(driver)  # what no worker could make has no place among others
     label, number = driver.describe(), 1
     while label in taken and not _same(taken[label], driver):
         number += 1
@@ -206,6 +213,8 @@ def free_label(driver: Driver, taken: dict[str, Driver]) -> str:
 
 
 def _same(one: Driver, other: Driver) -> bool:
+    if not (travels(one) and travels(other)):
+        return one is other
     (recipe, arrays), (other_recipe, other_arrays) = recipe_of(one), recipe_of(other)
     return recipe == other_recipe and all(
         np.array_equal(array, other_arrays[name]) for name, array in arrays.items()
