@@ -38,6 +38,11 @@ def end_with_parent(signum: int) -> None:
         os.kill(os.getpid(), signum)
 
 
+def has_display() -> bool:
+    """Return whether a process can open a window here."""
+    return sys.platform in ("win32", "darwin") or bool(os.environ.get("DISPLAY"))
+
+
 @contextmanager
 def owned(folder: Path) -> Iterator[None]:
     """Hold a folder that is there for this process alone; it is free again when the process ends, however.

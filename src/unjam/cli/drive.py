@@ -1,7 +1,5 @@
 """Episodes with a driver: `unjam drive` measures them, `unjam watch` shows one."""
 
-import os
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -24,6 +22,7 @@ from unjam.cli.options import (
 )
 from unjam.cli.output import aside, console, counting_steps, metrics_table, print_json
 from unjam.errors import MissingPartError
+from unjam.processes import has_display
 
 if TYPE_CHECKING:
     from unjam.drivers.driver import Driver
@@ -157,7 +156,7 @@ def watch_in_window(scenario: "Scenario", driver: "Driver", seed: Sequence[int],
     from unjam.worlds.episode import run_episode
     from unjam.worlds.sumo.simulation import Simulation
 
-    if sys.platform == "linux" and not os.environ.get("DISPLAY"):
+    if not has_display():
         raise MissingPartError(
             "watch: no display; write a film: --video FILE, or use xvfb-run unjam watch ..."
         )
