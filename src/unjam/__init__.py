@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from unjam.training.config import load_config
     from unjam.training.evaluate import drive
     from unjam.training.export import export_controller
+    from unjam.training.runs import list_runs
     from unjam.training.train import train
     from unjam.worlds.episode import run_episode
 
@@ -44,6 +45,7 @@ _PLACES = {
     "make_driver": "unjam.controller",
     "make_scenario": "unjam.scenarios",
     "measure": "unjam.measures.metrics",
+    "list_runs": "unjam.training.runs",
     "run_episode": "unjam.worlds.episode",
     "parallel_env": "unjam.environments.several",
     "write_report": "unjam.reports.html",
@@ -60,6 +62,7 @@ __all__ = [
     "check_driver",
     "drive",
     "export_controller",
+    "list_runs",
     "load_config",
     "load_controller",
     "make_driver",

@@ -65,6 +65,19 @@ def owned(folder: Path) -> Iterator[None]:
             os.close(descriptor)
 
 
+def is_owned(folder: Path) -> bool:
+    """Return whether a process holds a folder now."""
+    if not (folder / LOCK).is_file():
+        return False
+    try:
+        with owned(folder):
+            return False
+    except InputError:
+        return True
+    except OSError:  # somebody else's folder, which cannot be held
+        return False
+
+
 def _locked(path: Path) -> int | None:
     """Return an open and locked file; None where there are no locks."""
     try:

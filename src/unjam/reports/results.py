@@ -134,9 +134,15 @@ def rows_by_driver(rows: list[dict[str, Any]]) -> dict[str, list[dict[str, Any]]
     return found
 
 
+def read_about(folder: Path) -> tuple[dict[str, Any], dict[str, list[dict[str, Any]]]]:
+    """Return what a folder of results is about, and its rows of metrics by driver."""
+    about = json.loads((folder / EVALUATION_FILE).read_text())
+    return about, rows_by_driver(about.pop("rows"))
+
+
 def read_rows(folder: Path) -> dict[str, list[dict[str, Any]]]:
     """Return the rows of metrics of a folder of results, by driver."""
-    return rows_by_driver(json.loads((folder / EVALUATION_FILE).read_text())["rows"])
+    return read_about(folder)[1]
 
 
 def read_progress(folder: Path) -> list[dict[str, Any]]:
