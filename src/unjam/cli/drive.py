@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from unjam.cli.next_step import after_drive
 from unjam.cli.options import (
     DEFAULT_WORKERS,
     JsonOption,
@@ -90,6 +91,7 @@ def drive(
         console.print(metrics_table(result.rows))
         if result.report is not None:
             aside.print(f"report: {result.report}")
+        after_drive(scenario, driver)
     raise_failures(result)
 
 

@@ -7,6 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
+from unjam.cli.next_step import after_training, resumable
 from unjam.cli.options import (
     DEFAULT_WORKERS,
     AskedRun,
@@ -89,7 +90,8 @@ def train(
     from unjam.training.evaluate import Evaluation
     from unjam.training.train import train as run
 
-    with nullcontext() if json else _Progress(config.steps, folder) as shown:
+    progress = nullcontext() if json else _Progress(config.steps, folder)
+    with resumable(folder, workers), progress as shown:
         result = run(config, folder, resume is not None, shown and shown.iteration, shown and shown.judging)
 
     def facts(of: Any) -> dict[str, Any]:
@@ -108,6 +110,7 @@ def train(
         if of.gain is not None:
             console.print(f"return beyond the expert, held-out seeds, 95 % interval: {signed(of.gain)}")
         aside.print(f"controller: {of.controller}")
+        after_training(of.folder, of.gain, config.steps)
     aside.print(f"report: {result.report}")
 
 
