@@ -20,7 +20,7 @@ from unjam.drivers.residual import EXPERT, ResidualDriver
 from unjam.drivers.road_experts import JamAbsorber, Pacer
 from unjam.drivers.safety import SafetyFilter
 from unjam.drivers.wrappers import INNER, Filtered, Impaired, Mixed
-from unjam.errors import InputError, wrong
+from unjam.errors import InputError, did_you_mean, wrong
 from unjam.parameters import STRICT, Count, NotNegative, Positive, build, split_parameters
 from unjam.tree import Arrays
 
@@ -51,7 +51,7 @@ def named_driver(text: str, time_step: float) -> Driver:
         reference = FileReference.of(name)
         return FileDriver(reference.path, reference.name, parameters, time_step)
     if name not in DRIVERS:
-        raise wrong("driver", name, driver_names())
+        raise wrong("driver", name, f"{driver_names()}{did_you_mean(name, DRIVERS)}")
     kind = DRIVERS[name]
     if any(field.name == "time_step" for field in fields(kind)):  # pyright: ignore[reportArgumentType]
         parameters = {"time_step": time_step, **parameters}
