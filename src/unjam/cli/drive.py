@@ -89,6 +89,8 @@ def drive(
         print_json(result.document())
     elif any(row["status"] != "failed" for rows in result.rows.values() for row in rows):
         console.print(metrics_table(result.rows))
+        for note in result.notes:
+            aside.print(f"note: {note}", markup=False, soft_wrap=True)
         if result.report is not None:
             aside.print(f"report: {result.report}")
         after_drive(scenario, driver)
@@ -125,10 +127,13 @@ def watch(
     from unjam.reports.film import check_format, write_video
     from unjam.scenarios import make_scenario
     from unjam.training.evaluate import raise_failure
+    from unjam.training.notes import notes_on_controllers
     from unjam.worlds.workers import EpisodeTask, Workers
 
     road = make_scenario(scenario, changes | assignments(settings))
     driven = make_driver(driver, road.decision_step)
+    for note in notes_on_controllers(road, [driver], {}):
+        aside.print(f"note: {note}", markup=False, soft_wrap=True)
     if video is None:
         episode = watch_in_window(road, driven, (seed,), pace)
     else:

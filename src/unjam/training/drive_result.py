@@ -28,6 +28,8 @@ class DriveResult:
     report: Path | None = None
     shown: dict[str, Episode] = field(default_factory=dict, repr=False)
     """by driver: the episode that pictures show, the same seed for all"""
+    notes: list[str] = field(default_factory=list)
+    """what to know before trusting it: controllers on a road that they were not made for"""
 
     @property
     def mean(self) -> dict[str, float]:
@@ -67,6 +69,7 @@ class DriveResult:
             "episodes": self.rows[driver],
             "mean": {name: summary[name].mean for name in METRICS},
             "interval": {name: [summary[name].low, summary[name].high] for name in METRICS},
+            "notes": self.notes,
             "folder": str(self.folder) if self.folder else None,
             "report": str(self.report) if self.report else None,
         }

@@ -31,6 +31,7 @@ from unjam.training.config import RunConfig
 from unjam.training.drive_result import DriveResult, Rows
 from unjam.training.executors import error_named
 from unjam.training.folder import make_new_folder
+from unjam.training.notes import notes_on_controllers
 from unjam.training.seeds import held_out_seeds
 from unjam.worlds.episode import can_drive, run_episode
 from unjam.worlds.record import Episode
@@ -260,9 +261,9 @@ def drive(
     seeds = held_out_seeds(episodes) if held_out else [(seed + index,) for index in range(episodes)]
     with Workers(min(workers or os.cpu_count() or 1, episodes * len(drivers))) as pool:
         found = evaluate(made, drivers, seeds, pool, reward, progress)
-    report = None
+    report, notes = None, notes_on_controllers(made, drivers, found.shown)
     if folder is not None:
         about = {"scenario": Path(scenario).name, "reward": reward or made.reward, "manifest": manifest()}
-        save_evaluation(folder, found, about)
+        save_evaluation(folder, found, {**about, "notes": notes})
         report = write_report([folder], folder / "report.html")
-    return DriveResult(scenario, found.rows, folder, report, found.shown)
+    return DriveResult(scenario, found.rows, folder, report, found.shown, notes)

@@ -9,6 +9,7 @@ from typing import Any, Literal
 
 from unjam.errors import InputError, UnjamError
 from unjam.measures.statistics import Estimate, paired_difference
+from unjam.parameters import flat
 from unjam.processes import is_owned, owned
 from unjam.reports.results import EVALUATION_FILE, read_about, read_progress
 from unjam.training.config import RunConfig
@@ -99,18 +100,10 @@ def find_run(name: str, under: Path) -> Path:
 
 def differences(runs: Sequence[Run]) -> dict[str, list[Any]]:
     """Return the settings in which runs differ, each with the value of every run; dots lead into tables."""
-    flat = [_flat(asdict(run.config)) for run in runs]
-    names = dict.fromkeys(name for settings in flat for name in settings)
-    values = {name: [settings.get(name) for settings in flat] for name in names}
+    settings = [flat(asdict(run.config)) for run in runs]
+    names = dict.fromkeys(name for of_one in settings for name in of_one)
+    values = {name: [of_one.get(name) for of_one in settings] for name in names}
     return {name: each for name, each in values.items() if any(value != each[0] for value in each)}
-
-
-def _flat(settings: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    found: dict[str, Any] = {}
-    for key, value in settings.items():
-        inner = isinstance(value, dict)
-        found |= _flat(value, f"{prefix}{key}.") if inner else {f"{prefix}{key}": value}
-    return found
 
 
 def remove_run(folder: Path) -> None:
