@@ -32,6 +32,8 @@ from unjam.errors import InputError
 
 LINE_EVERY = 5
 """iterations between two plain lines of progress where there is no terminal"""
+MUCH_MORE = 1.1
+"""times the steps that were asked for, from which more are told of"""
 JUDGING = "evaluating on held-out seeds"
 
 
@@ -88,8 +90,11 @@ def train(
     check_possible(config)
     from unjam.reports.story import signed  # and torch: seconds that nobody waits for a wrong word
     from unjam.training.evaluate import Evaluation
+    from unjam.training.train import steps_to_train
     from unjam.training.train import train as run
 
+    if resume is None and (steps := steps_to_train(config)) > MUCH_MORE * config.steps:
+        aside.print(f"note: iterations are whole: {steps:,} steps will be trained, not {config.steps:,}")
     progress = nullcontext() if json else _Progress(config.steps, folder)
     with resumable(folder, workers), progress as shown:
         result = run(config, folder, resume is not None, shown and shown.iteration, shown and shown.judging)
