@@ -32,7 +32,10 @@ ALLOWED = {
 }
 """what else a part may import"""
 LAZY = {
-    "__init__": {"controller", "drivers", "environments", "kernels", "reports", "training", "worlds"},
+    "__init__": {
+        *("controller", "drivers", "environments", "kernels", "measures", "reports", "scenarios", "training"),
+        "worlds",
+    },
     "__main__": {"cli"},
 }
 TORCH = {"torch", "stable_baselines3", "sb3_contrib"}

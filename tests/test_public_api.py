@@ -1,6 +1,7 @@
 import inspect
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -22,6 +23,14 @@ def test_every_name_that_can_be_imported_is_listed() -> None:
 def test_an_unknown_name_is_an_attribute_error(name: str) -> None:
     with pytest.raises(AttributeError, match=f"module 'unjam' has no attribute '{name}'"):
         getattr(unjam, name)
+
+
+def test_completion_offers_the_public_names_and_nothing_else() -> None:
+    assert set(dir(unjam)) == {*unjam.__all__, "__version__"}
+
+
+def test_type_checkers_are_told_of_its_types() -> None:
+    assert Path(unjam.__file__).with_name("py.typed").is_file()
 
 
 def test_importing_all_of_it_gives_all_of_it() -> None:

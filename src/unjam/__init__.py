@@ -20,14 +20,17 @@ from unjam.environments import register_all  # noqa: E402
 __version__ = "0.1.0.dev0"
 
 if TYPE_CHECKING:
-    from unjam.controller import load_controller
+    from unjam.controller import load_controller, make_driver
     from unjam.controller.verify import verify_controller
     from unjam.drivers import Driver, LocalState, check_driver
     from unjam.environments.several import parallel_env
+    from unjam.measures.metrics import measure
     from unjam.reports.html import write_report
+    from unjam.scenarios import make_scenario
     from unjam.training.config import load_config
     from unjam.training.evaluate import drive
     from unjam.training.export import export_controller
+    from unjam.training.runs import list_runs
     from unjam.training.train import train
     from unjam.worlds.episode import run_episode
 
@@ -39,6 +42,10 @@ _PLACES = {
     "load_controller": "unjam.controller",
     "export_controller": "unjam.training.export",
     "verify_controller": "unjam.controller.verify",
+    "make_driver": "unjam.controller",
+    "make_scenario": "unjam.scenarios",
+    "measure": "unjam.measures.metrics",
+    "list_runs": "unjam.training.runs",
     "run_episode": "unjam.worlds.episode",
     "parallel_env": "unjam.environments.several",
     "write_report": "unjam.reports.html",
@@ -55,8 +62,12 @@ __all__ = [
     "check_driver",
     "drive",
     "export_controller",
+    "list_runs",
     "load_config",
     "load_controller",
+    "make_driver",
+    "make_scenario",
+    "measure",
     "parallel_env",
     "run_episode",
     "train",
@@ -69,3 +80,7 @@ def __getattr__(name: str) -> Any:
     if name not in _PLACES:
         raise AttributeError(f"module 'unjam' has no attribute {name!r}")
     return getattr(import_module(_PLACES[name]), name)
+
+
+def __dir__() -> list[str]:
+    return [*__all__, "__version__"]

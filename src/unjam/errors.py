@@ -5,6 +5,7 @@ Every error that a user can cause or mend is one of these: one clear line, no tr
 
 import errno
 from collections.abc import Iterable
+from difflib import get_close_matches
 
 
 class UnjamError(Exception):
@@ -52,5 +53,12 @@ def wrong(field: str, value: object, allowed: str) -> InputError:
 
 
 def wrong_name(field: str, value: object, names: Iterable[str]) -> InputError:
-    """Return the error for a name that is not among `names`."""
-    return wrong(field, value, ", ".join(names))
+    """Return the error for a name that is not among `names`, with the one that may have been meant."""
+    known = list(names)
+    return wrong(field, value, f"{', '.join(known)}{did_you_mean(value, known)}")
+
+
+def did_you_mean(value: object, names: Iterable[str]) -> str:
+    """Return `; did you mean 'ring'?`; empty where no name is like it."""
+    close = get_close_matches(str(value), list(names), 1)
+    return f"; did you mean {close[0]!r}?" if close else ""

@@ -1,10 +1,11 @@
 """How unjam's frozen dataclasses check what they are given: types, ranges, unknown names."""
 
+from collections.abc import Sequence
 from typing import Annotated, Any, TypeVar
 
-from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic import BeforeValidator, ConfigDict, Field, TypeAdapter, ValidationError
 
-from unjam.errors import InputError
+from unjam.errors import InputError, did_you_mean
 
 STRICT = ConfigDict(extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
 """Configuration of every parameter dataclass: an unknown name or a NaN is an error, not a surprise.
@@ -17,6 +18,17 @@ NotNegative = Annotated[float, Field(ge=0)]
 Count = Annotated[int, Field(ge=1)]
 CountOrNone = Annotated[int, Field(ge=0)]
 
+
+def as_range(value: Any) -> Any:
+    """Return (230, 230) for 230, which is the range of one value, and everything else as it is."""
+    if isinstance(value, str):
+        raise ValueError("a number, or two like (220, 270)")
+    return (value, value) if isinstance(value, int | float) else value
+
+
+OneOrRange = BeforeValidator(as_range)
+"""lets a parameter that is a range be a single number too"""
+
 Checked = TypeVar("Checked")
 
 
@@ -28,15 +40,16 @@ def build(kind: type[Checked], values: dict[str, Any], field: str) -> Checked:
     try:
         return TypeAdapter(kind).validate_python(values)
     except ValidationError as error:
-        raise InputError(one_line(error, field)) from None
+        raise InputError(one_line(error, field, kind)) from None
 
 
-def one_line(error: ValidationError, field: str) -> str:
+def one_line(error: ValidationError, field: str, kind: Any) -> str:
     """Return the first problem of a pydantic error as `field.name: value is not allowed; allowed: ...`."""
     problem = error.errors()[0]
     name = ".".join([field, *(str(part) for part in problem["loc"])]).strip(".")
     if problem["type"] in ("unexpected_keyword_argument", "extra_forbidden"):
-        return f"{name}: unknown name"
+        *path, last = problem["loc"]
+        return f"{name}: unknown name{did_you_mean(last, _names_at(kind, path))}"
     if problem["type"] == "missing":
         return f"{name}: missing"
     names_itself = not problem["loc"] or " is not allowed; allowed: " in problem["msg"]
@@ -44,6 +57,13 @@ def one_line(error: ValidationError, field: str) -> str:
         return f"{name}.{problem['msg'].removeprefix('Value error, ')}".removeprefix(".")
     allowed = problem["msg"].removeprefix("Input should be ").removeprefix("Value error, ")
     return f"{name}: {problem['input']!r} is not allowed; allowed: {allowed}"
+
+
+def _names_at(kind: Any, path: Sequence[object]) -> list[str]:
+    """Return the names of a dataclass's parameters, or of the one that a path leads to within it."""
+    for part in path:
+        kind = getattr(getattr(kind, "__pydantic_fields__", {}).get(part), "annotation", None)
+    return list(getattr(kind, "__pydantic_fields__", {}))
 
 
 def parse_value(text: str) -> Any:
@@ -104,3 +124,12 @@ def nested(changes: dict[str, Any]) -> dict[str, Any]:
             inner = {part: inner}
         tables = changed(tables, inner)
     return tables
+
+
+def flat(tables: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Return tables within tables as one, whose keys have dots: `nested` undoes it."""
+    found: dict[str, Any] = {}
+    for key, value in tables.items():
+        name = f"{prefix}{key}"
+        found |= flat(value, f"{name}.") if isinstance(value, dict) else {name: value}
+    return found

@@ -38,6 +38,11 @@ def end_with_parent(signum: int) -> None:
         os.kill(os.getpid(), signum)
 
 
+def has_display() -> bool:
+    """Return whether a process can open a window here."""
+    return sys.platform in ("win32", "darwin") or bool(os.environ.get("DISPLAY"))
+
+
 @contextmanager
 def owned(folder: Path) -> Iterator[None]:
     """Hold a folder that is there for this process alone; it is free again when the process ends, however.
@@ -58,6 +63,19 @@ def owned(folder: Path) -> Iterator[None]:
         if descriptor is not None:
             path.unlink(missing_ok=True)
             os.close(descriptor)
+
+
+def is_owned(folder: Path) -> bool:
+    """Return whether a process holds a folder now."""
+    if not (folder / LOCK).is_file():
+        return False
+    try:
+        with owned(folder):
+            return False
+    except InputError:
+        return True
+    except OSError:  # somebody else's folder, which cannot be held
+        return False
 
 
 def _locked(path: Path) -> int | None:

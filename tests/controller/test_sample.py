@@ -11,7 +11,7 @@ from unjam.errors import InputError
 
 def perceived(decisions: int = 40, seed: int = 0) -> LocalState:
     """What one CAV perceives, one moment after the other."""
-    return random_state(np.random.default_rng(seed), decisions)
+    return random_state(np.random.default_rng(seed), decisions, told=True)
 
 
 def test_a_sample_comes_back_with_what_the_driver_answers() -> None:

@@ -70,7 +70,7 @@ def test_accepts_good_drivers(driver: Any) -> None:
         (NotFinite(), r"step \d: acceleration is -inf"),
         (WrongShape(), r"step 0: acceleration has shape \(8, 1\)"),
         (Words(), "step 0: acceleration is not numbers"),
-        (Nothing(), r"has no initial_memory\(\)"),
+        (Nothing(), "neither a function nor a class"),
     ],
 )
 def test_names_what_is_wrong_and_in_which_step(driver: Any, words: str) -> None:

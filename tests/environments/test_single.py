@@ -15,7 +15,7 @@ import unjam
 from unjam.drivers import Constant
 from unjam.drivers.registry import named_driver
 from unjam.environments.single import RoadEnv
-from unjam.errors import InputError, UnjamError
+from unjam.errors import InputError, MissingPartError, UnjamError
 from unjam.scenarios import make_scenario
 from unjam.worlds.episode import run_episode
 
@@ -35,7 +35,8 @@ def test_passes_the_checks_of_gymnasium_and_stable_baselines3_without_warnings(
 ) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        check_env(environment.unwrapped, skip_render_check=True)
+        warnings.filterwarnings("default", "another simulation is open")  # a picture is drawn by another one
+        check_env(environment.unwrapped)
         check_env_of_sb3(environment.unwrapped)
 
 
@@ -138,8 +139,10 @@ def test_environments_of_one_process_do_not_disturb_each_other() -> None:
     alone.reset(seed=0)
     expected = [alone.step(np.full(1, 0.5))[0] for _ in range(40)]
     other, third = RoadEnv(**SHORT), RoadEnv("figure-eight", **SHORT)
-    for environment in (alone, other, third):
-        environment.reset(seed=0)
+    alone.reset(seed=0)
+    for environment in (other, third):
+        with pytest.warns(UserWarning, match="runs over TraCI"):
+            environment.reset(seed=0)
     for _ in range(40):
         third.step(np.zeros(1))
         seen.append((alone.step(np.full(1, 0.5))[0], other.step(np.full(1, 0.5))[0]))
@@ -148,6 +151,27 @@ def test_environments_of_one_process_do_not_disturb_each_other() -> None:
         environment.close()
     np.testing.assert_array_equal([first for first, _ in seen], expected)
     np.testing.assert_array_equal([second for _, second in seen], expected)
+
+
+def test_nothing_is_said_as_a_process_ends_with_environments_open() -> None:
+    code = "import gymnasium, unjam\n" + "gymnasium.make('unjam/Ring-v0', horizon=60).reset(seed=0)\n"
+    code += "left = [gymnasium.make('unjam/Ring-v0', horizon=60) for _ in range(2)]\n"
+    code += "[one.reset(seed=0) for one in left]"
+    command = [sys.executable, "-W", "ignore", "-c", code]
+    ran = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
+    assert (ran.stdout, ran.stderr) == ("", "")
+
+
+def test_a_window_without_a_display_is_refused_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("unjam.environments.single.has_display", lambda: False)
+    with pytest.raises(MissingPartError, match="without one: 'rgb_array'"):
+        RoadEnv(render_mode="human")
+
+
+def test_one_number_is_a_range_of_one() -> None:
+    environment = RoadEnv(length=231, **SHORT)
+    assert environment.reset(seed=0)[1]["drawn"] == {"length": 231.0}
+    environment.close()
 
 
 def test_stepping_before_a_reset_is_told() -> None:

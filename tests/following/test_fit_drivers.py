@@ -1,3 +1,4 @@
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -6,7 +7,7 @@ from tests.following.made_up import idm_driver
 from tests.studies.test_field import table
 from unjam.errors import DiskError, InputError
 from unjam.following.calibration import CalibrationSettings
-from unjam.following.fit_drivers import FitDriversSettings, fit_drivers, fit_from_files
+from unjam.following.fit_drivers import FitDriversSettings, doubts_about_units, fit_drivers, fit_from_files
 from unjam.following.networks import MultiStepSettings
 from unjam.following.pairs import Pair
 from unjam.physics.idm import IDMParameters
@@ -59,6 +60,14 @@ CHANGES = {"calibration.generations": 2, "residual": False}
 @pytest.fixture
 def data(tmp_path: Path) -> Path:
     return Path(table(tmp_path / "data.parquet", [{"kind": kind} for kind in ("human", "human", "ACC")]))
+
+
+def test_speeds_in_another_unit_than_gaps_are_doubted() -> None:
+    pair = idm_driver(IDMParameters(time_headway=1.3))
+    assert doubts_about_units([pair]) == []
+    kilometres = replace(pair, speed=3.6 * pair.speed, leader_speed=3.6 * pair.leader_speed)
+    (line,) = doubts_about_units([kilometres])
+    assert line.startswith("warning: gaps change 0.28 times as fast as the speeds say")
 
 
 def test_a_file_becomes_a_population(data: Path) -> None:

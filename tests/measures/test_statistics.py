@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from unjam.measures.metrics import METRICS
-from unjam.measures.statistics import crossed_estimate, estimate, paired_difference, summarise
+from unjam.measures.statistics import crossed_estimate, digits_of, estimate, paired_difference, summarise
 
 NUMBERS = st.lists(st.floats(-1e3, 1e3), min_size=2, max_size=12)
 
@@ -29,6 +29,13 @@ def test_more_values_give_a_narrower_interval() -> None:
     values = np.random.default_rng(2).normal(0.0, 1.0, 320)
     few, many = estimate(list(values[:20])), estimate(list(values))
     assert many.high - many.low < (few.high - few.low) / 2
+
+
+def test_a_mean_that_would_be_rounded_away_gets_more_digits() -> None:
+    assert digits_of(estimate([0.0] * 23 + [1.0, 1.0]), 0) == 2
+    assert digits_of(estimate([0.0, 0.0]), 0) == 0
+    assert digits_of(estimate([1.0, 0.0]), 1) == 1
+    assert digits_of(estimate([]), 0) == 0
 
 
 def test_values_that_are_no_numbers_are_left_out_and_not_counted() -> None:

@@ -43,8 +43,19 @@ METRICS_OF_THE_DESIGN = [
     "speed_limit_ratio_steady",
 ]
 
-VERBS = ["scenarios", "drivers", "drive", "assess", "train", "evaluate", "model", "fit-drivers", "report"]
-VERBS += ["reproduce", "search", "export", "verify", "watch", "bench", "doctor"]
+VERBS = [
+    "runs",
+    "scenarios",
+    "drivers",
+    "drive",
+    "assess",
+    "train",
+    "evaluate",
+    "model",
+    "fit-drivers",
+    "report",
+]
+VERBS += ["report", "reproduce", "search", "export", "verify", "watch", "bench", "doctor"]
 
 
 def document(ran: subprocess.CompletedProcess[str]) -> Any:
@@ -335,6 +346,7 @@ def test_a_stopped_run_leaves_no_process_and_can_go_on(
         _, words = process.communicate(timeout=10)
     assert process.returncode == code
     assert "Traceback" not in words
+    assert "go on with: unjam train --resume run --workers 1\n" in words
     wait_until(lambda: not any(Path(f"/proc/{worker}").exists() for worker in workers))
     last = json.loads(progress.read_text().splitlines()[-1])["actual_steps"]
     assert unjam("train", "--resume", "run", "--steps", last + 1).returncode == 0

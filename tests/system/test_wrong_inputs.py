@@ -18,6 +18,8 @@ WRONG: dict[str, tuple[str, list[str]]] = {
     "what is no range": ("low < high", ["search ring --vary trpo.gamma=1..0"]),
     "unknown executor": ("local, ray", ["search ring --vary trpo.gamma=0.9..0.95 --executor cloud"]),
     "unknown scenario": ("ring, ring-warm, ring-jammed", ["drive nowhere --driver pi"]),
+    "folder where none can be": ("allowed: a new folder", ["drive ring --driver pi --out /proc/unjam"]),
+    "folder of a name too long": ("File name too long", [f"drive ring --driver pi --out {'a' * 300}"]),
     "unknown driver": ("human, idm, pi", ["drive ring --driver ghost"]),
     "unknown parameter of a driver": ("driver pi.ghost: unknown name", ["drive ring --driver pi:ghost=1"]),
     "word for a number": ("time_constant: 'fast'", ["drive ring --driver pi:time_constant=fast"]),

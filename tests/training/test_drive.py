@@ -6,11 +6,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from unjam.drivers import IDM, LocalState, PISaturation
+from unjam.drivers import IDM, LocalState, PISaturation, check_driver
 from unjam.drivers.driver import Driver, Memory
+from unjam.environments.single import RoadEnv
 from unjam.errors import InputError
 from unjam.files import to_json
-from unjam.measures.metrics import METRICS
+from unjam.measures.metrics import METRICS, measure
 from unjam.reports.results import read_results
 from unjam.scenarios import Ring
 from unjam.training.evaluate import DriveResult, drive, raise_failures
@@ -144,11 +145,67 @@ def test_where_all_went_well_nothing_is_raised(compared: DriveResult) -> None:
     raise_failures(compared)
 
 
-class Unknown(Driver):
+class Stays(Driver):
     """A driver that another process cannot make again."""
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Any, Memory]:
         return state.speed * 0.0, memory
+
+
+class Follows:
+    """Follows the leader's speed; knows nothing of unjam."""
+
+    def __init__(self, gain: float) -> None:
+        self.gain = gain
+
+    def initial_memory(self, n: int) -> dict[str, Any]:
+        return {"asked": np.zeros(n)}
+
+    def act(self, state: LocalState, memory: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
+        return self.gain * (state.leader_speed - state.speed), {"asked": memory["asked"] + 1.0}
+
+
+def follow(state: LocalState) -> Any:
+    return 0.5 * (state.leader_speed - state.speed)
+
+
+def test_functions_and_objects_of_the_program_drive_beside_the_others() -> None:
+    result = drive("ring", [follow, Follows(0.5), Follows(0.2), Stays(), "idm"], 2, road=ROAD, workers=1)
+    assert list(result.rows) == ["follow", "Follows", "Follows (2)", "Stays", "idm"]
+    raise_failures(result)
+    rows = {label: [row["return"] for row in rows] for label, rows in result.rows.items()}
+    assert rows["follow"] == rows["Follows"] != rows["Follows (2)"]
+    episode = run_episode(Ring(**ROAD), Follows(0.2), 1)
+    assert measure(episode)["return"] == rows["Follows (2)"][1]
+    check_driver(follow)
+    check_driver(Follows(0.2))
+
+
+def test_an_error_in_a_function_of_the_program_is_raised_as_it_is() -> None:
+    with pytest.raises(ZeroDivisionError):
+        drive("ring", lambda state: 1 / 0, 1, road=ROAD, workers=1)
+
+
+def test_it_drives_while_an_environment_is_open_and_warns() -> None:
+    environment = RoadEnv(**ROAD)
+    environment.reset(seed=0)
+    with pytest.warns(UserWarning, match="runs over TraCI"):
+        beside = drive("ring", follow, 1, road=ROAD, workers=1)
+    environment.close()
+    assert beside.mean["return"] == drive("ring", follow, 1, road=ROAD, workers=1).mean["return"]
+
+
+def test_a_result_is_a_table_of_pandas_and_shows_itself_in_a_notebook(compared: DriveResult) -> None:
+    table = compared.table()
+    assert list(table.index) == list(METRICS)
+    assert table["pi", "mean"].to_dict() == pytest.approx(compared.mean, nan_ok=True)
+    assert list(table["idm"].columns) == ["mean", "low", "high"]
+    episodes = compared.episodes()
+    assert len(episodes) == 6
+    assert list(episodes.loc[episodes["driver"] == "pi", "seed"]) == ["4", "5", "6"]
+    html = compared._repr_html_()
+    assert "mean speed [m/s]" in html
+    assert html.count('src="data:image/svg+xml;base64,') == 1
 
 
 @pytest.fixture
@@ -174,7 +231,8 @@ def started(monkeypatch: pytest.MonkeyPatch) -> Callable[[], bool]:
         {"driver": "nobody"},
         {"driver": ["pi", "nobody"]},
         {"driver": "pi:speed=1"},
-        pytest.param({"driver": Unknown()}, id="unknown driver"),
+        {"driver": 3},
+        {"driver": [Stays]},
         {"driver": []},
         {"road": {"lenght": (120, 130)}},
         {"road": {"vehicles": 1}},

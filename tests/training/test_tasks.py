@@ -16,7 +16,7 @@ from unjam.learners.algorithm_1 import actual_experience
 from unjam.learners.settings import AGENTS
 from unjam.training.config import RunConfig, load_config, to_toml
 from unjam.training.folder import check_possible, read_config
-from unjam.training.train import Trainer, train
+from unjam.training.train import Trainer, steps_to_train, train
 from unjam.worlds.workers import Workers
 
 torch.set_num_threads(1)  # as a training does
@@ -28,6 +28,14 @@ VIRTUAL = {"virtual__members": 2, "virtual__epochs": 2, "virtual__hidden": [8]}
 
 def mixture(**changes: Any) -> RunConfig:
     return small_config(**{"tasks": MIXTURE, **VIRTUAL, **changes})
+
+
+def test_steps_are_those_of_whole_iterations() -> None:
+    assert steps_to_train(load_config(changes={"steps": 10})) == 12_000
+    assert steps_to_train(load_config(changes={"steps": 24_000})) == 24_000
+    assert (
+        steps_to_train(load_config(changes={"steps": 5, "road.horizon": 80, "trpo.batch_steps": 100})) == 160
+    )
 
 
 def test_what_a_task_leaves_out_is_the_runs_own() -> None:

@@ -15,6 +15,7 @@ from unjam.cli.drive import drive, watch
 from unjam.cli.machine import bench, doctor
 from unjam.cli.parts import drivers, fit_drivers, scenarios
 from unjam.cli.results import certify, evaluate, export, model, report, verify
+from unjam.cli.runs import runs
 from unjam.cli.train import reproduce, search, train, tune
 from unjam.errors import DISK_ERRNOS, UnjamError, disk_error
 from unjam.processes import end_with_parent
@@ -51,6 +52,7 @@ for verb in (
     *(report, tune, search, reproduce, export, certify, verify, watch, bench, doctor),
 ):
     app.command()(verb)
+app.add_typer(runs)
 
 
 class _Terminated(BaseException):

@@ -1,13 +1,12 @@
 """Episodes with a driver: `unjam drive` measures them, `unjam watch` shows one."""
 
-import os
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from unjam.cli.next_step import after_drive
 from unjam.cli.options import (
     DEFAULT_WORKERS,
     JsonOption,
@@ -24,6 +23,7 @@ from unjam.cli.options import (
 )
 from unjam.cli.output import aside, console, counting_steps, metrics_table, print_json
 from unjam.errors import MissingPartError
+from unjam.processes import has_display
 
 if TYPE_CHECKING:
     from unjam.drivers.driver import Driver
@@ -89,8 +89,11 @@ def drive(
         print_json(result.document())
     elif any(row["status"] != "failed" for rows in result.rows.values() for row in rows):
         console.print(metrics_table(result.rows))
+        for note in result.notes:
+            aside.print(f"note: {note}", markup=False, soft_wrap=True)
         if result.report is not None:
             aside.print(f"report: {result.report}")
+        after_drive(scenario, driver)
     raise_failures(result)
 
 
@@ -124,10 +127,13 @@ def watch(
     from unjam.reports.film import check_format, write_video
     from unjam.scenarios import make_scenario
     from unjam.training.evaluate import raise_failure
+    from unjam.training.notes import notes_on_controllers
     from unjam.worlds.workers import EpisodeTask, Workers
 
     road = make_scenario(scenario, changes | assignments(settings))
     driven = make_driver(driver, road.decision_step)
+    for note in notes_on_controllers(road, [driver], {}):
+        aside.print(f"note: {note}", markup=False, soft_wrap=True)
     if video is None:
         episode = watch_in_window(road, driven, (seed,), pace)
     else:
@@ -157,7 +163,7 @@ def watch_in_window(scenario: "Scenario", driver: "Driver", seed: Sequence[int],
     from unjam.worlds.episode import run_episode
     from unjam.worlds.sumo.simulation import Simulation
 
-    if sys.platform == "linux" and not os.environ.get("DISPLAY"):
+    if not has_display():
         raise MissingPartError(
             "watch: no display; write a film: --video FILE, or use xvfb-run unjam watch ..."
         )

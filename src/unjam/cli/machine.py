@@ -14,6 +14,7 @@ import typer
 from unjam.cli.options import JsonOption
 from unjam.cli.output import aside, console, new_table, print_json
 from unjam.errors import MissingPartError, UnjamError
+from unjam.processes import has_display
 
 RESULTS_SUMO = "1.28.0"
 """version of SUMO that all results of the documentation were made with"""
@@ -61,7 +62,7 @@ def check_health() -> list[Check]:
     from unjam.worlds.sumo.files import sumo_program
 
     python, sumo = platform.python_version(), f"pip install eclipse-sumo=={RESULTS_SUMO}"
-    display = bool(os.environ.get("DISPLAY")) or sys.platform in ("win32", "darwin")
+    display = has_display()
     no_display = "for unjam watch without a display: --video FILE, or xvfb-run unjam watch ..."
     return [
         Check("Python", sys.version_info >= (3, 11), python, "install Python 3.11 or newer"),

@@ -42,7 +42,7 @@ def metrics_table(rows_by_driver: dict[str, list[dict[str, Any]]]) -> Table:
     """Return the table of the verdict and all metrics: mean and 95 % bootstrap interval over episodes."""
     from unjam.measures.drivable import verdicts
     from unjam.measures.metrics import METRICS
-    from unjam.measures.statistics import estimate
+    from unjam.measures.statistics import digits_of, estimate
 
     table = new_table(("metric", "unit"), list(rows_by_driver))
     table.add_row("could a car drive so?", "", *(said or "–" for said in verdicts(rows_by_driver).values()))
@@ -53,7 +53,8 @@ def metrics_table(rows_by_driver: dict[str, list[dict[str, Any]]]) -> Table:
             if found.count == 0:
                 cells.append("–")
                 continue
-            mean, low, high = (f"{value:.{metric.digits}f}" for value in (found.mean, found.low, found.high))
+            digits = digits_of(found, metric.digits)
+            mean, low, high = (f"{value:.{digits}f}" for value in (found.mean, found.low, found.high))
             interval = f" [dim]\\[{low}, {high}][/dim]" if found.count > 1 else ""
             share = f" [dim]{found.count} of {len(rows)}[/dim]" if found.count < len(rows) else ""
             cells.append(f"{mean}{interval}{share}")

@@ -7,6 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
+from unjam.cli.next_step import after_training, resumable
 from unjam.cli.options import (
     DEFAULT_WORKERS,
     AskedRun,
@@ -31,6 +32,8 @@ from unjam.errors import InputError
 
 LINE_EVERY = 5
 """iterations between two plain lines of progress where there is no terminal"""
+MUCH_MORE = 1.1
+"""times the steps that were asked for, from which more are told of"""
 JUDGING = "evaluating on held-out seeds"
 
 
@@ -87,9 +90,13 @@ def train(
     check_possible(config)
     from unjam.reports.story import signed  # and torch: seconds that nobody waits for a wrong word
     from unjam.training.evaluate import Evaluation
+    from unjam.training.train import steps_to_train
     from unjam.training.train import train as run
 
-    with nullcontext() if json else _Progress(config.steps, folder) as shown:
+    if resume is None and (steps := steps_to_train(config)) > MUCH_MORE * config.steps:
+        aside.print(f"note: iterations are whole: {steps:,} steps will be trained, not {config.steps:,}")
+    progress = nullcontext() if json else _Progress(config.steps, folder)
+    with resumable(folder, workers), progress as shown:
         result = run(config, folder, resume is not None, shown and shown.iteration, shown and shown.judging)
 
     def facts(of: Any) -> dict[str, Any]:
@@ -108,6 +115,7 @@ def train(
         if of.gain is not None:
             console.print(f"return beyond the expert, held-out seeds, 95 % interval: {signed(of.gain)}")
         aside.print(f"controller: {of.controller}")
+        after_training(of.folder, of.gain, config.steps)
     aside.print(f"report: {result.report}")
 
 

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from unjam.controller.certificate import certificate_of
+from unjam.controller.domain import road_of
 from unjam.controller.file import (
     CERTIFICATE,
     FORMAT,
@@ -73,6 +74,7 @@ def verify_controller(path: Path | str, trust_code: bool = False) -> list[Verifi
     verified = [
         Verified("parts", f"{sizes}; each has the hash that the manifest names"),
         Verified("driver", driver.describe()),
+        *([Verified("road", f"made for the {road}")] if (road := road_of(manifest)) else []),
         Verified("weights", weights),
     ]
     if manifest["format"] > 1:

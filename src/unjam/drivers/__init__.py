@@ -5,6 +5,7 @@ from unjam.drivers.check import check_driver
 from unjam.drivers.command import Command, Limits
 from unjam.drivers.driver import Decision, Driver, Memory
 from unjam.drivers.follower_stopper import FollowerStopper
+from unjam.drivers.from_file import DriverLike, as_driver
 from unjam.drivers.local_state import LocalState
 from unjam.drivers.pi_saturation import PISaturation
 from unjam.drivers.registry import DRIVERS
@@ -22,6 +23,7 @@ __all__ = [
     "Constant",
     "Decision",
     "Driver",
+    "DriverLike",
     "FollowerStopper",
     "Human",
     "JamAbsorber",
@@ -31,5 +33,6 @@ __all__ = [
     "PISaturation",
     "Pacer",
     "ResidualDriver",
+    "as_driver",
     "check_driver",
 ]

@@ -6,6 +6,7 @@ import numpy as np
 
 from unjam.drivers.command import as_rows
 from unjam.drivers.driver import Memory
+from unjam.drivers.from_file import DriverLike, as_driver
 from unjam.drivers.local_state import SECTIONS_AHEAD, LocalState
 from unjam.errors import InputError
 from unjam.tree import leaves, mapped
@@ -13,7 +14,7 @@ from unjam.tree import leaves, mapped
 TOLERANCE = 1e-12
 
 
-def check_driver(driver: Any, rows: int = 8, steps: int = 50, seed: int = 0) -> None:
+def check_driver(driver: DriverLike, rows: int = 8, steps: int = 50, seed: int = 0) -> None:
     """Check that a driver keeps the contract of `unjam.drivers.Driver`; raise where it does not.
 
     It drives `rows` vehicles for `steps` random steps and checks that accelerations are finite and of
@@ -21,7 +22,7 @@ def check_driver(driver: Any, rows: int = 8, steps: int = 50, seed: int = 0) -> 
     answer, and that neither the state nor the memory it was given is changed.
 
     Args:
-        driver: anything with `initial_memory(n)` and `act(state, memory)`.
+        driver: anything with `initial_memory(n)` and `act(state, memory)`, or a function of the state.
         rows: vehicles driven at once.
         steps: steps driven.
         seed: of the random surroundings.
@@ -29,10 +30,8 @@ def check_driver(driver: Any, rows: int = 8, steps: int = 50, seed: int = 0) -> 
     Raises:
         InputError: one line that names what is wrong, and in which step.
     """
-    for method in ("initial_memory", "act"):
-        if not callable(getattr(driver, method, None)):
-            raise InputError(f"driver: has no {method}(); see unjam.drivers.Driver")
-    generator, told = np.random.default_rng(seed), bool(getattr(driver, "told", ()))
+    driver = as_driver(driver)
+    generator, told = np.random.default_rng(seed), bool(driver.told)
     memory = driver.initial_memory(rows)
     single = [driver.initial_memory(1) for _ in range(rows)]
     for step in range(steps):

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from traceback import extract_tb
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -97,38 +97,14 @@ class FileReference:
             raise InputError(f"{self}: {type(error).__name__}: {error}{place}") from error
 
 
-@dataclass(frozen=True)
-class FileDriver(FileReference, Driver):
-    """The driver `name` of the user's file: a function of the state, a class, or an instance of one."""
+class Brought(Driver):
+    """A driver of the user's own, by what it holds: anything with `act` and `initial_memory`."""
 
-    parameters: dict[str, Any] = field(default_factory=dict)
-    time_step: float = 0.1
-    held: Any = field(init=False, repr=False, compare=False)
-    """what the file has, as a driver"""
+    held: Any
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "path", self.path.resolve())
-        object.__setattr__(self, "held", self._build())
-
-    def _build(self) -> Any:
-        found = self.load()
-        if inspect.isclass(found):
-            arguments = dict(self.parameters)
-            if "time_step" in inspect.signature(found).parameters:
-                arguments.setdefault("time_step", self.time_step)
-            try:
-                found = found(**arguments)
-            except Exception as error:
-                raise InputError(f"{self}: {type(error).__name__} when made: {error}") from error
-        elif self.parameters:
-            raise InputError(f"{self}: takes no parameters; only a class does")
-        if callable(getattr(found, "act", None)):
-            if not callable(getattr(found, "initial_memory", None)):
-                raise InputError(f"{self}: has act() but no initial_memory(n)")
-            return found
-        if callable(found):
-            return FunctionDriver(found)
-        raise InputError(f"{self}: is neither a function nor a class with act(state, memory)")
+    def ask(self, function: Callable[..., Any], *arguments: Any) -> Any:
+        """Return what the user's function answers."""
+        return function(*arguments)
 
     def initial_memory(self, n: int) -> Memory:
         """Return what the user's driver remembers before its first step."""
@@ -153,6 +129,34 @@ class FileDriver(FileReference, Driver):
         features = getattr(self.held, "memory_features", None)
         return features(memory) if features else None
 
+
+@dataclass(frozen=True)
+class FileDriver(FileReference, Brought):
+    """The driver `name` of the user's file: a function of the state, a class, or an instance of one."""
+
+    parameters: dict[str, Any] = field(default_factory=dict)
+    time_step: float = 0.1
+    held: Any = field(init=False, repr=False, compare=False)
+    """what the file has, as a driver"""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "path", self.path.resolve())
+        object.__setattr__(self, "held", self._build())
+
+    def _build(self) -> Any:
+        found = self.load()
+        if inspect.isclass(found):
+            arguments = dict(self.parameters)
+            if "time_step" in inspect.signature(found).parameters:
+                arguments.setdefault("time_step", self.time_step)
+            try:
+                found = found(**arguments)
+            except Exception as error:
+                raise InputError(f"{self}: {type(error).__name__} when made: {error}") from error
+        elif self.parameters:
+            raise InputError(f"{self}: takes no parameters; only a class does")
+        return acting(found, str(self))
+
     def describe(self) -> str:
         """Return the names of file and driver, and the parameters that were given."""
         return labelled(str(self), self.parameters)
@@ -171,3 +175,56 @@ class FunctionDriver(Driver):
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
         """Return the function's acceleration; nothing is remembered."""
         return self.function(state), memory
+
+
+@dataclass(frozen=True, eq=False)
+class PythonDriver(Brought):
+    """A function or an object of this process as a driver: no other could make it."""
+
+    held: Any
+    label: str
+
+    def describe(self) -> str:
+        """Return the name of the function or the class."""
+        return self.label
+
+    def recipe(self) -> Recipe:
+        """Return that of a driver without a name, which stays in its process."""
+        return {"kind": "named", "name": "", "parameters": {}}
+
+
+class Acting(Protocol):
+    """Anything that drives and remembers, as `unjam.Driver` says of the two methods."""
+
+    def initial_memory(self, n: int) -> Memory:
+        """Return the memory of `n` CAVs before their first step."""
+        ...
+
+    def act(self, state: LocalState, memory: Memory) -> tuple[Any, Memory]:
+        """Return accelerations, and the memory after this step."""
+        ...
+
+
+DriverLike = Driver | Acting | Callable[[LocalState], Any]
+"""what drives where a program asks for it: a driver, what acts like one, or a function of the state"""
+
+
+def as_driver(driver: DriverLike) -> Driver:
+    """Return whatever drives as a `Driver`; raise `InputError` where it is a class, or does not drive."""
+    if isinstance(driver, Driver):
+        return driver
+    name = getattr(driver, "__name__", type(driver).__name__)
+    if inspect.isclass(driver):
+        raise InputError(f"driver: {name} is a class; allowed: an instance of it, like {name}()")
+    return PythonDriver(acting(driver, f"driver {name}"), name)
+
+
+def acting(found: Any, where: str) -> Any:
+    """Return what has `act` and `initial_memory`, or a function as such; else raise `InputError`."""
+    if callable(getattr(found, "act", None)):
+        if not callable(getattr(found, "initial_memory", None)):
+            raise InputError(f"{where}: has act() but no initial_memory(n)")
+        return found
+    if callable(found):
+        return FunctionDriver(found)
+    raise InputError(f"{where}: is neither a function nor a class with act(state, memory)")

@@ -21,7 +21,7 @@ from unjam.drivers.residual import EXPERT, ResidualDriver
 from unjam.drivers.road_experts import JamAbsorber, Pacer
 from unjam.drivers.safety import SafetyFilter
 from unjam.drivers.wrappers import INNER, Filtered, Impaired, Mixed
-from unjam.errors import InputError, wrong
+from unjam.errors import InputError, did_you_mean, wrong
 from unjam.parameters import STRICT, Count, NotNegative, Positive, build, split_parameters
 from unjam.tree import Arrays
 
@@ -55,7 +55,7 @@ def named_driver(text: str, time_step: float) -> Driver:
         reference = FileReference.of(name)
         return FileDriver(reference.path, reference.name, parameters, time_step)
     if name not in DRIVERS:
-        raise wrong("driver", name, driver_names())
+        raise wrong("driver", name, f"{driver_names()}{did_you_mean(name, DRIVERS)}")
     kind = DRIVERS[name]
     if any(field.name == "time_step" for field in fields(kind)):  # pyright: ignore[reportArgumentType]
         parameters = {"time_step": time_step, **parameters}
@@ -86,8 +86,16 @@ def recipe_of(driver: Driver) -> tuple[Recipe, Arrays]:
     for part in _within(recipe):
         if part["kind"] == "named" and not part["name"]:
             allowed = f"{driver_names()} (put your class in a file: path.py:name)"
-            raise wrong("driver", type(driver).__name__, allowed)
+            raise wrong("driver", driver.describe(), allowed)
     return recipe, driver.arrays()
+
+
+def travels(driver: Driver) -> bool:
+    """Return whether another process can make a driver; what a notebook defines drives where it is."""
+    try:
+        return bool(recipe_of(driver))
+    except InputError:
+        return False
 
 
 def driver_from_recipe(recipe: Recipe, arrays: Arrays) -> Driver:
@@ -201,7 +209,6 @@ def _within(recipe: Any) -> Iterator[Recipe]:
 
 def free_label(driver: Driver, taken: dict[str, Driver]) -> str:
     """Return the description of a driver, numbered where another driver has it already."""
-    recipe_of(driver)  # what no worker could make has no place among others
     label, number = driver.describe(), 1
     while label in taken and not _same(taken[label], driver):
         number += 1
@@ -210,6 +217,8 @@ def free_label(driver: Driver, taken: dict[str, Driver]) -> str:
 
 
 def _same(one: Driver, other: Driver) -> bool:
+    if not (travels(one) and travels(other)):
+        return one is other
     (recipe, arrays), (other_recipe, other_arrays) = recipe_of(one), recipe_of(other)
     return recipe == other_recipe and all(
         np.array_equal(array, other_arrays[name]) for name, array in arrays.items()

@@ -15,12 +15,13 @@ from unjam.drivers.command import Command, Limits
 from unjam.drivers.driver import Decision, Driver, Memory, Noise
 from unjam.drivers.local_state import LocalState
 from unjam.drivers.observation import FeatureName, Seen, observation_size, observe
-from unjam.errors import EpisodeError, InputError, UnjamError
+from unjam.errors import EpisodeError, InputError, MissingPartError, UnjamError, wrong_name
+from unjam.processes import has_display
 from unjam.scenarios import make_scenario
 from unjam.worlds.drive import Drive
 from unjam.worlds.reward import Outcome, make_reward, time_headway
 from unjam.worlds.sumo import make_traffic
-from unjam.worlds.sumo.simulation import Backend, Simulation, libsumo_is_taken
+from unjam.worlds.sumo.simulation import Backend, Simulation, own_simulation
 from unjam.worlds.sumo.traffic import Traffic
 
 Observations = NDArray[np.float32]
@@ -121,9 +122,8 @@ class SteppedRoad:
         numbers = (self._seed, self._episodes) if self._episodes else (self._seed,)
         self._episodes += 1
         if self._simulation is None:
-            # libsumo runs one in a process; where it is taken, over TraCI: the same, but slower.
-            taken = self._backend == "libsumo" and libsumo_is_taken()
-            self._simulation = Simulation("traci" if taken else self._backend)
+            own = self._backend == "libsumo"
+            self._simulation = own_simulation() if own else Simulation(self._backend)
         self._traffic = traffic = make_traffic(self.scenario, numbers, self._simulation)
         self._drive = Drive(traffic, self._driver)
         self._decisions = iter(self._drive)
@@ -206,12 +206,13 @@ class RoadEnv(gymnasium.Env[Observations, NDArray[Any]]):
     Time step    one decision: 0.1 s, on the merge 1 s
     ===========  ===================================================================================
 
-    libsumo runs one simulation in a process: a second environment there runs over TraCI, twenty times slower.
+    libsumo runs one simulation in a process: a second environment there runs over TraCI, several times
+    slower, and a warning says so.
     For several at once use ``gymnasium.make_vec("unjam/Ring-v0", num_envs=4, vectorization_mode="async")``.
     """
 
     metadata: ClassVar[dict[str, Any]] = {  # pyright: ignore[reportIncompatibleVariableOverride]
-        "render_modes": ["human", "rgb_array"],
+        "render_modes": ["human", "rgb_array"] if has_display() else ["rgb_array"],
         "render_fps": 10,
     }
 
@@ -237,9 +238,12 @@ class RoadEnv(gymnasium.Env[Observations, NDArray[Any]]):
 
         Raises:
             InputError: something of it is wrong, or the road has several CAVs.
+            MissingPartError: a window is asked for where there is no display.
         """
-        if render_mode not in (None, *self.metadata["render_modes"]):
-            raise InputError(f"render_mode: {render_mode!r} is not allowed; allowed: human, rgb_array")
+        if render_mode not in (None, "human", "rgb_array"):
+            raise wrong_name("render_mode", render_mode, ("human", "rgb_array"))
+        if render_mode == "human" and not has_display():
+            raise MissingPartError("render_mode: 'human' needs a display; without one: 'rgb_array'")
         self.render_mode = render_mode
         backend = "gui" if render_mode == "human" else "libsumo"
         self._road = SteppedRoad(scenario, changes, reward, expert, observe, backend)

@@ -30,6 +30,10 @@ VALIDATION_SHARE = 0.2
 """share of the drivers who decide whether a residual is better than none"""
 FEWEST = 5
 """drivers that a residual needs: one of them judges"""
+SAME_UNIT = (0.5, 2.0)
+"""share of the difference of speeds by which gaps change, if both are in metres: one, but for noise"""
+SUSPICIOUS = 3
+"""parameters at the end of what was searched from which the units, or the data, are doubted"""
 FILTERS = ("kind", "split", "driver")
 """what trajectories can be chosen by"""
 
@@ -73,6 +77,12 @@ class FittedDrivers:
             f"error of the simulated gap: one IDM for all {fit['together']['gap_error']:.2f} m, "
             f"each driver's own {np.mean(errors):.2f} m on average"
         ]
+        unknown = fit["together"]["bounds"]
+        if len(unknown) >= SUSPICIOUS:
+            lines.append(
+                f"warning: {len(unknown)} of {len(SEARCHED)} parameters lie at the end of what was searched "
+                f"({', '.join(unknown)}): these are no people; are speeds in m/s and gaps in m?"
+            )
         collided = sum(one["collided"] > 0 for one in details)
         if collided:
             lines.append(f"{collided} drivers use up their gap in the simulation")
@@ -128,12 +138,28 @@ def fit_from_files(
         pairs = [pair for pair in pairs if getattr(pair, name) == value]
         if not pairs:
             raise InputError(f"only: no trajectory has {name} {value!r}; there are: {', '.join(there)}")
+    words += doubts_about_units(pairs)
     population = fit_drivers(pairs, settings, on_progress)
     made = manifest()
     # It is given away: no folder of this machine is named.
     made["command"] = [Path(word).name if "/" in word else word for word in made["command"]]
     about = {"data": [file.name for file in files], "only": only or {}, "manifest": made}
     return FittedDrivers(replace(population, about={**population.about, **about}), words)
+
+
+def doubts_about_units(pairs: Sequence[Pair]) -> list[str]:
+    """Return a line where gaps change otherwise than the speeds say: the two have not the same unit."""
+    differences = [pair.leader_speed - pair.speed for pair in pairs]
+    closing = np.concatenate([(each[1:] + each[:-1]) / 2.0 for each in differences])
+    change = np.concatenate([np.diff(pair.gap) / pair.step for pair in pairs])
+    share = float(closing @ change / max(closing @ closing, 1e-9))
+    low, high = SAME_UNIT
+    if low <= share <= high or not closing.any():
+        return []
+    return [
+        f"warning: gaps change {share:.2f} times as fast as the speeds say (0.28 where speeds are in km/h); "
+        "allowed: speeds in m/s and gaps in m"
+    ]
 
 
 def fit_drivers(

@@ -250,7 +250,8 @@ def _check_columns(frame: pd.DataFrame, wanted: Iterable[str], path: Path) -> No
     missing = [name for name in wanted if name not in frame]
     if missing:
         there = ", ".join(str(name) for name in frame.columns if name != "line")
-        raise InputError(f"{path.name}: no column {missing[0]!r}; it has: {there}")
+        needed = ", ".join(wanted)
+        raise InputError(f"{path.name}: no column {missing[0]!r}; it has: {there}; needed: {needed}")
 
 
 def _joined(frame: pd.DataFrame, columns: tuple[str, ...]) -> pd.Series:

@@ -46,6 +46,11 @@ def estimate(
     return Estimate(mean, float(low), float(high), len(finite))
 
 
+def digits_of(found: Estimate, digits: int) -> int:
+    """Return with how many digits to show an estimate: two more where a mean would be rounded to zero."""
+    return digits + 2 if found.mean and not round(found.mean, digits) else digits
+
+
 def estimate_of(rows: Sequence[dict[str, Any]], name: str) -> Estimate:
     """Return the estimate of a metric over the rows of `measure`."""
     return estimate([row[name] for row in rows])

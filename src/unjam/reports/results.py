@@ -14,6 +14,7 @@ from safetensors.numpy import load_file
 
 from unjam.errors import InputError
 from unjam.measures.metrics import METRICS
+from unjam.worlds.record import Episode
 
 Floats = NDArray[np.float32]
 
@@ -23,6 +24,11 @@ MODEL_FILE = "model.json"
 """what there is to see of a run's virtual environment"""
 PICTURED = ("speeds", "positions", "gaps", "outline", "waiting", "lines", "places")
 """arrays of an episode that pictures are made of"""
+ABOUT_SHOWN = (
+    *("step", "seed", "drawn", "loop_length", "crossings", "branches", "limit_speed"),
+    *("vehicle_ids", "cav_ids"),
+)
+"""what is written of an episode that pictures show, beside its arrays"""
 
 
 @dataclass(frozen=True)
@@ -64,6 +70,12 @@ class Shown:
     def cavs(self) -> list[int]:
         """Columns of the CAVs."""
         return [self.vehicle_ids.index(name) for name in self.cav_ids]
+
+
+def shown_of(driver: str, episode: Episode) -> Shown:
+    """Return what pictures show of an episode that was just driven."""
+    names = {*ABOUT_SHOWN, *PICTURED} - {"seed"}
+    return Shown(driver, **{name: getattr(episode, name) for name in names})
 
 
 @dataclass(frozen=True)
@@ -122,9 +134,15 @@ def rows_by_driver(rows: list[dict[str, Any]]) -> dict[str, list[dict[str, Any]]
     return found
 
 
+def read_about(folder: Path) -> tuple[dict[str, Any], dict[str, list[dict[str, Any]]]]:
+    """Return what a folder of results is about, and its rows of metrics by driver."""
+    about = json.loads((folder / EVALUATION_FILE).read_text())
+    return about, rows_by_driver(about.pop("rows"))
+
+
 def read_rows(folder: Path) -> dict[str, list[dict[str, Any]]]:
     """Return the rows of metrics of a folder of results, by driver."""
-    return rows_by_driver(json.loads((folder / EVALUATION_FILE).read_text())["rows"])
+    return read_about(folder)[1]
 
 
 def read_progress(folder: Path) -> list[dict[str, Any]]:

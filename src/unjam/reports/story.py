@@ -8,7 +8,7 @@ import numpy as np
 
 from unjam.measures.drivable import verdicts
 from unjam.measures.metrics import METRICS, Metric
-from unjam.measures.statistics import Estimate, estimate_of, paired_difference, signed
+from unjam.measures.statistics import Estimate, digits_of, estimate_of, paired_difference, signed
 from unjam.reports.results import Results, Shown
 
 CLOSE_HEADWAY = 1.0
@@ -117,7 +117,8 @@ def _lead_of_drives(result: Results) -> str:
 def notes_of(result: Results) -> list[str]:
     """Return what a reader should know before trusting the main finding."""
     labels = [result.trained] if result.trained else list(result.rows)
-    return [note for label in labels for note in _notes_of(result, label)]
+    foreign = [f"{note}." for note in result.about.get("notes", [])]
+    return [*foreign, *(note for label in labels for note in _notes_of(result, label))]
 
 
 def _notes_of(result: Results, label: str) -> list[str]:
@@ -205,6 +206,7 @@ def cell_of(found: Estimate, digits: int, wanted: int) -> dict[str, str]:
     """Return a cell: mean and interval; how many of `wanted` values it stands for, where that is not all."""
     if found.count == 0:
         return {"mean": "–", "interval": ""}
+    digits = digits_of(found, digits)
     interval = "" if np.isnan(found.low) else f"[{found.low:.{digits}f}, {found.high:.{digits}f}]"
     if found.count < wanted:
         interval = f"{interval} {found.count} of {wanted}".strip()

@@ -3,7 +3,7 @@
 from dataclasses import asdict
 from typing import Any
 
-from unjam.errors import wrong
+from unjam.errors import wrong_name
 from unjam.parameters import build, changed, nested
 from unjam.scenarios.figure_eight import FigureEight
 from unjam.scenarios.merge import Merge
@@ -42,7 +42,7 @@ def make_scenario(name: str, changes: dict[str, Any] | None = None) -> Scenario:
     if name.endswith(".sumocfg"):
         return own_network(name, changes)
     if name not in SCENARIOS:
-        raise wrong("scenario", name, ", ".join([*SCENARIOS, "a .sumocfg file"]))
+        raise wrong_name("scenario", name, [*SCENARIOS, "a .sumocfg file"])
     scenario = SCENARIOS[name]
     if not changes:
         return scenario

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 from pydantic.dataclasses import dataclass
 
-from unjam.parameters import STRICT, Count, NotNegative
+from unjam.parameters import STRICT, Count, NotNegative, OneOrRange
 from unjam.physics.idm import equilibrium_speed
 from unjam.scenarios.ring import Lap, Loop, Place
 from unjam.scenarios.road import Connection, Edge, Line, Node, RoadNetwork, as_line
@@ -52,8 +52,11 @@ class FigureEight(Loop):
         "the speed at which the queue of all vehicles just clears the crossing in half a lap"
     )
 
-    radius: tuple[Annotated[int, Field(ge=15)], Annotated[int, Field(ge=15)]] = (32, 35)
-    """smallest and largest radius, drawn uniformly among the integers between them [m]"""
+    radius: Annotated[tuple[Annotated[int, Field(ge=15)], Annotated[int, Field(ge=15)]], OneOrRange] = (
+        32,
+        35,
+    )
+    """smallest and largest radius, drawn uniformly among the integers between them; or one [m]"""
     vehicles: Annotated[int, Field(ge=2)] = 14
     cavs: Count = 1
     """vehicles that are CAVs, evenly spread; the first leads the queue"""

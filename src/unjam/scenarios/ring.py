@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 from pydantic.dataclasses import dataclass
 
-from unjam.parameters import STRICT, Count
+from unjam.parameters import STRICT, Count, OneOrRange
 from unjam.physics.idm import equilibrium_speed
 from unjam.scenarios.road import ClosedRoad, Edge, Entry, Node, RoadNetwork, Route, as_line
 from unjam.scenarios.scenario import VEHICLE_LENGTH, Scenario
@@ -162,8 +162,11 @@ class Ring(Loop):
         "the IDM's equilibrium speed, at which all vehicles could drive alike for ever"
     )
 
-    length: tuple[Annotated[int, Field(ge=10)], Annotated[int, Field(ge=10)]] = (220, 270)
-    """shortest and longest ring, drawn uniformly among the integers between them [m]"""
+    length: Annotated[tuple[Annotated[int, Field(ge=10)], Annotated[int, Field(ge=10)]], OneOrRange] = (
+        220,
+        270,
+    )
+    """shortest and longest ring, drawn uniformly among the integers between them; or one length [m]"""
 
     @model_validator(mode="after")
     def _fits(self) -> "Ring":

@@ -4,49 +4,45 @@
 """
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Container, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 from safetensors.numpy import save
 
 from unjam.controller import make_driver
 from unjam.drivers.driver import Driver
-from unjam.drivers.registry import driver_names, free_label
+from unjam.drivers.from_file import DriverLike, as_driver
+from unjam.drivers.registry import driver_names, free_label, travels
 from unjam.errors import InputError, wrong
 from unjam.files import make_folder, to_json, write_whole
 from unjam.manifest import manifest
-from unjam.measures.drivable import verdicts
-from unjam.measures.metrics import METRICS, measure
-from unjam.measures.statistics import Estimate, summarise
+from unjam.measures.metrics import measure
+from unjam.measures.statistics import summarise
 from unjam.reports.html import write_report
-from unjam.reports.results import PICTURED
+from unjam.reports.results import ABOUT_SHOWN, PICTURED
+from unjam.reports.summary import frame_of_rows
 from unjam.scenarios import make_scenario
 from unjam.scenarios.scenario import Scenario
 from unjam.training.config import RunConfig
+from unjam.training.drive_result import DriveResult, Rows
 from unjam.training.executors import error_named
 from unjam.training.folder import make_new_folder
+from unjam.training.notes import notes_on_controllers
 from unjam.training.seeds import held_out_seeds
-from unjam.worlds.episode import can_drive
+from unjam.worlds.episode import can_drive, run_episode
 from unjam.worlds.record import Episode
 from unjam.worlds.reward import make_reward
+from unjam.worlds.sumo.simulation import own_simulation
 from unjam.worlds.workers import EpisodeTask, Workers
 
 TRAINED = "trained"
 """label of the trained controller in tables and pictures"""
-ABOUT_SHOWN = (
-    *("step", "seed", "drawn", "loop_length", "crossings", "branches", "limit_speed"),
-    *("vehicle_ids", "cav_ids"),
-)
-"""what is written of an episode that pictures show, beside its arrays"""
-
 Progress = Callable[[tuple[str, int], int], None]
 """called now and then with (the driver's label, the index of its episode), and the decisions made so far"""
-Rows = dict[str, list[dict[str, Any]]]
-"""by driver: a row of metrics per episode, failed ones too"""
 
 
 @dataclass(frozen=True)
@@ -101,13 +97,51 @@ def evaluate_each(
         _, index = pairs[task]
         return measure(episode), episode if pictured and index == 0 and episode.ok else None
 
+    away = [index for index, (label, _) in enumerate(pairs) if travels(drivers[label][1])]
+    found = dict(
+        zip(
+            away,
+            workers.run_each(
+                [tasks[index] for index in away],
+                lambda number, episode: measured(away[number], episode),
+                lambda number, steps: on_progress(away[number], steps),
+            ),
+            strict=True,
+        )
+    )
+    found |= _driven_here(tasks, found.keys(), measured, on_progress)
     rows: Rows = {label: [] for label in drivers}
     shown: dict[str, Episode] = {}
-    for (label, _), (row, episode) in zip(pairs, workers.run_each(tasks, measured, on_progress), strict=True):
+    for index, (label, _) in enumerate(pairs):
+        row, episode = found[index]
         rows[label].append(row)
         if episode is not None:
             shown[label] = episode
     return Evaluation(rows, shown)
+
+
+def _driven_here(
+    tasks: Sequence[EpisodeTask],
+    done: Container[int],
+    keep: Callable[[int, Episode], Any],
+    on_progress: Callable[[int, int], None],
+) -> dict[int, Any]:
+    """Run those tasks that are not done in this process; return what `keep` makes of each, by index."""
+    left = {index: task for index, task in enumerate(tasks) if index not in done}
+    if not left:
+        return {}
+    with own_simulation() as simulation:
+        return {
+            index: keep(
+                index,
+                run_episode(
+                    *(task.scenario, task.driver, task.seed, task.reward, task.explore, task.full),
+                    simulation=simulation,
+                    progress=partial(on_progress, index),
+                ),
+            )
+            for index, task in left.items()
+        }
 
 
 def raise_failure(rows: Sequence[dict[str, Any]]) -> None:
@@ -131,7 +165,6 @@ def save_evaluation(folder: Path, evaluation: Evaluation, about: dict[str, Any])
     """
     make_folder(folder)
     rows = [{"driver": label, **row} for label, found in evaluation.rows.items() for row in found]
-    frame = pd.DataFrame([{**row, "seed": str(row["seed"])} for row in rows])
     arrays = {
         f"{number}.{name}": getattr(episode, name).astype(np.float32)
         for number, episode in enumerate(evaluation.shown.values())
@@ -142,7 +175,7 @@ def save_evaluation(folder: Path, evaluation: Evaluation, about: dict[str, Any])
         for label, episode in evaluation.shown.items()
     ]
     write_whole(folder / "shown.safetensors", save(arrays))
-    write_whole(folder / "episodes.parquet", frame.to_parquet())
+    write_whole(folder / "episodes.parquet", frame_of_rows(evaluation.rows).to_parquet())
     write_whole(folder / "evaluation.json", to_json({**about, "rows": rows, "shown": about_shown}, indent=1))
 
 
@@ -188,47 +221,9 @@ def judge(
     return found
 
 
-@dataclass(frozen=True)
-class DriveResult:
-    """Episodes of one or several drivers on the same traffic."""
-
-    scenario: str
-    rows: Rows
-    folder: Path | None = None
-    """where everything was written"""
-    report: Path | None = None
-
-    @property
-    def mean(self) -> dict[str, float]:
-        """Mean of every metric over the episodes of the first driver."""
-        return {name: found.mean for name, found in self.summary(next(iter(self.rows))).items()}
-
-    def summary(self, driver: str) -> dict[str, Estimate]:
-        """Return mean and 95 % bootstrap interval of every metric for a driver."""
-        return summarise(self.rows[driver])
-
-    def document(self) -> dict[str, Any]:
-        """Return the result as `unjam drive --json` prints it; of several drivers, a list of such."""
-        documents = [self._document(driver) for driver in self.rows]
-        return documents[0] if len(documents) == 1 else {"scenario": self.scenario, "drivers": documents}
-
-    def _document(self, driver: str) -> dict[str, Any]:
-        summary = self.summary(driver)
-        return {
-            "scenario": self.scenario,
-            "driver": driver,
-            "drivable": verdicts(self.rows)[driver],
-            "episodes": self.rows[driver],
-            "mean": {name: summary[name].mean for name in METRICS},
-            "interval": {name: [summary[name].low, summary[name].high] for name in METRICS},
-            "folder": str(self.folder) if self.folder else None,
-            "report": str(self.report) if self.report else None,
-        }
-
-
 def drive(
     scenario: str = "ring",
-    driver: str | Driver | Sequence[str | Driver] = "pi",
+    driver: str | DriverLike | Sequence[str | DriverLike] = "pi",
     episodes: int = 5,
     seed: int = 0,
     road: dict[str, Any] | None = None,
@@ -243,10 +238,11 @@ def drive(
     Args:
         scenario: its name.
         driver: a name (`pi`), with parameters (`pi:window=30`), your own (`path.py:name`), a run folder, a
-            `.unjam` file, or a driver; or several of them, to be compared on the same traffic.
+            `.unjam` file; a driver, a function of the state or an object with `act` and `initial_memory`,
+            which drive in this process; or a list of them, to be compared on the same traffic.
         episodes: of each driver; they have the seeds `seed`, `seed + 1`, ...
         seed: of the first episode.
-        road: changes to the scenario's parameters, e.g. `{"length": (230, 230)}`.
+        road: changes to the scenario's parameters, e.g. `{"length": 230}` or `{"length": (220, 270)}`.
         reward: a name or `path.py:name`; empty: the scenario's own.
         workers: processes; all cores by default. The result does not depend on it.
         out: folder for the results and a report.html; None: nothing is written.
@@ -263,11 +259,14 @@ def drive(
         raise wrong("seed", seed, "none with held-out seeds")
     made = make_scenario(scenario, road)
     drivers: dict[str, Driver] = {}
-    for entry in [driver] if isinstance(driver, (str, Driver)) else driver:
+    if isinstance(driver, str) or not isinstance(driver, Sequence):
+        driver = [driver]
+    for entry in driver:
         if isinstance(entry, str):
             drivers[entry] = make_driver(entry, made.decision_step)
         else:
-            drivers[free_label(entry, drivers)] = entry
+            one = as_driver(entry)
+            drivers[free_label(one, drivers)] = one
     if not drivers:
         raise wrong("driver", driver, driver_names())
     make_reward(reward or made.reward)
@@ -278,9 +277,9 @@ def drive(
     seeds = held_out_seeds(episodes) if held_out else [(seed + index,) for index in range(episodes)]
     with Workers(min(workers or os.cpu_count() or 1, episodes * len(drivers))) as pool:
         found = evaluate(made, drivers, seeds, pool, reward, progress)
-    report = None
+    report, notes = None, notes_on_controllers(made, drivers, found.shown)
     if folder is not None:
         about = {"scenario": Path(scenario).name, "reward": reward or made.reward, "manifest": manifest()}
-        save_evaluation(folder, found, about)
+        save_evaluation(folder, found, {**about, "notes": notes})
         report = write_report([folder], folder / "report.html")
-    return DriveResult(scenario, found.rows, folder, report)
+    return DriveResult(scenario, found.rows, folder, report, found.shown, notes)

@@ -61,11 +61,15 @@ def make_new_folder(folder: Path, otherwise: str = "") -> None:
 
     What somebody left who was killed before anything was written is nothing.
     """
-    if folder.exists() and not (
-        folder.is_dir() and all(is_leftover(path) or path.name == LOCK for path in folder.iterdir())
-    ):
-        raise InputError(f"out: {str(folder)!r} is not empty; allowed: a new folder{otherwise}")
-    make_folder(folder)
+    try:
+        if folder.exists() and not (
+            folder.is_dir() and all(is_leftover(path) or path.name == LOCK for path in folder.iterdir())
+        ):
+            raise InputError(f"out: {str(folder)!r} is not empty; allowed: a new folder{otherwise}")
+        make_folder(folder)
+    except OSError as error:  # no place for a folder at all: under /proc, or of a name too long
+        why = f"cannot be made ({error.strerror})"
+        raise InputError(f"out: {str(folder)!r} {why}; allowed: a new folder") from None
 
 
 def start_folder(folder: Path, config: RunConfig) -> None:

@@ -37,6 +37,7 @@ from unjam.training.folder import (
 )
 from unjam.training.model_facts import write_model_facts
 from unjam.training.seeds import VALIDATE
+from unjam.worlds.episode import Task
 from unjam.worlds.workers import EpisodeTask, Workers
 
 MEANS = (
@@ -157,6 +158,20 @@ def gain_of(config: RunConfig, rows: Rows) -> Estimate | None:
     return paired_difference(rows[TRAINED], rows[config.make_expert().describe()], "return")
 
 
+def episodes_of_iteration(tasks: Sequence[Task], steps: int) -> list[int]:
+    """Return how many episodes an iteration of so many actual steps has on each road, at least one."""
+    total = sum(task.weight for task in tasks)
+    return [max(1, ceil(round(task.weight / total * steps / task.scenario.horizon, 9))) for task in tasks]
+
+
+def steps_to_train(config: RunConfig) -> int:
+    """Return how many actual steps a new training will make: whole iterations, unless episodes end early."""
+    tasks = config.make_tasks()
+    counts = episodes_of_iteration(tasks, config.learner.batch_steps)
+    each = sum(count * task.scenario.horizon for count, task in zip(counts, tasks, strict=True))
+    return ceil(config.steps / each) * each
+
+
 class Trainer:
     """What Algorithm 1 needs around it: episodes from the workers, validation, and the run's folder.
 
@@ -204,11 +219,7 @@ class Trainer:
 
     def collect(self, network: Network, iteration: int) -> Collected:
         """Return the episodes of an iteration, at least one of each road, as many as its weight asks for."""
-        steps = self.config.learner.batch_steps
-        counts = [
-            max(1, ceil(round(share * steps / task.scenario.horizon, 9)))
-            for task, share in zip(self.tasks, self._shares, strict=True)
-        ]
+        counts = episodes_of_iteration(self.tasks, self.config.learner.batch_steps)
         return self._drive(self.drivers(network), counts, (self.config.seed, iteration), explore=True)
 
     def validate(self, iteration: Iteration) -> Validated:

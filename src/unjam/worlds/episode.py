@@ -6,13 +6,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from unjam.drivers.driver import Driver
+from unjam.drivers.from_file import DriverLike, as_driver
 from unjam.errors import InputError
 from unjam.scenarios.scenario import Scenario
 from unjam.worlds.drive import drive
 from unjam.worlds.record import Episode, Floats, outcome_of
 from unjam.worlds.reward import Reward, make_reward
 from unjam.worlds.sumo import make_traffic
-from unjam.worlds.sumo.simulation import Simulation
+from unjam.worlds.sumo.simulation import Simulation, own_simulation
 from unjam.worlds.world import OnProgress
 
 
@@ -33,8 +34,8 @@ class Task:
 
 def run_episode(
     scenario: Scenario,
-    driver: Driver,
-    seed: Sequence[int],
+    driver: DriverLike,
+    seed: int | Sequence[int],
     reward: str = "",
     explore: bool = False,
     full: bool = False,
@@ -48,8 +49,8 @@ def run_episode(
 
     Args:
         scenario: road, traffic and horizon.
-        driver: of every CAV.
-        seed: integers; everything random comes from them.
+        driver: of every CAV: a driver, anything with `act` and `initial_memory`, or a function of the state.
+        seed: an integer or several; everything random comes from them.
         reward: name, or `path.py:name`; empty: the scenario's own.
         explore: whether a residual driver adds its exploration noise.
         full: whether fuel is recorded and, on roads with ends, where on the plane vehicles are (it costs a
@@ -61,11 +62,12 @@ def run_episode(
         InputError: driver or reward answer something that is not finite, or of a wrong shape.
         EpisodeError: SUMO cannot run the scenario.
     """
+    driver, seed = as_driver(driver), (seed,) if isinstance(seed, int) else seed
     if not can_drive(driver, scenario):
         raise InputError(f"driver: it is not allowed on {scenario.title}: it needs a closed road")
     earned = make_reward(reward or scenario.reward)
     if simulation is None:
-        with Simulation() as simulation:
+        with own_simulation() as simulation:
             return run_episode(scenario, driver, seed, reward, explore, full, simulation, progress)
     traffic = make_traffic(scenario, seed, simulation, driver.plain_numbers, full)
     episode = drive(traffic, driver, explore, on_progress=progress)

@@ -5,7 +5,7 @@ from math import isfinite
 from typing import NamedTuple
 
 from unjam.drivers.from_file import FileReference, is_file_reference
-from unjam.errors import wrong
+from unjam.errors import wrong, wrong_name
 from unjam.parameters import split_parameters
 from unjam.physics.arrays import Array, at_least, namespace, square_root
 
@@ -181,7 +181,7 @@ def make_reward(text: str) -> Reward:
     elif name in REWARDS:
         reward = REWARDS[name]
     else:
-        raise wrong("reward", name, ", ".join([*REWARDS, "path.py:name"]))
+        raise wrong_name("reward", name, [*REWARDS, "path.py:name"])
     return _weighted(reward, weights) if weights else reward
 
 

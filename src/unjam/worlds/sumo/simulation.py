@@ -3,6 +3,8 @@
 import importlib
 import io
 import tempfile
+import warnings
+import weakref
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import redirect_stdout, suppress
@@ -142,6 +144,8 @@ class Simulation:
         with redirect_stdout(io.StringIO()):  # traci announces each of its attempts to connect
             traci.start(command, label=label)
         self._sumo = traci.getConnection(label)
+        # One that nobody closes would complain aloud of the lost connection as this process ends.
+        weakref.finalize(self, _close, self._sumo)
         self._bind()
 
     def _options(self, step: float, seed: int) -> list[str]:
@@ -267,8 +271,7 @@ class Simulation:
     def _end(self) -> None:
         """End SUMO; one that is gone already is no error."""
         self._running = False
-        with suppress(Exception):
-            self._sumo.close()
+        _close(self._sumo)
 
     def __enter__(self) -> Self:
         return self
@@ -277,9 +280,21 @@ class Simulation:
         self.close()
 
 
-def libsumo_is_taken() -> bool:
-    """Return whether a simulation is open in this process."""
-    return _open is not None
+def _close(sumo: Any) -> None:
+    with suppress(Exception):
+        sumo.close()
+
+
+def own_simulation() -> Simulation:
+    """Open a simulation in this process; over TraCI, with a warning, where libsumo runs one already."""
+    if _open is None:
+        return Simulation()
+    warnings.warn(
+        "another simulation is open in this process: this one runs over TraCI, with the same results but "
+        "several times slower; close the other, or use gymnasium.make_vec(..., vectorization_mode='async')",
+        stacklevel=2,
+    )
+    return Simulation("traci")
 
 
 def _function(sumo: Any, domain: str, name: str) -> Callable[..., Any]:

@@ -1,0 +1,75 @@
+"""What `unjam.drive` returns: rows of metrics by driver, as numbers, tables, and in a notebook."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from unjam.measures.drivable import verdicts
+from unjam.measures.metrics import METRICS
+from unjam.measures.statistics import Estimate, summarise
+from unjam.reports.summary import frame_of_metrics, frame_of_rows, html_of
+from unjam.worlds.record import Episode
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+Rows = dict[str, list[dict[str, Any]]]
+"""by driver: a row of metrics per episode, failed ones too"""
+
+
+@dataclass(frozen=True)
+class DriveResult:
+    """Episodes of one or several drivers on the same traffic."""
+
+    scenario: str
+    rows: Rows
+    folder: Path | None = None
+    """where everything was written"""
+    report: Path | None = None
+    shown: dict[str, Episode] = field(default_factory=dict, repr=False)
+    """by driver: the episode that pictures show, the same seed for all"""
+    notes: list[str] = field(default_factory=list)
+    """what to know before trusting it: controllers on a road that they were not made for"""
+
+    @property
+    def mean(self) -> dict[str, float]:
+        """Mean of every metric over the episodes of the first driver."""
+        return {name: found.mean for name, found in self.summary(next(iter(self.rows))).items()}
+
+    def summary(self, driver: str) -> dict[str, Estimate]:
+        """Return mean and 95 % bootstrap interval of every metric for a driver."""
+        return summarise(self.rows[driver])
+
+    def table(self) -> "pd.DataFrame":
+        """Return a row per metric and, for each driver, its mean and both ends of its 95 % interval.
+
+        `result.table().loc["mean_speed", ("pi", "mean")]` is one number.
+        """
+        return frame_of_metrics(self.rows)
+
+    def episodes(self) -> "pd.DataFrame":
+        """Return a row per episode and driver, with its seed, its status and every metric."""
+        return frame_of_rows(self.rows)
+
+    def _repr_html_(self) -> str:
+        """What a notebook shows: every metric with its interval, and where each vehicle was at each time."""
+        return html_of(self.rows, self.shown)
+
+    def document(self) -> dict[str, Any]:
+        """Return the result as `unjam drive --json` prints it; of several drivers, a list of such."""
+        documents = [self._document(driver) for driver in self.rows]
+        return documents[0] if len(documents) == 1 else {"scenario": self.scenario, "drivers": documents}
+
+    def _document(self, driver: str) -> dict[str, Any]:
+        summary = self.summary(driver)
+        return {
+            "scenario": self.scenario,
+            "driver": driver,
+            "drivable": verdicts(self.rows)[driver],
+            "episodes": self.rows[driver],
+            "mean": {name: summary[name].mean for name in METRICS},
+            "interval": {name: [summary[name].low, summary[name].high] for name in METRICS},
+            "notes": self.notes,
+            "folder": str(self.folder) if self.folder else None,
+            "report": str(self.report) if self.report else None,
+        }

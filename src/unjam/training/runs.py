@@ -1,0 +1,119 @@
+"""Run folders as things: which there are, how far each is, in what they differ, and removing one."""
+
+import os
+import shutil
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+from unjam.errors import InputError, UnjamError
+from unjam.measures.statistics import Estimate, paired_difference
+from unjam.parameters import flat
+from unjam.processes import is_owned, owned
+from unjam.reports.results import EVALUATION_FILE, read_about, read_progress
+from unjam.training.config import RunConfig
+from unjam.training.folder import MANIFEST, read_config
+
+State = Literal["running", "finished", "stopped"]
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run folder, as far as it has come."""
+
+    name: str
+    """its path below the folder that was listed"""
+    folder: Path
+    config: RunConfig = field(repr=False)
+    state: State
+    """`running`: a process of this machine writes it; `stopped`: it can go on with `unjam train --resume`"""
+    steps: int
+    """actual steps that are done, of `config.steps`"""
+    gains: dict[str, Estimate | None]
+    """return beyond the expert on held-out seeds by road, whose name is empty where it is the only one"""
+
+    def document(self) -> dict[str, Any]:
+        """Return it as JSON."""
+        config = self.config
+        return {
+            **{"name": self.name, "folder": str(self.folder), "scenario": config.scenario},
+            **{"preset": config.preset, "expert": config.expert, "agent": config.agent, "seed": config.seed},
+            **{"state": self.state, "steps": self.steps, "steps_wanted": config.steps},
+            "gain": {road: asdict(gain) if gain else None for road, gain in self.gains.items()},
+        }
+
+
+def list_runs(under: Path | str = "runs", scenario: str = "") -> list[Run]:
+    """Return the runs in a folder and all below it, by name; with `scenario`, those that train on it.
+
+    Raises:
+        InputError: there is no such folder.
+    """
+    under = Path(under)
+    if not under.is_dir():
+        raise InputError(f"under: {str(under)!r} is not a folder; allowed: one that holds run folders")
+    found = [read_run(folder, str(folder.relative_to(under))) for folder in sorted(_run_folders(under))]
+    return [
+        run
+        for run in found
+        if not scenario or scenario in {Path(road.scenario).name for road in run.config.roads().values()}
+    ]
+
+
+def _run_folders(under: Path) -> Iterator[Path]:
+    for place, below, files in os.walk(under):
+        if {"config.toml", MANIFEST} <= set(files):
+            below.clear()  # the roads of a run are no runs
+            try:
+                read_config(Path(place))
+            except UnjamError:  # of another unjam, or somebody else's
+                continue
+            yield Path(place)
+
+
+def read_run(folder: Path, name: str = "") -> Run:
+    """Return how far a run is; raise `InputError` where the folder is none of a run."""
+    config, progress = read_config(folder), read_progress(folder)
+    if not (folder / MANIFEST).is_file():
+        raise InputError(f"run: {str(folder)!r} is not a run folder: it has no {MANIFEST}")
+    steps = progress[-1]["actual_steps"] if progress else 0
+    gains = {road: _gain(folder / road) for road in config.roads()}
+    judged = all((folder / road / EVALUATION_FILE).is_file() for road in gains)
+    done: State = "finished" if judged and steps >= config.steps else "stopped"
+    return Run(name or str(folder), folder, config, "running" if is_owned(folder) else done, steps, gains)
+
+
+def _gain(folder: Path) -> Estimate | None:
+    """Return what a judged controller earns beyond its expert; None before that, or without an expert."""
+    if not (folder / EVALUATION_FILE).is_file():
+        return None
+    about, rows = read_about(folder)
+    expert = rows.get(about.get("expert", ""))
+    return paired_difference(rows[about["trained"]], expert, "return") if expert else None
+
+
+def find_run(name: str, under: Path) -> Path:
+    """Return the folder of a run by its name below `under`, or by its path."""
+    return under / name if (under / name).is_dir() else Path(name)
+
+
+def differences(runs: Sequence[Run]) -> dict[str, list[Any]]:
+    """Return the settings in which runs differ, each with the value of every run; dots lead into tables."""
+    settings = [flat(asdict(run.config)) for run in runs]
+    names = dict.fromkeys(name for of_one in settings for name in of_one)
+    values = {name: [of_one.get(name) for of_one in settings] for name in names}
+    return {name: each for name, each in values.items() if any(value != each[0] for value in each)}
+
+
+def remove_run(folder: Path) -> None:
+    """Remove a run folder for good.
+
+    Raises:
+        InputError: it is none, a process writes it, or it is a link or holds the working folder.
+    """
+    read_run(folder)
+    if folder.is_symlink() or Path.cwd().is_relative_to(folder.resolve()):
+        raise InputError(f"run: {str(folder)!r} is a link, or where you are; allowed: a run folder elsewhere")
+    with owned(folder):
+        shutil.rmtree(folder)

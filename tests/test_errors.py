@@ -1,0 +1,35 @@
+from collections.abc import Callable
+
+import pytest
+
+from unjam.drivers.registry import named_driver
+from unjam.errors import InputError
+from unjam.scenarios import make_scenario
+from unjam.training.config import load_config
+from unjam.worlds.reward import make_reward
+
+
+@pytest.mark.parametrize(
+    ("make", "meant"),
+    [
+        (lambda: make_scenario("rign-jammed"), "ring-jammed"),
+        (lambda: make_scenario("ring", {"vehicels": 3}), "vehicles"),
+        (lambda: make_scenario("ring", {"safety.time_headwy": 1}), "time_headway"),
+        (lambda: named_driver("folower-stopper", 0.1), "follower-stopper"),
+        (lambda: named_driver("pi:time_constnt=1", 0.1), "time_constant"),
+        (lambda: make_reward("relased"), "released"),
+        (lambda: load_config(preset="dmo"), "demo"),
+        (lambda: load_config(changes={"trpo.gama": 0.9}), "gamma"),
+        (lambda: load_config(changes={"scenaro": "ring"}), "scenario"),
+    ],
+)
+def test_a_name_that_is_nearly_right_is_suggested(make: Callable[[], object], meant: str) -> None:
+    with pytest.raises(InputError) as caught:
+        make()
+    assert str(caught.value).endswith(f"; did you mean {meant!r}?")
+
+
+def test_nothing_is_suggested_for_what_is_like_nothing() -> None:
+    with pytest.raises(InputError) as caught:
+        make_scenario("xyz")
+    assert "did you mean" not in str(caught.value)

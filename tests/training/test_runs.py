@@ -1,0 +1,85 @@
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+import unjam
+from unjam.errors import InputError
+from unjam.files import append_line, to_json
+from unjam.measures.metrics import METRICS
+from unjam.processes import owned
+from unjam.training.config import RunConfig, load_config
+from unjam.training.folder import start_folder
+from unjam.training.runs import differences, read_run, remove_run
+
+
+def made(folder: Path, config: RunConfig, done: int, gain: float | None = None) -> Path:
+    """A run folder that has come so far, judged with such a gain."""
+    start_folder(folder, config)
+    append_line(folder / "progress.jsonl", to_json({"iteration": 1, "actual_steps": done}))
+    if gain is not None:
+        rows = [
+            {"driver": driver, "seed": [1, seed], **dict.fromkeys(METRICS, 0.0), "return": earned + seed}
+            for driver, earned in (("pi", 100.0), ("trained", 100.0 + gain))
+            for seed in range(3)
+        ]
+        about = {"trained": "trained", "expert": "pi", "rows": rows}
+        (folder / "evaluation.json").write_text(json.dumps(about))
+    return folder
+
+
+CONFIG = load_config(changes={"steps": 1000, "preset": ""})
+
+
+@pytest.fixture
+def under(tmp_path: Path) -> Path:
+    made(tmp_path / "ring-001", CONFIG, 1000, gain=7.0)
+    made(tmp_path / "deep" / "ring-002", replace(CONFIG, seed=3, road={"cavs": 2}), 400)
+    made(tmp_path / "merge-001", replace(CONFIG, scenario="merge", expert="acc"), 0)
+    (tmp_path / "notes").mkdir()
+    (tmp_path / "notes" / "config.toml").write_text("mine = 1")
+    return tmp_path
+
+
+def test_runs_are_listed_with_how_far_they_are(under: Path) -> None:
+    with owned(under / "merge-001"):
+        found = {run.name: run for run in unjam.list_runs(under)}
+    assert {name: (run.state, run.steps) for name, run in found.items()} == {
+        "ring-001": ("finished", 1000),
+        "deep/ring-002": ("stopped", 400),
+        "merge-001": ("running", 0),
+    }
+    gain = found["ring-001"].gains[""]
+    assert gain is not None
+    assert gain.mean == pytest.approx(7.0)
+    assert found["deep/ring-002"].gains == {"": None}
+    assert [run.name for run in unjam.list_runs(under, "merge")] == ["merge-001"]
+
+
+def test_only_settings_that_differ_are_told(under: Path) -> None:
+    runs = [read_run(under / name) for name in ("ring-001", "deep/ring-002")]
+    assert differences(runs) == {"seed": [0, 3], "road.cavs": [None, 2]}
+
+
+def test_a_run_is_removed_and_nothing_else(under: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with owned(under / "ring-001"), pytest.raises(InputError, match="written by another process"):
+        remove_run(under / "ring-001")
+    for other in (under / "notes", under):
+        with pytest.raises(InputError):
+            remove_run(other)
+    (under / "link").symlink_to(under / "ring-001")
+    with pytest.raises(InputError, match="is a link"):
+        remove_run(under / "link")
+    monkeypatch.chdir(under / "ring-001")
+    with pytest.raises(InputError, match="where you are"):
+        remove_run(Path("."))
+    monkeypatch.chdir(under)
+    remove_run(under / "ring-001")
+    assert not (under / "ring-001").exists()
+    assert (under / "notes" / "config.toml").is_file()
+
+
+def test_a_folder_that_is_not_there_is_told() -> None:
+    with pytest.raises(InputError, match="allowed: one that holds run folders"):
+        unjam.list_runs("nowhere")
