@@ -11,7 +11,8 @@ from hypothesis.extra.numpy import arrays
 from numpy.typing import ArrayLike
 
 from unjam.drivers import LocalState
-from unjam.measures.metrics import METRICS, measure, speed_along_road, wave_speed
+from unjam.measures.metrics import METRICS, measure
+from unjam.measures.waves import speed_along_road, wave_speed
 from unjam.scenarios.scenario import VEHICLE_LENGTH
 from unjam.worlds.audit import Audit, Following, following
 from unjam.worlds.record import Episode, Floats, Trajectory, failed_episode, outcome_of

@@ -19,8 +19,9 @@ from unjam.controller import make_driver
 from unjam.drivers.wrappers import Impaired
 from unjam.files import make_folder, to_json, write_whole
 from unjam.manifest import manifest
-from unjam.measures.metrics import measure, wave_speed
+from unjam.measures.metrics import measure
 from unjam.measures.statistics import paired_difference
+from unjam.measures.waves import wave_speed
 from unjam.reports.figures import png_bytes, space_time
 from unjam.reports.results import read_results
 from unjam.scenarios import make_scenario
