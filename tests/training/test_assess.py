@@ -21,6 +21,8 @@ from unjam.training.assess import (
 from unjam.training.choice import PEOPLE, Option
 from unjam.worlds.workers import Workers
 
+HELD = {"horizon": 150, "actuation": "shielded", "safety": {"active": True}}
+"""on so short a road an ACC of its own gains nothing"""
 FLOW = '<flow id="f" type="car" route="along" begin="0" end="40" period="2"/>'
 
 
@@ -31,7 +33,7 @@ def file(tmp_path_factory: pytest.TempPathFactory) -> str:
 
 @pytest.fixture(scope="module")
 def asked(file: str) -> Question:
-    return question(file, [0.5], 40, 0.02, None, ["acc", "idm"], {"horizon": 150})
+    return question(file, [0.5], 40, 0.02, None, ["acc", "idm"], HELD)
 
 
 @pytest.fixture(scope="module")

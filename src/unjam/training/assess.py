@@ -27,13 +27,10 @@ from unjam.training.seeds import choosing_seeds, held_out_seeds
 from unjam.worlds.episode import can_drive
 from unjam.worlds.workers import Workers
 
-DRIVERS_OF_OPEN_ROADS = (
-    "acc",
-    "idm:time_headway=1,max_acceleration=2.5",
-    "follower-stopper",
-    "pi",
-)
+DRIVERS_OF_OPEN_ROADS = ("cruise", "acc", "follower-stopper", "pi")
 """who is tried where nobody is named: drivers that fit roads with ends"""
+WITH_OWN_ACC: dict[str, Any] = {"actuation": "cruise", "safety": {"active": False}}
+"""how CAVs are driven: their own ACC follows and makes room for who changes lanes, drivers hold it back"""
 PICTURED = 2
 """episodes of the budget that are kept for pictures"""
 NOBODY = 1e-12
@@ -105,7 +102,7 @@ def question(
         raise wrong("minutes", minutes, "> 0")
     if not 0 < precision < 1:
         raise wrong("precision", precision, "> 0, < 1")
-    road = make_scenario(file, {**(changes or {}), "cav_share": NOBODY})
+    road = make_scenario(file, {**WITH_OWN_ACC, **(changes or {}), "cav_share": NOBODY})
     made = {name: make_driver(name, road.decision_step) for name in drivers}
     for name, driver in made.items():
         if driver.native or not can_drive(driver, road):

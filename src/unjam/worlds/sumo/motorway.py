@@ -1,7 +1,6 @@
 """Traffic of a motorway with lanes and ramps: SUMO drives people, who overtake; CAVs have their own ACC."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 from math import inf
 from typing import Any
 
@@ -11,22 +10,14 @@ from unjam.drivers.local_state import LARGEST_GAP, LocalState
 from unjam.drivers.roadside import Messages
 from unjam.drivers.safety import Ahead
 from unjam.scenarios.road import MotorwayRoad
-from unjam.worlds.audit import SHORT_HEADWAY, Audit, brakings, following
-from unjam.worlds.record import Floats, Trajectory
+from unjam.worlds.record import Floats
 from unjam.worlds.sumo.files import CAV_TYPES, network_file, network_lines
-from unjam.worlds.sumo.open import Moment, OpenTraffic
-from unjam.worlds.sumo.simulation import LEAVE_TO_SUMO
+from unjam.worlds.sumo.lanes import Followed, LaneTraffic
+from unjam.worlds.sumo.open import Moment
 from unjam.worlds.world import OnProgress
 
-CUT_IN = 3.0
-"""time after a change of leader in which braking is counted apart [s]"""
-SETTLED = 5.0
-"""time behind the same leader after which headways are a car's own choice [s]"""
-PEOPLE, CAV, CAV_CUT_IN = 0, 1, 2
-"""whose braking it is"""
 
-
-class MotorwayTraffic(OpenTraffic[MotorwayRoad]):
+class MotorwayTraffic(LaneTraffic[MotorwayRoad]):
     """The actual environment of a motorway."""
 
     def start(self, controlled: bool, on_progress: OnProgress | None = None) -> None:
@@ -39,11 +30,6 @@ class MotorwayTraffic(OpenTraffic[MotorwayRoad]):
         self._factors = {entry.name: road.kinds[entry.kind].speed_factor for entry in road.entries}
         ways, step = int(self._ways.max()) + 1, scenario.decision_step
         self._messages = Messages(road.roadside, ways, road.length, step, self._noise_generator)
-        self._follows: dict[str, tuple[str, int]] = {}
-        """of each CAV: its leader, and the simulation step since when"""
-        self._step = 0
-        self._seen: list[Floats] = []
-        """of each simulation step: speed, leader's speed, gap of the CAVs that follow the same for long"""
         super().start(controlled, on_progress)
 
     def _is_cav(self, name: str) -> bool:
@@ -79,26 +65,12 @@ class MotorwayTraffic(OpenTraffic[MotorwayRoad]):
     def _everybody(self) -> tuple[Sequence[str], list[float]]:
         return self._names, self._speed.tolist()
 
-    def _watch(self) -> None:
-        super()._watch()
-        self._step += 1
-        if not self._controlled:
-            return
-        rows = np.array([self._row[name] for name in self.cavs if name in self._row], np.intp)
+    def _followed(self, names: Sequence[str]) -> list[Followed]:
+        rows = [self._row[name] for name in names]
         leaders = self._leader[rows]
-        since = np.zeros(len(rows))
-        for number, (row, leader) in enumerate(zip(rows.tolist(), leaders.tolist(), strict=True)):
-            name, ahead = self._names[row], self._names[leader] if leader >= 0 else ""
-            if self._follows.get(name, (None,))[0] != ahead:
-                self._follows[name] = ahead, self._step
-            since[number] = self._step - self._follows[name][1]
-        since *= self.scenario.simulation_step
-        first = len(self._changed) - len(self._names)
-        for row in rows[since < CUT_IN].tolist():
-            self._changed[first + row] = CAV_CUT_IN
-        long = (leaders >= 0) & (since > SETTLED)
-        rows, leaders = rows[long], leaders[long]
-        self._seen.append(np.array([self._speed[rows], self._speed[leaders], self._gap(rows, leaders)]))
+        ahead = [self._names[leader] if leader >= 0 else "" for leader in leaders.tolist()]
+        seen = self._speed[rows], self._speed[leaders], self._gap(rows, leaders)
+        return list(map(Followed, ahead, *(values.tolist() for values in seen)))
 
     def _gap(self, rows: Any, leaders: Any) -> Floats:
         """Return the gaps of vehicles to their leaders [m]."""
@@ -139,16 +111,9 @@ class MotorwayTraffic(OpenTraffic[MotorwayRoad]):
         speeds, ahead = self._speed[rows].tolist(), self._speed[leaders].tolist()
         return list(map(Ahead, speeds, ahead, gaps))
 
-    def _legal(self, speeds: dict[str, float]) -> dict[str, float]:
-        """Return wanted speeds of those who are held back; the others, and all where a lane closes, are told
-        nothing: whoever is told a speed, be it a high one, makes no room for who changes lanes.
-        """
-        legal, most = {}, self.limits.highest * self.scenario.simulation_step - 1e-9
-        for name, speed in speeds.items():
-            row = self._row[name]
-            free = speed - self._speed[row] >= most or self._lanes[row] in self._closing
-            legal[name] = LEAVE_TO_SUMO if free else speed
-        return legal
+    def _is_free(self, name: str) -> bool:
+        """Whether its lane, or one beside it, closes: there vehicles make room for each other."""
+        return self._lanes[self._row[name]] in self._closing
 
     def _lines(self) -> Floats:
         return network_lines(network_file(self.road.network))
@@ -156,15 +121,3 @@ class MotorwayTraffic(OpenTraffic[MotorwayRoad]):
     def _pictured(self, vehicles: Sequence[str]) -> dict[str, Any]:
         routes = {entry.name: entry.route for entry in self.road.entries}
         return {"branches": tuple(routes[name] for name in vehicles), "peak": self.road.peak}
-
-    def _audit(self, trajectories: Sequence[Trajectory]) -> Audit:
-        """Return the physics of every simulation step; how CAVs follow whom they have followed for long."""
-        accelerations = np.array(self._changes) / self.scenario.simulation_step
-        whose = np.frombuffer(bytes(self._changed), np.uint8)
-        people, cavs, after_cut_in = (
-            brakings(accelerations[whose == who]) for who in (PEOPLE, CAV, CAV_CUT_IN)
-        )
-        speed, ahead, gap = np.concatenate([np.zeros((3, 0)), *self._seen], axis=1)[:, None]
-        followed = following(speed, ahead, gap, self.scenario.simulation_step)
-        found = replace(followed, jerk=np.nan)  # the moments of one car are not one behind the other
-        return Audit(people, cavs, found, SHORT_HEADWAY, lanes=True, cut_in=after_cut_in)

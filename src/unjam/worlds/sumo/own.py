@@ -13,11 +13,12 @@ from unjam.drivers.local_state import LARGEST_GAP, LocalState
 from unjam.scenarios.road import OwnRoad
 from unjam.worlds.record import Episode, Floats
 from unjam.worlds.sumo.files import CAV_TYPES, edge_lengths, network_lines
-from unjam.worlds.sumo.open import Moment, OpenTraffic
+from unjam.worlds.sumo.lanes import Followed, LaneTraffic
+from unjam.worlds.sumo.open import Moment
 from unjam.worlds.world import Driven, OnProgress
 
 
-class OwnTraffic(OpenTraffic[OwnRoad]):
+class OwnTraffic(LaneTraffic[OwnRoad]):
     """The actual environment of a network of the user's own."""
 
     def start(self, controlled: bool, on_progress: OnProgress | None = None) -> None:
@@ -56,7 +57,13 @@ class OwnTraffic(OpenTraffic[OwnRoad]):
 
     def _legal(self, speeds: dict[str, float]) -> dict[str, float]:
         allowed = self._simulation.allowed_speeds(list(speeds))
-        return {name: min(speed, most) for (name, speed), most in zip(speeds.items(), allowed, strict=True)}
+        told = super()._legal(speeds).items()
+        return {name: min(speed, most) for (name, speed), most in zip(told, allowed, strict=True)}
+
+    def _followed(self, names: Sequence[str]) -> list[Followed]:
+        simulation, leaders = self._simulation, [self._simulation.leader(name, LARGEST_GAP) for name in names]
+        near = zip(simulation.speeds(names), leaders, strict=True)
+        return [Followed(leader, speed, ahead, gap) for speed, (leader, ahead, gap) in near]
 
     def _ends_with(self, colliding: Sequence[str]) -> bool:
         return any(name in self.cavs for name in colliding)

@@ -224,6 +224,13 @@ class Simulation:
             found += [self._get_speed(other) if there else speed, min(max(true_gap, 0.0), farthest)]
         return found
 
+    def leader(self, name: str, farthest: float) -> tuple[str, float, float]:
+        """Return the vehicle ahead, its speed and the gap to it [m/s, m]; no name where it is farther."""
+        leader, gap = self._sumo.vehicle.getLeader(name, farthest) or ("", farthest)
+        if not leader:
+            return "", 0.0, farthest
+        return leader, self._get_speed(leader), gap + self._sumo.vehicle.getMinGap(name)
+
     def distances(self, ids: Sequence[str]) -> list[float]:
         """Return how far each of `ids` has driven since it entered [m]."""
         return list(map(self._get_distance, ids))
