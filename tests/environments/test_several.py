@@ -55,7 +55,7 @@ def test_passes_the_seed_test_of_pettingzoo() -> None:
     parallel_seed_test(lambda: unjam.parallel_env("ring", **SHORT), num_cycles=10)
 
 
-MERGE: Any = {"horizon": 60, "penetration": 0.3}
+MERGE: Any = {"horizon": 60, "cav_share": 0.3}
 
 
 def test_the_merge_passes_the_checks_of_pettingzoo_without_warnings(
@@ -120,7 +120,7 @@ def test_time_goes_on_by_itself_until_the_first_agent_enters_and_ends_with_the_l
 
 
 def test_a_collision_terminates_everybody_who_is_there() -> None:
-    environment = unjam.parallel_env("merge", penetration=1.0, actuation="raw", standing=0)
+    environment = unjam.parallel_env("merge", cav_share=1.0, actuation="raw", standing=0)
     environment.reset(seed=0)
     terminated: dict[str, bool] = {}
     truncated: dict[str, bool] = {}

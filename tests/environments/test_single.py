@@ -19,7 +19,13 @@ from unjam.errors import InputError, MissingPartError, UnjamError
 from unjam.scenarios import make_scenario
 from unjam.worlds.episode import run_episode
 
-NAMES = {"unjam/Ring-v0": "ring", "unjam/FigureEight-v0": "figure-eight", "unjam/Merge-v0": "merge"}
+NAMES = {
+    "unjam/Ring-v0": "ring",
+    "unjam/FigureEight-v0": "figure-eight",
+    "unjam/Merge-v0": "merge",
+    "unjam/OnRamp-v0": "on-ramp",
+}
+OPEN = ("unjam/Merge-v0", "unjam/OnRamp-v0")
 SHORT: Any = {"horizon": 60}
 
 
@@ -62,7 +68,7 @@ def test_steps_the_very_episode_that_run_episode_runs(name: str, warmup: int) ->
     left_early = stay.start + decided < scenario.horizon
     assert len(rewards) == decided + left_early  # the decision in which it left is no part of its stay
     np.testing.assert_allclose(rewards[:decided], stay.reward, atol=1e-12)
-    in_order = np.sort if name == "unjam/Merge-v0" else np.array  # of entry, or along the road
+    in_order = np.sort if name in OPEN else np.array  # of entry, or along the road
     for found, recorded in zip(speeds, expected.speeds[1 + stay.start :], strict=False):
         np.testing.assert_array_equal(in_order(found), in_order(recorded[~np.isnan(recorded)]))
 
@@ -83,7 +89,7 @@ def test_actions_are_added_to_an_expert(environment: gymnasium.Env) -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_the_horizon_truncates_and_does_not_terminate(name: str) -> None:
-    horizon = 20 if name == "unjam/Merge-v0" else 60
+    horizon = 20 if name in OPEN else 60
     environment = gymnasium.make(name, horizon=horizon)
     environment.reset(seed=1)
     decided = environment.unwrapped._road.traffic.decisions  # pyright: ignore[reportAttributeAccessIssue]

@@ -139,7 +139,7 @@ def broken(content: bytes, generator: np.random.Generator) -> bytes:
 TINY = {
     "ring": ["ring", "--length", "60", "--vehicles", "5", "--set", "road.horizon=100"],
     "figure-eight": ["figure-eight", "--set", "road.horizon=100"],
-    "merge": ["merge", "--set", "road.horizon=40", "--set", "road.penetration=0.5"],
+    "merge": ["merge", "--set", "road.horizon=40", "--set", "road.cav_share=0.5"],
     "own-network": ["straight.sumocfg", "--cav-types", "car", "--set", "road.horizon=100"],
 }
 LEARNERS = ("trpo", "sac", "ppo")

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from unjam.measures.effect import LEAST_JUDGED, Effect, effect_of, harm_of, reasons_against
+from unjam.measures.effect import LEAST_JUDGED, Effect, beside_people, effect_of, harm_of, reasons_against
 from unjam.measures.statistics import Estimate
 
 USUAL: dict[str, Any] = {
@@ -17,7 +17,9 @@ USUAL: dict[str, Any] = {
     "cav_min_ttc": 1.5,
     "cav_max_braking": 5.0,
     "overridden": 0.0,
+    "mean_speed": 20.0,
     "travel_time": 100.0,
+    "delay": 40.0,
     "throughput_veh_per_h": 2000.0,
     "fuel_ml_per_km": 80.0,
     "people_beyond_4_5": 30.0,
@@ -44,7 +46,31 @@ GOOD = Effect(
     drivable="drivable",
     people_time=100.0,
     people_flow=2000.0,
+    people_delay=nan,
+    speed=NONE,
 )
+
+
+def test_words_say_what_everybody_gains() -> None:
+    known = replace(GOOD, people_delay=40.0)
+    assert known.delay_cut == Estimate(0.1, 0.05, 0.15, 20)
+    assert known.words == (
+        "travel time -4.0 [-6.0, -2.0] s (10 % less delay), flow +10 [-10, +30] veh/h, "
+        "fuel +0.0 [+0.0, +0.0] ml/km"
+    )
+    assert "delay" not in GOOD.words
+    assert "flow -20 [-30, -10] veh/h: a loss" in replace(GOOD, flow=between(-30.0, -10.0)).words
+    nowhere = Estimate(nan, nan, nan, 0)
+    closed = replace(GOOD, travel_time=nowhere, speed=between(0.1, 0.3))
+    assert closed.words.startswith("mean speed +0.20 [+0.10, +0.30] m/s, flow")
+
+
+def test_every_driver_is_seen_beside_people_who_are_there() -> None:
+    found = beside_people({"pi": rows_of([98.0, 99.0]), "human": rows_of([100.0, 100.0])})
+    assert list(found) == ["pi"]
+    assert found["pi"].travel_time.mean == -1.5
+    assert found["pi"].people_delay == 40.0
+    assert not beside_people({"pi": rows_of([98.0])})
 
 
 def test_differences_are_paired_and_only_on_seeds_that_both_have() -> None:

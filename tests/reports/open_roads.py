@@ -32,7 +32,7 @@ def shown_from(episode: Episode, driver: str) -> Shown:
 @cache
 def merge_episode(seconds: int = 100, driver: str = "pi") -> Episode:
     found = {"pi": PISaturation(), "human": Human()}[driver]
-    return run_episode(Merge(penetration=0.2, horizon=seconds), found, (1,), full=True)
+    return run_episode(Merge(cav_share=0.2, horizon=seconds), found, (1,), full=True)
 
 
 def own_episode(folder: Path, seconds: int = 60) -> Episode:

@@ -38,7 +38,7 @@ def driven(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def merged(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The report of `unjam drive merge`: vehicles come and go."""
-    road = {"horizon": 40, "penetration": 0.3}
+    road = {"horizon": 40, "cav_share": 0.3}
     folder = tmp_path_factory.mktemp("merge") / "results"
     report = unjam.drive("merge", ["human", "pi"], episodes=1, road=road, workers=1, out=folder).report
     assert report is not None

@@ -72,16 +72,16 @@ def test_nobody_stands_where_none_shall() -> None:
 
 
 @given(st.integers(0, 2**32 - 1), st.floats(0, 1))
-def test_a_share_is_drawn_for_each_vehicle_by_itself(seed: int, penetration: float) -> None:
-    count = len(cavs(drawn(seed, penetration=penetration)))
-    spread = np.sqrt(333 * penetration * (1 - penetration))
-    assert abs(count - 333 * penetration) <= 5.5 * spread + 1e-9
+def test_a_share_is_drawn_for_each_vehicle_by_itself(seed: int, cav_share: float) -> None:
+    count = len(cavs(drawn(seed, cav_share=cav_share)))
+    spread = np.sqrt(333 * cav_share * (1 - cav_share))
+    assert abs(count - 333 * cav_share) <= 5.5 * spread + 1e-9
 
 
 @pytest.mark.parametrize("spacing", ["random", "even"])
 def test_none_or_all_of_the_highways_vehicles_are_cavs(spacing: str) -> None:
-    assert cavs(drawn(penetration=0.0, spacing=spacing)) == []
-    assert cavs(drawn(penetration=1.0, spacing=spacing)) == list(range(333))
+    assert cavs(drawn(cav_share=0.0, spacing=spacing)) == []
+    assert cavs(drawn(cav_share=1.0, spacing=spacing)) == list(range(333))
 
 
 def test_even_spacing_is_each_tenth_vehicle_in_every_episode() -> None:
@@ -90,9 +90,9 @@ def test_even_spacing_is_each_tenth_vehicle_in_every_episode() -> None:
 
 
 @given(st.floats(0, 1))
-def test_even_spacing_spreads_the_share_evenly(penetration: float) -> None:
-    found = cavs(drawn(penetration=penetration, spacing="even"))
-    assert abs(len(found) - 333 * penetration) <= 1.0
+def test_even_spacing_spreads_the_share_evenly(cav_share: float) -> None:
+    found = cavs(drawn(cav_share=cav_share, spacing="even"))
+    assert abs(len(found) - 333 * cav_share) <= 1.0
     assert len(np.unique(np.diff(found))) <= 2
 
 
@@ -110,7 +110,7 @@ def test_so_many_cavs_enter_in_the_first_half_as_were_asked_for(seed: int, count
 
 
 def test_cavs_have_names_that_were_announced() -> None:
-    some: list[dict[str, Any]] = [{}, {"cavs": 5}, {"penetration": 1.0}, {"inflow": 700.0}]
+    some: list[dict[str, Any]] = [{}, {"cavs": 5}, {"cav_share": 1.0}, {"inflow": 700.0}]
     for changes in some:
         assert drawn(**changes).cav_ids <= set(Merge(**changes).possible_cavs())
 
@@ -174,8 +174,8 @@ def test_recipe_makes_the_same_scenario_again() -> None:
         ({"standing": -1}, "standing"),
         ({"cavs": 167}, "cavs: 167 is not allowed; allowed: <= 166, who enter in the first half"),
         ({"cavs": 0}, "cavs"),
-        ({"penetration": 1.1}, "penetration: 1.1"),
-        ({"penetration": -0.1}, "penetration: -0.1"),
+        ({"cav_share": 1.1}, "cav_share: 1.1"),
+        ({"cav_share": -0.1}, "cav_share: -0.1"),
         ({"inflow": 0}, "inflow: 0"),
         ({"ramp_flow": -5}, "ramp_flow: -5"),
         ({"spacing": "odd"}, "'random' or 'even'"),

@@ -79,10 +79,10 @@ WRONG: dict[str, tuple[str, list[str]]] = {
     "virtual environment of a run without one": ("has no virtual environment", ["model model-free"]),
     "report of nothing": ("has no evaluation.json", ["report full"]),
     "report of damaged results": ("damaged", ["report damaged"]),
-    "share above one": ("penetration: 2", ["drive merge --driver pi --set penetration=2"]),
+    "share above one": ("cav_share: 2", ["drive merge --driver pi --set cav_share=2"]),
     "nobody a CAV": (
         "no CAV was on the road in 5 decisions",
-        ["drive merge --driver pi --set penetration=0 --set horizon=5"],
+        ["drive merge --driver pi --set cav_share=0 --set horizon=5"],
     ),
     "share of CAVs on a road without one": (
         "cav_share: unknown name",

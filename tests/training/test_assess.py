@@ -109,7 +109,7 @@ def test_the_answer_does_not_depend_on_the_number_of_workers(
 ) -> None:
     with Workers(1) as workers:
         again = assess(asked, tmp_path / "again", workers)
-    assert again.judged == answer.judged
+    assert repr(again.judged) == repr(answer.judged)  # NaN, of what is not known, is not itself
     assert again.document["tried"] == answer.document["tried"]
 
 

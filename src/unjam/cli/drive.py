@@ -76,6 +76,7 @@ def drive(
 
       unjam drive ring -d pi -d runs/ring-001 --held-out --episodes 20
     """
+    from unjam.measures.effect import beside_people
     from unjam.scenarios import make_scenario
     from unjam.training.evaluate import drive as run
     from unjam.training.evaluate import raise_failures
@@ -89,6 +90,8 @@ def drive(
         print_json(result.document())
     elif any(row["status"] != "failed" for rows in result.rows.values() for row in rows):
         console.print(metrics_table(result.rows))
+        for label, effect in beside_people(result.rows).items():
+            console.print(f"{label} beside people alone, {effect.flow.count} paired seeds: {effect.words}")
         for note in result.notes:
             aside.print(f"note: {note}", markup=False, soft_wrap=True)
         if result.report is not None:

@@ -83,9 +83,7 @@ def scenario_changes(
     warmup: Annotated[
         int | None, typer.Option(help="All-human simulation steps before the CAVs take over.")
     ] = None,
-    cav_share: Annotated[
-        float | None, typer.Option(help="Share of CAVs among the vehicles of your own network.")
-    ] = None,
+    cav_share: Annotated[float | None, typer.Option(help="Share of CAVs, on roads with ends.")] = None,
     cav_types: Annotated[
         str | None, typer.Option(help="Vehicle types that are CAVs, on your own network: car,truck.")
     ] = None,

@@ -6,6 +6,7 @@ ARGUMENTS_OF = {
     "unjam/Ring-v0": {"scenario": "ring"},
     "unjam/FigureEight-v0": {"scenario": "figure-eight"},
     "unjam/Merge-v0": {"scenario": "merge", "cavs": 1},
+    "unjam/OnRamp-v0": {"scenario": "on-ramp", "cavs": 1},
 }
 """what each environment that Gymnasium makes by name is made of"""
 

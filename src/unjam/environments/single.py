@@ -189,7 +189,8 @@ class SteppedRoad:
 class RoadEnv(gymnasium.Env[Observations, NDArray[Any]]):
     """One CAV among people, on the actual simulator.
 
-    ``gymnasium.make("unjam/Ring-v0")``, ``"unjam/FigureEight-v0"``, ``"unjam/Merge-v0"``; every parameter of
+    ``gymnasium.make("unjam/Ring-v0")``, ``"unjam/FigureEight-v0"``, ``"unjam/Merge-v0"``,
+    ``"unjam/OnRamp-v0"``; every parameter of
     the scenario can be given: ``gymnasium.make("unjam/Ring-v0", scenario="ring-jammed", length=(230, 230))``.
 
     ===========  ===================================================================================

@@ -42,6 +42,26 @@ class Effect:
     """mean travel time of people alone on these seeds [s]"""
     people_flow: float
     """[veh/h]"""
+    people_delay: float
+    """their travel time beyond that of a free road [s]; NaN where that is not known"""
+    speed: Estimate
+    """mean speed of all vehicles [m/s]"""
+
+    @property
+    def delay_cut(self) -> Estimate:
+        """Share of people's delay that is saved; NaN where that is not known."""
+        time, whole = self.travel_time, -self.people_delay
+        return Estimate(time.mean / whole, time.high / whole, time.low / whole, time.count)
+
+    @property
+    def words(self) -> str:
+        """What everybody on the road gains, in a line: time, flow and fuel, or speed where nobody leaves."""
+        cut, time = self.delay_cut, f"travel time {signed(self.travel_time, 1)} s"
+        if cut.mean == cut.mean:
+            time += f" ({100 * cut.mean:.0f} % less delay)" if cut.mean > 0 else " (more delay)"
+        first = time if self.travel_time.count else f"mean speed {signed(self.speed, 2)} m/s"
+        lost = ": a loss, whatever the speed" if self.flow.high < 0 else ""
+        return f"{first}, flow {signed(self.flow)} veh/h{lost}, fuel {signed(self.fuel, 1)} ml/km"
 
     @property
     def width(self) -> float:
@@ -72,7 +92,16 @@ def effect_of(
         drivable=drivable_in_all([{**row, HARD: 0.0} for row in rows]),
         people_time=estimate_of(people, TIME).mean,
         people_flow=estimate_of(people, FLOW).mean,
+        people_delay=estimate_of(people, "delay").mean,
+        speed=paired_difference(rows, people, "mean_speed", confidence),
     )
+
+
+def beside_people(rows_by_driver: dict[str, list[dict[str, Any]]]) -> dict[str, Effect]:
+    """Return the effect of each driver beside people alone, where they are among the drivers."""
+    people = rows_by_driver.get("human", [])
+    others = ((label, rows) for label, rows in rows_by_driver.items() if label != "human")
+    return {label: effect_of(rows, people) for label, rows in others} if people else {}
 
 
 def harm_of(effect: Effect) -> str:

@@ -229,6 +229,11 @@ def travel_time(episode: Episode) -> float:
     return float((there + episode.waiting)[1:].sum() * episode.step / demanded) if demanded else float("nan")
 
 
+def delay(episode: Episode) -> float:
+    """Travel time beyond that of a free road, waiting included [s]; NaN where that one is not known."""
+    return travel_time(episode) - episode.free_time
+
+
 def backlog_veh(episode: Episode) -> float:
     """Vehicles that wait to enter at the end; on a closed road nobody does."""
     return float(episode.waiting[-1]) if len(episode.waiting) else 0.0
@@ -294,6 +299,7 @@ METRICS: dict[str, Metric] = {
     "fuel_ml_per_km": Metric(fuel_ml_per_km, "fuel", "ml/km", 1),
     "throughput_veh_per_h": Metric(throughput_veh_per_h, "flow", "veh/h", 0),
     "travel_time": Metric(travel_time, "travel time, waiting included", "s", 1),
+    "delay": Metric(delay, "delay, waiting included", "s", 1),
     "backlog_veh": Metric(backlog_veh, "vehicles waiting to enter", "", 0),
 }
 

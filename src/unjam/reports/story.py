@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from unjam.measures.drivable import verdicts
+from unjam.measures.effect import beside_people
 from unjam.measures.metrics import METRICS, Metric
 from unjam.measures.statistics import Estimate, digits_of, estimate_of, paired_difference, signed
 from unjam.reports.results import Results, Shown
@@ -96,7 +97,11 @@ def lead_of(result: Results) -> str:
 
 def _lead_of_drives(result: Results) -> str:
     """Return how fast all vehicles drive with each driver."""
-    scenario = result.about["scenario"]
+    scenario, effects = result.about["scenario"], beside_people(result.rows)
+    if effects:
+        count = len(result.rows["human"])
+        said = "; ".join(f"{label}: {effect.words}" for label, effect in effects.items())
+        return f"Beside people alone on {scenario}, {count} episodes with the same seeds paired: {said}."
     ratios = {label: estimate_of(rows, "speed_limit_ratio_steady") for label, rows in result.rows.items()}
     if len(ratios) > 1:
         words = ", ".join(

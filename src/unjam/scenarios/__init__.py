@@ -26,6 +26,8 @@ SCENARIOS: dict[str, Scenario] = {
     **ON_RAMPS,
 }
 
+NAMED_BEFORE = {"people": "human_control", "penetration": "cav_share"}
+"""what parameters are called now, by what they were called"""
 KINDS = {kind.title: kind for kind in (Ring, FigureEight, Merge, OnRamp, OwnNetwork)}
 """All kinds of road, by their title."""
 
@@ -52,8 +54,8 @@ def make_scenario(name: str, changes: dict[str, Any] | None = None) -> Scenario:
 
 
 def _named_as_now(values: dict[str, Any]) -> dict[str, Any]:
-    """Return parameters of a scenario by the names that they have now; older files say `people`."""
-    return {"human_control" if key == "people" else key: value for key, value in values.items()}
+    """Return parameters of a scenario by the names that they have now; older files say others."""
+    return {NAMED_BEFORE.get(key, key): value for key, value in values.items()}
 
 
 def _of_population(file: str) -> dict[str, Any]:

@@ -55,7 +55,7 @@ class Merge(Scenario):
     """vehicles that want to enter the highway [veh/h], evenly spaced in time"""
     ramp_flow: NotNegative = 100.0
     """vehicles that want to enter the ramp [veh/h]"""
-    penetration: Annotated[float, Field(ge=0, le=1)] = 0.1
+    cav_share: Annotated[float, Field(ge=0, le=1)] = 0.1
     """share of the highway's vehicles that are CAVs"""
     spacing: Literal["random", "even"] = "random"
     """where in the stream the CAVs are: `random` as the paper; `even`: each tenth vehicle, as Flow"""
@@ -135,9 +135,9 @@ class Merge(Scenario):
         if self.cavs is not None:
             return set(generator.choice(len(self._early()), self.cavs, replace=False).tolist())
         if self.spacing == "even":
-            every = np.arange(count * self.penetration) / max(self.penetration, 1e-9)
+            every = np.arange(count * self.cav_share) / max(self.cav_share, 1e-9)
             return set(every.astype(int).tolist())
-        return set(np.flatnonzero(generator.random(count) < self.penetration).tolist())
+        return set(np.flatnonzero(generator.random(count) < self.cav_share).tolist())
 
     def limit(self) -> float:
         """Return the mean speed of the highway's people where no ramp, no noise and no jam disturbs them."""
@@ -150,7 +150,7 @@ class Merge(Scenario):
 
     def facts(self) -> list[tuple[str, str]]:
         """Return the road's own facts for `unjam scenarios`."""
-        share = f"{self.cavs} CAV" if self.cavs is not None else f"{100 * self.penetration:g} % CAV"
+        share = f"{self.cavs} CAV" if self.cavs is not None else f"{100 * self.cav_share:g} % CAV"
         return [
             ("road", "highway of 700 m with a ramp"),
             ("vehicles", f"{self.inflow:g} + {self.ramp_flow:g} veh/h ({share})"),

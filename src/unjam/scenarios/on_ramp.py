@@ -32,6 +32,8 @@ RAMP_ENTRY_SPEED = 15.0
 """[m/s]"""
 RAMP_HEADWAY = 2.0
 """smallest time between two vehicles that want to enter the ramp [s]"""
+FREE_TIME = {1: 113.0, 2: 106.6}
+"""mean travel time of people alone without a peak, by lanes, of six seeds [s]"""
 KINDS = 200
 """how many different people there are"""
 APART = 60.0
@@ -71,6 +73,8 @@ class OnRamp(Scenario):
     """smallest time between two vehicles that want to enter a lane of the motorway [s]"""
     cav_share: Annotated[float, Field(ge=0, le=1)] = 0.1
     """share of all vehicles that are CAVs; a larger share contains the smaller one"""
+    cavs: Count | None = None
+    """exactly so many CAVs instead of a share, among those that want to enter in the first half"""
     following: Literal["EIDM", "IDM"] = "EIDM"
     """SUMO's model of how people follow"""
     time_headways: Interval = (1.0, 1.8)
@@ -122,11 +126,10 @@ class OnRamp(Scenario):
     def draw(self, generator: np.random.Generator) -> MotorwayRoad:
         """Return the road with who wants to enter it; random are the people, when they come, who is a CAV."""
         kinds = {f"person_{number}": self._person(generator) for number in range(KINDS)}
-        entries, chosen = list[Entry](), set[str]()
+        entries, draws = list[Entry](), dict[str, float]()
         for number, (time, route, lane, speed) in enumerate(sorted(self._arrivals(generator))):
             name, kind = f"vehicle_{number}", f"person_{generator.integers(KINDS)}"
-            if generator.random() < self.cav_share:
-                chosen.add(name)
+            draws[name] = generator.random()
             entries.append(Entry(name, route, 0.0, speed, time, lane, kind))
         return MotorwayRoad(
             network=_network(self.lanes),
@@ -134,14 +137,22 @@ class OnRamp(Scenario):
             entries=tuple(entries),
             limit_speed=MOTORWAY_SPEED,
             kinds=kinds,
-            cav_ids=frozenset(chosen),
+            cav_ids=self._chosen(draws),
             lanes=_lanes(self.lanes),
             merge=BEFORE,
             length=BEFORE + MERGING + AFTER,
             vehicle_length=self.vehicle_length,
             peak=self.peak,
+            free_time=FREE_TIME[self.lanes],
             roadside=self.roadside,
         )
+
+    def _chosen(self, draws: dict[str, float]) -> frozenset[str]:
+        """Return who is a CAV: those with the lowest draws."""
+        if self.cavs is None:
+            return frozenset(name for name, draw in draws.items() if draw < self.cav_share)
+        early = sorted(list(draws)[: len(draws) // 2], key=draws.__getitem__)
+        return frozenset(early[: self.cavs])
 
     def _person(self, generator: np.random.Generator) -> Person:
         def between(interval: tuple[float, float]) -> float:

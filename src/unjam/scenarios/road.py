@@ -210,6 +210,8 @@ class MotorwayRoad(BuiltRoad):
     """of every vehicle [m]"""
     peak: tuple[float, float]
     """from when to when the most vehicles want to enter [s]"""
+    free_time: float
+    """mean travel time of people where they are few [s]"""
     roadside: Roadside
     """what CAVs are told of the road ahead"""
 

@@ -85,8 +85,8 @@ CONDITIONS: dict[str, tuple[Condition, ...]] = {
     "merge": (
         *EVERYWHERE,
         Condition("1 s late", impaired={"delay": 1.0}),  # it decides once in a second
-        Condition("a CAV in 20", {"penetration": 0.05}),
-        Condition("a CAV in 5", {"penetration": 0.2}),
+        Condition("a CAV in 20", {"cav_share": 0.05}),
+        Condition("a CAV in 5", {"cav_share": 0.2}),
         Condition("1,800 veh/h", {"inflow": 1800}),
         Condition("200 veh/h from the ramp", {"ramp_flow": 200}),
     ),

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from unjam.measures.drivable import verdicts
+from unjam.measures.effect import Effect, beside_people
 from unjam.measures.metrics import METRICS
 from unjam.measures.statistics import Estimate, summarise
 from unjam.reports.summary import frame_of_metrics, frame_of_rows, html_of
@@ -62,6 +63,7 @@ class DriveResult:
 
     def _document(self, driver: str) -> dict[str, Any]:
         summary = self.summary(driver)
+        effect = beside_people({name: self.rows[name] for name in {driver, "human"} & set(self.rows)})
         return {
             "scenario": self.scenario,
             "driver": driver,
@@ -69,7 +71,15 @@ class DriveResult:
             "episodes": self.rows[driver],
             "mean": {name: summary[name].mean for name in METRICS},
             "interval": {name: [summary[name].low, summary[name].high] for name in METRICS},
+            "beside_people": _effect(effect[driver]) if driver in effect else None,
             "notes": self.notes,
             "folder": str(self.folder) if self.folder else None,
             "report": str(self.report) if self.report else None,
         }
+
+
+def _effect(effect: Effect) -> dict[str, Any]:
+    """Return the paired differences to people alone as JSON: mean and ends of the interval."""
+    names = ("travel_time", "delay_cut", "speed", "flow", "fuel", "hard_braking")
+    found = {name: getattr(effect, name) for name in names}
+    return {name: [each.mean, each.low, each.high] for name, each in found.items()}

@@ -155,6 +155,8 @@ class Episode:
     """vehicles that left at the end of their route"""
     peak: tuple[float, float] = (0.0, 0.0)
     """from when to when the most vehicles want to enter [s]; (0, 0) where there is no peak"""
+    free_time: float = float("nan")
+    """mean travel time where nobody disturbs anybody [s]; NaN where it is not known"""
     waiting: Floats = field(default_factory=lambda: np.zeros(0))
     """vehicles that wanted to enter and could not, at each moment, shape (T + 1,); (0,) of a closed road"""
     lines: Floats = field(default_factory=lambda: np.zeros((0, 2)))

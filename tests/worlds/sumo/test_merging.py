@@ -100,7 +100,7 @@ def leader_of(places: dict[str, float], name: str, traffic: MergingTraffic) -> s
 def test_people_are_asked_for_the_speeds_of_the_idm_and_on_the_junction_left_to_sumo(
     simulation: Simulation, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    traffic = merging(Merge(noise=0.0, penetration=0.0), simulation)
+    traffic = merging(Merge(noise=0.0, cav_share=0.0), simulation)
     found = Commands(traffic, simulation, monkeypatch, 400)
     _, asked, wanted = np.array(found.off).T
     assert len(asked) > 5000
@@ -115,7 +115,7 @@ def test_people_are_asked_for_the_speeds_of_the_idm_and_on_the_junction_left_to_
 def test_their_noise_is_normal_and_as_large_as_was_asked_for(
     simulation: Simulation, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    traffic = merging(Merge(penetration=0.0, standing=0), simulation)
+    traffic = merging(Merge(cav_share=0.0, standing=0), simulation)
     found = Commands(traffic, simulation, monkeypatch, 400)
     speed, asked, wanted = np.array(found.off).T
     noise = ((asked - wanted) / STEP)[speed > 3.0]
@@ -127,7 +127,7 @@ def test_their_noise_is_normal_and_as_large_as_was_asked_for(
 
 def test_people_obey_the_right_of_way_only_where_they_shall(simulation: Simulation) -> None:
     for right_of_way, mode in ((False, 1), (True, 25)):
-        traffic = merging(Merge(right_of_way=right_of_way, penetration=0.3), simulation)
+        traffic = merging(Merge(right_of_way=right_of_way, cav_share=0.3), simulation)
         for _ in range(20):
             traffic.advance(Command(np.zeros(len(traffic.cavs))))
         modes = {
@@ -237,7 +237,7 @@ def test_from_an_empty_start_people_flow_freely(human: list[Episode]) -> None:
 
 def test_nobody_collides_whoever_drives() -> None:
     for driver in (Constant(1.0), Constant(-0.1)):
-        episodes_of(driver, range(2), horizon=200, penetration=0.3)
+        episodes_of(driver, range(2), horizon=200, cav_share=0.3)
 
 
 @pytest.mark.slow

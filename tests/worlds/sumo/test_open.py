@@ -20,7 +20,7 @@ from unjam.worlds.sumo import make_traffic
 from unjam.worlds.sumo.simulation import Simulation
 from unjam.worlds.workers import EpisodeTask, Workers
 
-MERGE = Merge(penetration=0.3, horizon=120)
+MERGE = Merge(cav_share=0.3, horizon=120)
 
 
 class Counting(Driver):
@@ -116,7 +116,7 @@ def test_the_same_seed_gives_the_same_bytes_in_process_and_in_workers(simulation
     tasks = [
         EpisodeTask(MERGE, residual, (2,), explore=True),
         EpisodeTask(replace(MERGE, warmup=100), Counting(), (5, 1)),
-        EpisodeTask(replace(MERGE, penetration=0.0), Human(), (2,)),
+        EpisodeTask(replace(MERGE, cav_share=0.0), Human(), (2,)),
     ]
     with Workers(2) as workers:
         found = [fingerprint(episode) for episode in workers.run([*tasks[:1], *tasks[2:]])]
@@ -213,7 +213,7 @@ def test_time_goes_on_while_no_cav_is_on_the_road(driver: Driver, simulation: Si
 
 
 def test_where_no_cav_ever_comes_one_line_says_so(simulation: Simulation) -> None:
-    empty = Merge(penetration=0.0, horizon=10)
+    empty = Merge(cav_share=0.0, horizon=10)
     with pytest.raises(InputError, match="no CAV was on the road in 10 decisions"):
         run_episode(empty, Constant(), (0,), simulation=simulation)
     assert run_episode(empty, Human(), (0,), simulation=simulation).trajectories == ()
@@ -230,7 +230,7 @@ def test_a_warmup_hands_over_the_cavs_that_are_on_the_road(simulation: Simulatio
 
 
 def test_a_collision_terminates_the_stays_that_it_ends_and_no_earlier_ones(simulation: Simulation) -> None:
-    reckless = Merge(penetration=0.5, actuation="raw", standing=0)
+    reckless = Merge(cav_share=0.5, actuation="raw", standing=0)
     episode = run_episode(reckless, Constant(1.0), (1,), simulation=simulation)
     assert (episode.status, episode.collisions >= 2) == ("collision", True)
     assert episode.steps < 600
@@ -262,7 +262,7 @@ def test_rows_of_those_who_stay_follow_who_leaves_and_enters(simulation: Simulat
     ],
 )
 def test_a_wrong_answer_is_refused_with_its_step(answer: Any, words: str, simulation: Simulation) -> None:
-    everyone = Merge(penetration=1.0, standing=0, horizon=20)
+    everyone = Merge(cav_share=1.0, standing=0, horizon=20)
     with pytest.raises(InputError, match=f"driver: step \\d+: {words}"):
         run_episode(everyone, FunctionDriver(answer), (0,), simulation=simulation)
 

@@ -194,7 +194,7 @@ def test_leaders_on_the_same_lane_are_those_of_sumo(simulation: Simulation) -> N
 
 
 def merging(simulation: Simulation) -> MergingTraffic:
-    traffic = make_traffic(Merge(penetration=0.3), (3,), simulation)
+    traffic = make_traffic(Merge(cav_share=0.3), (3,), simulation)
     assert isinstance(traffic, MergingTraffic)
     traffic.start(controlled=True)
     return traffic

@@ -120,4 +120,5 @@ class MotorwayTraffic(LaneTraffic[MotorwayRoad]):
 
     def _pictured(self, vehicles: Sequence[str]) -> dict[str, Any]:
         routes = {entry.name: entry.route for entry in self.road.entries}
-        return {"branches": tuple(routes[name] for name in vehicles), "peak": self.road.peak}
+        road, branches = self.road, tuple(routes[name] for name in vehicles)
+        return {"branches": branches, "peak": road.peak, "free_time": road.free_time}
