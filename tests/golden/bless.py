@@ -11,7 +11,7 @@ ROOT = Path(__file__).parents[2]
 sys.path.insert(0, str(ROOT))
 
 from tests.golden.trajectories import drive_all, fingerprint, folder, hash_of, table_of  # noqa: E402
-from unjam.worlds.sumo.files import sumo_version  # noqa: E402
+from unjam.worlds.sumo.networks import sumo_version  # noqa: E402
 
 HEADING = "## Unreleased\n\n"
 

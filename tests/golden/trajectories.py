@@ -17,7 +17,7 @@ from unjam.scenarios import make_scenario
 from unjam.scenarios.scenario import Scenario
 from unjam.worlds.episode import run_episode
 from unjam.worlds.record import Episode
-from unjam.worlds.sumo.files import sumo_version
+from unjam.worlds.sumo.networks import sumo_version
 from unjam.worlds.sumo.simulation import Simulation
 
 ROADS = {

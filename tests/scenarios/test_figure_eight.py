@@ -8,7 +8,7 @@ from unjam.errors import InputError
 from unjam.scenarios import SCENARIOS, FigureEight, make_scenario, scenario_from_recipe, scenario_recipe
 from unjam.scenarios.figure_eight import loop_length
 from unjam.scenarios.road import ClosedRoad
-from unjam.worlds.sumo.files import network_file
+from unjam.worlds.sumo.networks import network_file
 
 ORDER = ["bottom", "top", "upper_ring", "right", "left", "lower_ring"]
 

@@ -11,7 +11,8 @@ from unjam.errors import InputError
 from unjam.scenarios import Merge, make_scenario, scenario_from_recipe, scenario_recipe
 from unjam.scenarios.merge import ENTRANCE_WAY, JUNCTION_WAYS
 from unjam.scenarios.road import MergingRoad
-from unjam.worlds.sumo.files import files_of, network_file
+from unjam.worlds.sumo.files import files_of
+from unjam.worlds.sumo.networks import network_file
 
 
 def drawn(seed: int = 0, **changes: Any) -> MergingRoad:

@@ -21,7 +21,7 @@ from unjam.drivers.local_state import LARGEST_GAP
 from unjam.drivers.registry import named_driver
 from unjam.drivers.safety import SafetyFilter
 from unjam.drivers.wrappers import Filtered
-from unjam.worlds.sumo.files import sumo_program
+from unjam.worlds.sumo.networks import sumo_program
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 

@@ -59,7 +59,7 @@ class Check:
 
 def check_health() -> list[Check]:
     """Return all checks, the costliest last: an episode in a worker process."""
-    from unjam.worlds.sumo.files import sumo_program
+    from unjam.worlds.sumo.networks import sumo_program
 
     python, sumo = platform.python_version(), f"pip install eclipse-sumo=={RESULTS_SUMO}"
     display = has_display()
@@ -109,7 +109,7 @@ def _try(name: str, run: Callable[[], str], remedy: str) -> Check:
 
 
 def _cache() -> Check:
-    from unjam.worlds.sumo.files import cache_folder
+    from unjam.worlds.sumo.cache import cache_folder
 
     folder = cache_folder()
     try:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import sumo
 
-from unjam.worlds.sumo.files import sumo_program
+from unjam.worlds.sumo.networks import sumo_program
 
 GAME = Path(sumo.SUMO_HOME) / "tools" / "game"
 

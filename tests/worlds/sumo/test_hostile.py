@@ -19,7 +19,7 @@ from unjam.scenarios.own_network import _tell_dropped
 from unjam.sumo_files import read_sumo_files
 from unjam.sumo_files.options import PASSED, is_passed
 from unjam.worlds.episode import run_episode
-from unjam.worlds.sumo.files import sumo_program
+from unjam.worlds.sumo.networks import sumo_program
 from unjam.worlds.sumo.simulation import Simulation
 from unjam.worlds.workers import EpisodeTask, Workers
 

@@ -18,8 +18,9 @@ from unjam.errors import DiskError, EpisodeError, MissingPartError
 from unjam.scenarios import Ring
 from unjam.scenarios.road import RoadNetwork
 from unjam.worlds.sumo import cache as cache_module
-from unjam.worlds.sumo import files
-from unjam.worlds.sumo.files import cache_folder, network_file, sumo_program
+from unjam.worlds.sumo import networks
+from unjam.worlds.sumo.cache import cache_folder
+from unjam.worlds.sumo.networks import network_file, sumo_program
 
 
 def road_of(length: int) -> RoadNetwork:
@@ -85,7 +86,7 @@ def test_whatever_changes_the_network_makes_another_file(
     plain = tuple(node._replace(priority=False) for node in road.nodes)
     changed = (road, other, replace(road, speed=20.0), replace(road, nodes=plain), replace(road, links=True))
     made = [network_file(each) for each in changed]
-    monkeypatch.setattr(files, "sumo_version", lambda: "9.99.0")
+    monkeypatch.setattr(networks, "sumo_version", lambda: "9.99.0")
     made.append(network_file(road))
     assert len(set(made)) == 6
     assert edges_of(made[0]) != edges_of(made[1])
@@ -139,7 +140,7 @@ def test_processes_that_make_the_same_network_at_once_get_one_whole_file(cache: 
     code = (
         "import sys, numpy as np\n"
         "from unjam.scenarios import Ring\n"
-        "from unjam.worlds.sumo.files import network_file\n"
+        "from unjam.worlds.sumo.networks import network_file\n"
         "road = Ring(length=(260, 260)).draw(np.random.default_rng(0)).network\n"
         "print('ready', flush=True)\n"
         "sys.stdin.readline()\n"

@@ -14,7 +14,8 @@ from unjam.scenarios import Ring, make_scenario
 from unjam.scenarios.road import Connection
 from unjam.worlds.episode import run_episode
 from unjam.worlds.sumo import make_traffic
-from unjam.worlds.sumo.files import Files, files_of, network_file
+from unjam.worlds.sumo.files import Files, files_of
+from unjam.worlds.sumo.networks import network_file
 from unjam.worlds.sumo.simulation import Backend, Simulation
 
 RING = Ring(horizon=100, length=(230, 230))

@@ -21,7 +21,7 @@ from unjam.scenarios.population import as_calibrated
 from unjam.scenarios.road import MergingRoad, Origin
 from unjam.scenarios.scenario import VEHICLE_LENGTH
 from unjam.worlds.record import Episode, Floats
-from unjam.worlds.sumo.files import network_file, network_lines
+from unjam.worlds.sumo.networks import network_file, network_lines
 from unjam.worlds.sumo.open import Moment, OpenTraffic
 from unjam.worlds.sumo.simulation import LEAVE_TO_SUMO
 from unjam.worlds.world import Driven, OnProgress

@@ -11,8 +11,9 @@ from unjam.drivers.roadside import Messages
 from unjam.drivers.safety import Ahead
 from unjam.scenarios.road import MotorwayRoad
 from unjam.worlds.record import Floats
-from unjam.worlds.sumo.files import CAV_TYPES, network_file, network_lines
+from unjam.worlds.sumo.files import CAV_TYPES
 from unjam.worlds.sumo.lanes import Followed, LaneTraffic
+from unjam.worlds.sumo.networks import network_file, network_lines
 from unjam.worlds.sumo.open import Moment
 from unjam.worlds.world import OnProgress
 

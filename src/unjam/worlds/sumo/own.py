@@ -12,8 +12,9 @@ import numpy as np
 from unjam.drivers.local_state import LARGEST_GAP, LocalState
 from unjam.scenarios.road import OwnRoad
 from unjam.worlds.record import Episode, Floats
-from unjam.worlds.sumo.files import CAV_TYPES, edge_lengths, network_lines
+from unjam.worlds.sumo.files import CAV_TYPES
 from unjam.worlds.sumo.lanes import Followed, LaneTraffic
+from unjam.worlds.sumo.networks import edge_lengths, network_lines
 from unjam.worlds.sumo.open import Moment
 from unjam.worlds.world import Driven, OnProgress
 

@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 from unjam.errors import EpisodeError, MissingPartError, UnjamError
 from unjam.scenarios.scenario import Actuation
 from unjam.sumo_files import copy_harmless, stamp_of
-from unjam.worlds.sumo.files import Files, sumo_program, sumo_words
+from unjam.worlds.sumo.files import Files
+from unjam.worlds.sumo.networks import sumo_program, sumo_words
 
 Backend = Literal["libsumo", "traci", "gui"]
 """`libsumo`: in this process; `traci`: SUMO as a child process; `gui`: the same, with its window."""

@@ -1,0 +1,19 @@
+#!/usr/bin/env bash
+# Measures what docs/on-ramp.md says, on seeds that chose nothing. Each JSON file here is the evaluation.json of one
+# `unjam drive`, its manifest included. Twenty minutes on two cores.
+set -eu
+cd "$(dirname "$0")/../.."
+runs=runs/on-ramp
+rm -rf "$runs"
+drive() {
+    local name=$1 road=$2
+    shift 2
+    unjam drive "$road" --held-out --episodes 20 --out "$runs/$name" "$@" >/dev/null
+    cp "$runs/$name/evaluation.json" "results/on-ramp/$name.json"
+}
+for share in 05 10 20; do
+    people=""
+    [ $share = 10 ] && people="-d human"
+    # shellcheck disable=SC2086
+    drive "share-$share" on-ramp --cav-share "0.$share" $people -d cruise -d jam-ahead -d unjam:on-ramp-tuned
+done

@@ -1,0 +1,160 @@
+"""Networks as SUMO reads them, made once for each content, and what is known of SUMO's programs."""
+
+import errno
+import hashlib
+import os
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Iterable
+from contextlib import suppress
+from functools import cache
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+from xml.sax.saxutils import quoteattr
+
+import numpy as np
+
+from unjam.errors import DISK_ERRNOS, EpisodeError, MissingPartError, disk_error
+from unjam.scenarios.road import Connection, Edge, Node, RoadNetwork
+from unjam.sumo_files import read_lanes
+from unjam.worlds.record import Floats
+from unjam.worlds.sumo.cache import cache_folder, is_as_made, seal
+
+Attributes = dict[str, Any]
+"""of an XML element"""
+
+
+@cache
+def sumo_program(name: str) -> str:
+    """Return the path of one of SUMO's programs: the installed package's, else the one on the PATH.
+
+    Raises:
+        MissingPartError: neither has it.
+    """
+    with suppress(ImportError, AttributeError):
+        import sumo
+
+        bundled = Path(sumo.SUMO_HOME) / "bin" / name
+        if bundled.exists():
+            return str(bundled)
+    found = shutil.which(name)
+    if found is None:
+        raise MissingPartError(f"SUMO's {name} is not there; install it: pip install eclipse-sumo==1.28.0")
+    return found
+
+
+@cache
+def sumo_version() -> str:
+    """Return the installed version of libsumo; `MissingPartError` where there is none."""
+    try:
+        return version("libsumo")
+    except PackageNotFoundError:
+        raise MissingPartError("libsumo is not installed; install it: pip install libsumo==1.28.0") from None
+
+
+def sumo_words(lines: Iterable[str]) -> str:
+    """Return what one of SUMO's programs says of an error, as one line."""
+    return "; ".join(said for line in lines if (said := line.strip()) and said != "Quitting (on error).")
+
+
+def network_file(network: RoadNetwork) -> Path:
+    """Return SUMO's network file, made with netconvert if this content was never made before, or is damaged.
+
+    Raises:
+        MissingPartError: netconvert is missing.
+        DiskError: the cache cannot be written.
+    """
+    edges = (_edge(edge, network.speed) for edge in network.edges)
+    files = {
+        ("--node-files", "road.nod.xml"): document("nodes", "node", map(_node, network.nodes)),
+        ("--edge-files", "road.edg.xml"): document("edges", "edge", edges),
+    }
+    if network.connections:
+        pairs = map(_connection, network.connections)
+        files["--connection-files", "road.con.xml"] = document("connections", "connection", pairs)
+    options = ["--no-turnarounds", "true", *([] if network.links else ["--no-internal-links", "true"])]
+    content = "\n".join([sumo_version(), *options, *files.values()])
+    name = hashlib.sha256(content.encode()).hexdigest()[:24]
+    target = cache_folder() / "networks" / f"{name}.net.xml"
+    if is_as_made(target):
+        return target
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=target.parent) as folder:
+            made = _netconvert(files, options, Path(folder))
+            with made.open("ab") as file:
+                file.write(seal(made.read_bytes()))
+                file.flush()
+                os.fsync(file.fileno())
+            os.replace(made, target)  # whole or not at all, also with several workers at it
+    except OSError as error:
+        if error.errno in DISK_ERRNOS:
+            raise disk_error(error, target.parent) from None
+        raise
+    return target
+
+
+@cache
+def network_lines(path: Path) -> Floats:
+    """Return the centre lines of all lanes: rows (x, y) [m], a row of NaN between two lines."""
+    rows: list[tuple[float, float]] = []
+    for _, _, points in read_lanes(path):
+        rows += [*points, (float("nan"), float("nan"))]
+    return np.array(rows, np.float64).reshape(-1, 2)
+
+
+@cache
+def edge_lengths(path: Path) -> dict[str, float]:
+    """Return the length of each edge [m]."""
+    return {edge: length for edge, length, _ in read_lanes(path)}
+
+
+def _node(node: Node) -> Attributes:
+    kind = "priority" if node.priority else None
+    return {"id": node.name, "x": f"{node.x:.6f}", "y": f"{node.y:.6f}", "type": kind, "radius": node.radius}
+
+
+def _connection(connection: Connection) -> Attributes:
+    ends = {"from": connection.before, "to": connection.after}
+    return {**ends, "fromLane": connection.lane, "toLane": connection.lane_after}
+
+
+def _edge(edge: Edge, speed: float) -> Attributes:
+    ends = {"id": edge.name, "from": edge.begin, "to": edge.end}
+    shape = " ".join(f"{x:.6f},{y:.6f}" for x, y in edge.shape) or None
+    lane = {"numLanes": edge.lanes, "speed": edge.speed or speed, "length": repr(edge.length)}
+    return {**ends, **lane, "priority": edge.priority, "shape": shape}
+
+
+def document(root: str, tag: str, elements: Iterable[Attributes]) -> str:
+    """Return an XML document of elements of one kind."""
+    return "\n".join([f"<{root}>", *(element(tag, **each) for each in elements), f"</{root}>"])
+
+
+def element(tag: str, /, **attributes: Any) -> str:
+    """Return an XML element without content, and without the attributes that are None."""
+    pairs = [f"{key}={quoteattr(str(value))}" for key, value in attributes.items() if value is not None]
+    return f"<{tag} {' '.join(pairs)}/>"
+
+
+def _netconvert(files: dict[tuple[str, str], str], options: list[str], folder: Path) -> Path:
+    made = folder / "road.net.xml"
+    for (_, name), content in files.items():
+        (folder / name).write_text(content)
+    command = [
+        sumo_program("netconvert"),
+        *(f"{option}={folder / name}" for option, name in files),
+        f"--output-file={made}",
+        "--offset.disable-normalization=true",
+        "--precision=6",
+        *options,
+    ]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode == 0 and made.exists():
+        if made.read_bytes().rstrip().endswith(b"</net>"):
+            return made
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))  # of which netconvert itself says nothing
+    words = sumo_words((done.stderr or done.stdout).splitlines())
+    raise EpisodeError(f"netconvert cannot make the road: {words}")
