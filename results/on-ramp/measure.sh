@@ -12,8 +12,8 @@ drive() {
     cp "$runs/$name/evaluation.json" "results/on-ramp/$name.json"
 }
 for share in 05 10 20; do
-    people=""
-    [ $share = 10 ] && people="-d human"
+    people="" # they are the same at every share
+    [ $share = 10 ] && people="-d human -d cruise"
     # shellcheck disable=SC2086
-    drive "share-$share" on-ramp --cav-share "0.$share" $people -d cruise -d jam-ahead -d unjam:on-ramp-tuned
+    drive "share-$share" on-ramp --cav-share "0.$share" $people -d jam-ahead -d unjam:on-ramp-tuned
 done

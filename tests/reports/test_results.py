@@ -10,8 +10,17 @@ import unjam
 from unjam.drivers import Human, PISaturation
 from unjam.errors import InputError
 from unjam.measures.metrics import METRICS
-from unjam.reports.results import Results, command_to_repeat, read_progress, read_results
-from unjam.scenarios import Ring
+from unjam.reports.results import (
+    PICTURED,
+    Results,
+    command_to_repeat,
+    packed,
+    read_progress,
+    read_results,
+    shown_of,
+    unpacked,
+)
+from unjam.scenarios import Ring, make_scenario
 from unjam.training.evaluate import DriveResult
 from unjam.worlds.episode import run_episode
 
@@ -145,3 +154,17 @@ def test_plain_words_of_the_command_are_left_as_they_are() -> None:
     command = ["unjam", "train", "ring", "--out", "runs/ring-001", "--set", "trpo.gamma=0.99"]
     assert command_to_repeat(results_made_by(*command)) == " ".join(command)
     assert command_to_repeat(results_made_by()) == ""
+
+
+def test_where_vehicles_come_and_go_the_gaps_are_not_stored() -> None:
+    merge = run_episode(make_scenario("merge", {"horizon": 40}), Human(), (0,), full=True)
+    shown = shown_of("human", merge)
+    small = packed(shown)
+    there = ~np.isnan(merge.speeds)
+    assert small["speeds"].shape == (there.sum(),)
+    assert small["places"].shape == (there.sum(), 3)
+    whole = unpacked(dict(small))
+    for name in PICTURED:
+        np.testing.assert_array_equal(whole[name], getattr(shown, name).astype(np.float32))
+    ring = shown_of("human", run_episode(make_scenario("ring", {"horizon": 5}), Human(), (0,)))
+    assert "there" not in packed(ring)

@@ -32,6 +32,8 @@ from unjam.reports.story import cards_of, columns_of, lead_of, names_of, notes_o
 from unjam.scenarios.scenario import VEHICLE_LENGTH
 
 MOST_PANELS = 6
+MOST_FRAMES = 600
+"""of a replay: between two, vehicles go straight on"""
 REPLAY_SECONDS = 0.5
 """time between two frames of the replay [s]"""
 
@@ -131,8 +133,9 @@ def replay_data(panels: Sequence[Shown]) -> dict[str, Any]:
     """Return what the page's replay needs: positions and speeds at a few frames a second."""
     if not panels:
         return {"drivers": []}
-    step = max(REPLAY_SECONDS, *(episode.step for episode in panels))
-    frames = 1 + int(max(episode.times[-1] for episode in panels) / step + 1e-9)
+    longest = max(episode.times[-1] for episode in panels)
+    step = max(REPLAY_SECONDS, longest / MOST_FRAMES, *(episode.step for episode in panels))
+    frames = 1 + int(longest / step + 1e-9)
     return {
         "step": step,
         "frames": frames,

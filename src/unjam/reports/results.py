@@ -24,6 +24,9 @@ MODEL_FILE = "model.json"
 """what there is to see of a run's virtual environment"""
 PICTURED = ("speeds", "positions", "gaps", "outline", "waiting", "lines", "places")
 """arrays of an episode that pictures are made of"""
+BY_VEHICLE = ("speeds", "positions", "gaps", "places")
+"""those with a row per moment and a column per vehicle"""
+STORED = (*PICTURED, "there")
 ABOUT_SHOWN = (
     *("step", "seed", "drawn", "loop_length", "crossings", "branches", "limit_speed"),
     *("vehicle_ids", "cav_ids"),
@@ -78,6 +81,33 @@ def shown_of(driver: str, episode: Episode) -> Shown:
     return Shown(driver, **{name: getattr(episode, name) for name in names})
 
 
+def packed(shown: Shown) -> dict[str, Floats]:
+    """Return the arrays of pictures in single precision, where vehicles come and go without the gaps.
+
+    On a road with ends each vehicle is there for a few of all moments: `there` says when, and the arrays
+    that have a row per moment and a column per vehicle keep those entries alone.
+    """
+    arrays = {name: getattr(shown, name).astype(np.float32) for name in PICTURED}
+    there = ~np.isnan(shown.speeds)
+    if there.all():
+        return arrays
+    kept = {name: array[there] for name, array in arrays.items() if array.shape[:2] == there.shape}
+    return {**arrays, **kept, "there": there}
+
+
+def unpacked(arrays: dict[str, Any]) -> dict[str, Any]:
+    """Return the arrays of pictures that `packed` took apart, or older ones as they are."""
+    there = arrays.pop("there", None)
+    if there is None:
+        return arrays
+    whole = {}
+    for name, array in arrays.items():
+        if len(array) == there.sum() and name in BY_VEHICLE:
+            whole[name] = np.full((*there.shape, *array.shape[1:]), np.nan, np.float32)
+            whole[name][there] = array
+    return {**arrays, **whole}
+
+
 @dataclass(frozen=True)
 class Results:
     """The content of a run folder, or of one that `unjam drive` wrote."""
@@ -117,7 +147,9 @@ def read_results(folder: Path) -> Results:
         rows, shown = rows_by_driver(about.pop("rows")), {}
         for number, entry in enumerate(about.pop("shown")):
             entry.pop("seed", None)
-            pictured: dict[str, Any] = {name: arrays[f"{number}.{name}"] for name in PICTURED}
+            pictured = unpacked(
+                {name: arrays[key] for name in STORED if (key := f"{number}.{name}") in arrays}
+            )
             shown[entry["driver"]] = Shown(**_with_nan(entry), **pictured)
         config = _text(folder / "config.toml")
         return Results(folder, about, rows, shown, read_progress(folder), config, read_model(folder))

@@ -10,7 +10,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from safetensors.numpy import save
 
 from unjam.controller import make_driver
@@ -23,7 +22,7 @@ from unjam.manifest import manifest
 from unjam.measures.metrics import measure
 from unjam.measures.statistics import summarise
 from unjam.reports.html import write_report
-from unjam.reports.results import ABOUT_SHOWN, PICTURED
+from unjam.reports.results import ABOUT_SHOWN, packed, shown_of
 from unjam.reports.summary import frame_of_rows
 from unjam.scenarios import make_scenario
 from unjam.scenarios.scenario import Scenario
@@ -166,9 +165,9 @@ def save_evaluation(folder: Path, evaluation: Evaluation, about: dict[str, Any])
     make_folder(folder)
     rows = [{"driver": label, **row} for label, found in evaluation.rows.items() for row in found]
     arrays = {
-        f"{number}.{name}": getattr(episode, name).astype(np.float32)
+        f"{number}.{name}": array
         for number, episode in enumerate(evaluation.shown.values())
-        for name in PICTURED
+        for name, array in packed(shown_of("", episode)).items()
     }
     about_shown = [
         {"driver": label, **{name: getattr(episode, name) for name in ABOUT_SHOWN}}

@@ -81,7 +81,8 @@ class MotorwayTraffic(LaneTraffic[MotorwayRoad]):
         self._messages.measure(self._way, self._place, self._speed, self.road.limit_speed)
         ahead = self._leader
         gaps = np.where(ahead >= 0, self._gap(np.arange(len(ahead)), ahead), np.nan)
-        return Moment(self._names, self._speed.tolist(), self._place.tolist(), gaps.tolist())
+        places = self._place - self.road.merge  # as on the merge: zero where the ways meet
+        return Moment(self._names, self._speed.tolist(), places.tolist(), gaps.tolist())
 
     def _states(self, names: Sequence[str]) -> LocalState:
         rows = np.array([self._row[name] for name in names], np.intp)
