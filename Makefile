@@ -1,4 +1,4 @@
-# make demo   sets everything up and trains a residual on the ring: ends with the path of a report
+# make demo   sets everything up, trains a residual on the ring, and drives a motorway beside people alone
 # make test   the tests that take minutes; make test-all adds the slow ones
 # make check  lint, format, types; make docs builds the site; make bench measures speed
 #
@@ -15,6 +15,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet -c const
 
 demo: $(VENV)/.installed
 	$(BIN)/unjam train ring --preset demo
+	$(BIN)/unjam drive on-ramp -d human -d unjam:on-ramp-tuned --episodes 4
 
 # The tests of a file share what they have made
 SPREAD := -n 2 --dist loadfile --no-loadscope-reorder
