@@ -98,7 +98,7 @@ class MotorwayTraffic(LaneTraffic[MotorwayRoad]):
             leader_gap=np.where(near, ahead, LARGEST_GAP),
             follower_speed=np.where(close, self._speed[follower], speed),
             follower_gap=np.where(close, behind, LARGEST_GAP),
-            route_position=place,
+            route_position=place - self.road.merge,
             loop_length=np.full(len(rows), np.nan),
             allowed_speed=self._allowed[[self._lanes[row] for row in rows]] * factors,
             to_merge=self.road.merge - place,
