@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # Measures what docs/on-ramp.md says, on seeds that chose nothing. Each JSON file here is the evaluation.json of one
-# `unjam drive`, its manifest included. Twenty minutes on two cores.
+# `unjam drive`, its manifest included. Half an hour on two cores.
 set -eu
 cd "$(dirname "$0")/../.."
 runs=runs/on-ramp
@@ -17,3 +17,9 @@ for share in 05 10 20; do
     # shellcheck disable=SC2086
     drive "share-$share" on-ramp --cav-share "0.$share" $people -d jam-ahead -d unjam:on-ramp-tuned
 done
+# the same driver, untouched, elsewhere
+drive one-lane on-ramp-1 -d human -d jam-ahead
+drive late-message on-ramp -d jam-ahead --set roadside.smoothing=60 --set roadside.age=10
+drive other-people on-ramp -d human -d jam-ahead --set following=IDM --set time_headways=[1.4,2.0] \
+    --set accelerations=[1.8,2.8] --set decelerations=[2.5,3.5] --set gaps=[2.5,3.2] --set inflow=3600
+drive no-jam on-ramp -d human -d jam-ahead --set inflow=1800 --set ramp_flow=250
