@@ -5,6 +5,7 @@ A controller needs the one that its residual is added to.
 
 import math
 from collections import deque
+from collections.abc import Sequence
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
@@ -19,6 +20,10 @@ class State(NamedTuple):
     follower_gap: float
     route_position: float = math.nan
     loop_length: float = math.nan
+    allowed_speed: float = math.nan
+    to_merge: float = math.nan
+    lane_speeds: Sequence[float] = ()
+    road_speeds: Sequence[float] = ()
 
 
 def clip(value: float, low: float, high: float) -> float:
@@ -124,9 +129,22 @@ def jam_absorber(p: Any, s: State, m: Any) -> float:
     return min(p.crawling_speed - s.speed, follow) if m.features[0] else follow
 
 
+def cruise(p: Any, s: State, m: Any) -> float:
+    return 100.0
+
+
+def jam_ahead(p: Any, s: State, m: Any) -> float:
+    told = (s.road_speeds if p.all_lanes else s.lane_speeds)[p.first : p.last + 1]
+    if not told or not s.to_merge > 0.0:
+        return cruise(p, s, m)
+    cap = min(max(sum(told) / len(told) + p.margin, p.lowest), s.allowed_speed)
+    return max((cap - s.speed) / p.time_constant, -p.slowing)
+
+
 def constant(p: Any, s: State, m: Any) -> float:
     return p.acceleration
 
 
 EXPERTS = {"idm": idm, "pi": pi, "follower-stopper": follower_stopper, "acc": acc, "lacc": acc, "bcm": bcm}
 EXPERTS |= {"ovm": ovm, "pacer": pacer, "jam-absorber": jam_absorber, "constant": constant}
+EXPERTS |= {"cruise": cruise, "jam-ahead": jam_ahead}

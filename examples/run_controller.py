@@ -58,6 +58,10 @@ class Driver:
             "expert_acceleration": (expert,),
             "expert_memory": getattr(self.memory, "features", ()),
             "loop_length": (s.loop_length / 250.0,),
+            "allowed_speed": ((s.allowed_speed - s.speed) / 10.0,),
+            "to_merge": (clip(s.to_merge / 1000.0, -1.0, 2.0),),
+            "lane_speeds": tuple((speed - s.speed) / 10.0 for speed in s.lane_speeds),
+            "road_speeds": tuple((speed - s.speed) / 10.0 for speed in s.road_speeds),
             "route_position": (s.route_position / 100.0,),
             "place": (math.cos(lap := 2.0 * math.pi * s.route_position / s.loop_length), math.sin(lap)),
         }
@@ -93,14 +97,15 @@ class Controller:
         self.limit = max(-action["low"], action["high"])
         self.driver = Driver(self.manifest["driver"], arrays(parts["weights.safetensors"]))
 
-    def act(self, *perceived: float) -> float:
+    def act(self, *perceived: Any) -> float:
         """The acceleration to drive with [m/s2], for the fields of `State`."""
         return clip(self.driver.act(State(*perceived)), -self.limit, self.limit)
 
 
 if __name__ == "__main__":
     controller = Controller(sys.argv[1])
-    recorded = zip(*(controller.sample[name] for name in (*State._fields, "acceleration")), strict=True)
-    off = [abs(controller.act(*map(float, perceived)) - answer) for *perceived, answer in recorded]
+    names = [name for name in State._fields if name in controller.sample]
+    recorded = zip(*(controller.sample[name].tolist() for name in (*names, "acceleration")), strict=True)
+    off = [abs(controller.act(*perceived) - answer) for *perceived, answer in recorded]
     print(f"{len(off)} decisions, at most {max(off):.1e} m/s2 from what was recorded")
     sys.exit(int(max(off) > 1e-9))

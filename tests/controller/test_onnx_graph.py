@@ -134,7 +134,8 @@ def test_the_graph_takes_any_number_of_vehicles_and_names_nothing_of_this_machin
     driver = LACC()
     part = onnx_graph(driver, 0.5)
     states = perceived(7)
-    fed = {**states._asdict(), "memory.acceleration": np.zeros(7)}
+    seen = {name: getattr(states, name) for name in driver.perceives}
+    fed = {**seen, "memory.acceleration": np.zeros(7)}
     session = onnxruntime.InferenceSession(part, providers=["CPUExecutionProvider"])
     found, after = session.run(None, fed)
     expected, memory = driver.act(states, driver.initial_memory(7))

@@ -25,8 +25,10 @@ ROADS = {
     "ring-warm": ("ring-warm", {"horizon": 100, "warmup": 300}),
     "figure-eight": ("figure-eight", {"horizon": 400}),
     "merge": ("merge", {"horizon": 60}),
+    "on-ramp": ("on-ramp", {"horizon": 150, "peak": [0, 150], "cav_share": 0.3}),
     "own-network": ("", {"horizon": 250, "cav_types": ["van"]}),
 }
+ON_MOTORWAYS = ("cruise", "jam-ahead")
 VANS = "".join(
     f'<vehicle id="{number}" type="{"car" if number % 3 else "van"}" route="along" '
     f'depart="{2 * number}" departSpeed="8"/>'
@@ -45,13 +47,15 @@ def folder(version: str | None = None) -> Path:
 
 
 def cases() -> list[tuple[str, str]]:
-    """Return every road with every driver that may drive on it."""
-    return [
+    """Return every road with every driver that may drive on it; those of motorways on the motorway alone."""
+    closed = ("ring", "ring-warm", "figure-eight")
+    found = [
         (road, driver)
-        for road in ROADS
+        for road in (*closed, "merge", "own-network")
         for driver, kind in DRIVERS.items()
-        if road not in ("merge", "own-network") or not kind.needs_loop
+        if driver not in ON_MOTORWAYS and (road in closed or not kind.needs_loop)
     ]
+    return [*found, *(("on-ramp", driver) for driver in ("human", "follower-stopper", *ON_MOTORWAYS))]
 
 
 def scenario_of(road: str, network: Path) -> Scenario:
