@@ -92,16 +92,15 @@ def lap_place(state: LocalState) -> Array:
     return stack_columns((xp.cos(angle), xp.sin(angle)))
 
 
-def _speeds_ahead(told: Array, own: Array) -> Array:
-    """Return speeds of the sections ahead less the own one, over `SPEED_SCALE`, shape (n, sections)."""
-    return (told - own[..., None]) / SPEED_SCALE
-
-
-def _sections(whose: str) -> tuple[Observed, ...]:
-    """Return what a feature of the sections ahead says of itself."""
-    return tuple(
-        Observed(f"speed {whose} {SECTION * number:g} m ahead - own", SPEED_SCALE, "m/s")
-        for number in range(SECTIONS_AHEAD)
+def _sections_ahead(field: str, where: str) -> Feature:
+    """Return the feature of a state's field with a speed for each section ahead, less the own speed."""
+    words = (f"speed {where} {SECTION * number:g} m ahead - own" for number in range(SECTIONS_AHEAD))
+    return Feature(
+        lambda seen: (getattr(seen.state, field) - seen.state.speed[..., None]) / SPEED_SCALE,
+        tuple(Observed(each, SPEED_SCALE, "m/s") for each in words),
+        needs="message",
+        told=(field,),
+        plain=False,
     )
 
 
@@ -148,20 +147,8 @@ FEATURES: dict[str, Feature] = {
         needs="message",
         told=("to_merge",),
     ),
-    "lane_speeds": Feature(
-        lambda seen: _speeds_ahead(seen.state.lane_speeds, seen.state.speed),
-        _sections("in its lane"),
-        needs="message",
-        told=("lane_speeds",),
-        plain=False,
-    ),
-    "road_speeds": Feature(
-        lambda seen: _speeds_ahead(seen.state.road_speeds, seen.state.speed),
-        _sections("on the road"),
-        needs="message",
-        told=("road_speeds",),
-        plain=False,
-    ),
+    "lane_speeds": _sections_ahead("lane_speeds", "in its lane"),
+    "road_speeds": _sections_ahead("road_speeds", "on the road"),
 }
 """all that a network can be shown: the paper's five numbers; the expert's acceleration; what the expert
 remembers; the length of the closed road; the place on it; the position along a road with ends; on motorways
