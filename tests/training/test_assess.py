@@ -21,7 +21,7 @@ from unjam.training.assess import (
 from unjam.training.choice import PEOPLE, Option
 from unjam.worlds.workers import Workers
 
-HELD = {"horizon": 150, "actuation": "shielded", "safety": {"active": True}}
+HELD = {"horizon": 150, "actuation": "shielded", "safety.active": True}
 """on so short a road an ACC of its own gains nothing"""
 FLOW = '<flow id="f" type="car" route="along" begin="0" end="40" period="2"/>'
 

@@ -29,9 +29,9 @@ from unjam.worlds.workers import Workers
 
 DRIVERS_OF_OPEN_ROADS = ("cruise", "acc", "follower-stopper", "pi")
 """who is tried where nobody is named: drivers that fit roads with ends"""
-WITH_OWN_ACC: dict[str, Any] = {"actuation": "cruise", "safety": {"active": False}}
+WITH_OWN_ACC: dict[str, Any] = {"actuation": "cruise", "safety.active": False}
 """how CAVs are driven: their own ACC follows and makes room for who changes lanes, drivers hold it back"""
-PICTURED = 2
+FOR_PICTURES = 2
 """episodes of the budget that are kept for pictures"""
 NOBODY = 1e-12
 """share of CAVs where people are alone: a network without any is not allowed"""
@@ -108,7 +108,7 @@ def question(
         if driver.native or not can_drive(driver, road):
             why = "people alone are driven anyway" if driver.native else "one that needs no closed road"
             raise wrong("driver", name, why)
-    least = least_episodes(len(asked), len(made)) + PICTURED
+    least = least_episodes(len(asked), len(made)) + FOR_PICTURES
     if episodes < least:
         raise wrong("episodes", episodes, f">= {least} for {len(asked)} shares and {len(made)} drivers")
     return Question(file, road, made, asked, episodes, minutes, precision)
@@ -145,7 +145,7 @@ def assess(
         InputError: the folder holds something, or no driver can drive this road.
     """
     make_new_folder(folder)
-    budget = Budget(asked.episodes - PICTURED, asked.minutes)
+    budget = Budget(asked.episodes - FOR_PICTURES, asked.minutes)
 
     def driven(options: Sequence[Option], seeds: Sequence[Seed], pictured: bool = False) -> Evaluation:
         setups = {option.label: asked.setup(option) for option in options}
