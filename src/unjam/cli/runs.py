@@ -64,7 +64,7 @@ def list_them(
 
 
 def _gain_words(gain: Any) -> str:
-    from unjam.reports.story import signed
+    from unjam.measures.statistics import signed
 
     return signed(gain).replace("[", "\\[") if gain else "–"
 

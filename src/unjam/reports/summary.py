@@ -12,6 +12,7 @@ from unjam.reports.story import Column, table_of
 from unjam.worlds.record import Episode
 
 Rows = dict[str, list[dict[str, Any]]]
+"""by driver: a row of metrics per episode, failed ones too"""
 
 
 def frame_of_rows(rows_by_driver: Rows) -> pd.DataFrame:

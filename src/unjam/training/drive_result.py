@@ -8,14 +8,11 @@ from unjam.measures.drivable import verdicts
 from unjam.measures.effect import Effect, beside_people
 from unjam.measures.metrics import METRICS
 from unjam.measures.statistics import Estimate, summarise
-from unjam.reports.summary import frame_of_metrics, frame_of_rows, html_of
+from unjam.reports.summary import Rows, frame_of_metrics, frame_of_rows, html_of
 from unjam.worlds.record import Episode
 
 if TYPE_CHECKING:
     import pandas as pd
-
-Rows = dict[str, list[dict[str, Any]]]
-"""by driver: a row of metrics per episode, failed ones too"""
 
 
 @dataclass(frozen=True)
