@@ -98,7 +98,7 @@ class LaneTraffic(OpenTraffic[RoadKind]):
         people, cavs, cut_in = (brakings(accelerations[whose == who]) for who in (PEOPLE, CAV, CAV_CUT_IN))
         speed, ahead, gap = self._settled()
         found = following(speed, ahead, gap, self.scenario.simulation_step)
-        decided = super()._audit(trajectories).following
+        decided = self._decided(trajectories)
         commands = {name: getattr(decided, name) for name in ("jerk", "overridden", "yielded")}
         return Audit(people, cavs, replace(found, **commands), SHORT_HEADWAY, lanes=True, cut_in=cut_in)
 

@@ -13,7 +13,7 @@ from unjam.drivers.command import Command
 from unjam.drivers.local_state import LARGEST_GAP, LocalState
 from unjam.drivers.safety import Ahead
 from unjam.physics.kinematics import next_speed
-from unjam.worlds.audit import SHIELD_ROUNDING, Audit, brakings, following
+from unjam.worlds.audit import SHIELD_ROUNDING, Audit, Following, brakings, following
 from unjam.worlds.record import Episode, Floats, Trajectory, trajectory
 from unjam.worlds.sumo.traffic import RoadKind, Scene, Traffic
 from unjam.worlds.world import Driven, OnProgress
@@ -265,6 +265,13 @@ class OpenTraffic(Traffic[RoadKind]):
 
     def _audit(self, trajectories: Sequence[Trajectory]) -> Audit:
         """Return the physics of every simulation step; how CAVs followed, of every decision."""
+        accelerations = np.array(self._changes) / self.scenario.simulation_step
+        of_cav = np.array(self._changed, bool)
+        people, cavs = brakings(accelerations[~of_cav]), brakings(accelerations[of_cav])
+        return Audit(people, cavs, self._decided(trajectories), self.scenario.safety.time_headway)
+
+    def _decided(self, trajectories: Sequence[Trajectory]) -> Following:
+        """Return how CAVs followed, and how often they were overridden, from what every decision recorded."""
         most = max((len(each.states.speed) for each in trajectories), default=0)
         speed, leader, gap = np.full((3, most, len(trajectories)), np.nan)
         for column, each in enumerate(trajectories):
@@ -273,11 +280,7 @@ class OpenTraffic(Traffic[RoadKind]):
             leader[rows, column], gap[rows, column] = each.states.leader_speed, each.states.leader_gap
         step = self.scenario.decision_step
         added = np.concatenate([each.shield for each in trajectories]) if trajectories else np.zeros(0)
-        followed = following(speed, leader, gap, step, added > SHIELD_ROUNDING / step, np.zeros_like(added))
-        accelerations = np.array(self._changes) / self.scenario.simulation_step
-        of_cav = np.array(self._changed, bool)
-        people, cavs = brakings(accelerations[~of_cav]), brakings(accelerations[of_cav])
-        return Audit(people, cavs, followed, self.scenario.safety.time_headway)
+        return following(speed, leader, gap, step, added > SHIELD_ROUNDING / step, np.zeros_like(added))
 
     def _trajectories(self, driven: Driven) -> tuple[Trajectory, ...]:
         """Return the stays of at least one decision, in order of entry."""
