@@ -55,20 +55,20 @@ class DriveResult:
 
     def document(self) -> dict[str, Any]:
         """Return the result as `unjam drive --json` prints it; of several drivers, a list of such."""
-        documents = [self._document(driver) for driver in self.rows]
+        said, effects = verdicts(self.rows), beside_people(self.rows)
+        documents = [self._document(driver, said[driver], effects.get(driver)) for driver in self.rows]
         return documents[0] if len(documents) == 1 else {"scenario": self.scenario, "drivers": documents}
 
-    def _document(self, driver: str) -> dict[str, Any]:
+    def _document(self, driver: str, verdict: str, effect: Effect | None) -> dict[str, Any]:
         summary = self.summary(driver)
-        effect = beside_people({name: self.rows[name] for name in {driver, "human"} & set(self.rows)})
         return {
             "scenario": self.scenario,
             "driver": driver,
-            "drivable": verdicts(self.rows)[driver],
+            "drivable": verdict,
             "episodes": self.rows[driver],
             "mean": {name: summary[name].mean for name in METRICS},
             "interval": {name: [summary[name].low, summary[name].high] for name in METRICS},
-            "beside_people": _effect(effect[driver]) if driver in effect else None,
+            "beside_people": _effect(effect) if effect else None,
             "notes": self.notes,
             "folder": str(self.folder) if self.folder else None,
             "report": str(self.report) if self.report else None,
