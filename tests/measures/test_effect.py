@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from unjam.measures.effect import LEAST_JUDGED, Effect, beside_people, effect_of, harm_of, reasons_against
-from unjam.measures.statistics import Estimate
+from unjam.measures.statistics import Estimate, estimate
 
 USUAL: dict[str, Any] = {
     "status": "completed",
@@ -59,6 +59,9 @@ def test_words_say_what_everybody_gains() -> None:
         "fuel +0.0 [+0.0, +0.0] ml/km"
     )
     assert "delay" not in GOOD.words
+    slower = replace(known, travel_time=between(2.0, 6.0))
+    assert slower.words.startswith("travel time +4.0 [+2.0, +6.0] s (more delay)")
+    assert "delay" not in replace(known, travel_time=between(-6.0, 1.0)).words  # it may be none
     assert "flow -20 [-30, -10] veh/h: a loss" in replace(GOOD, flow=between(-30.0, -10.0)).words
     nowhere = Estimate(nan, nan, nan, 0)
     closed = replace(GOOD, travel_time=nowhere, speed=between(0.1, 0.3))
@@ -77,7 +80,7 @@ def test_differences_are_paired_and_only_on_seeds_that_both_have() -> None:
     people = rows_of([100.0, 120.0, 140.0, 999.0])
     found = effect_of(rows_of([98.0, 117.0, 136.0], throughput_veh_per_h=1990.0), people)
     assert (found.travel_time.mean, found.travel_time.count) == (-3.0, 3)
-    assert -4.0 <= found.travel_time.low < found.travel_time.high <= -2.0
+    assert found.travel_time == estimate([-2.0, -3.0, -4.0])
     assert found.flow == Estimate(-10.0, -10.0, -10.0, 3)
     assert (found.people_time, found.people_flow) == (120.0, 2000.0)
     assert found.relative_time == -3.0 / 120.0

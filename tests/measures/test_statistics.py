@@ -1,3 +1,6 @@
+import json
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -6,16 +9,98 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from unjam.measures.metrics import METRICS
-from unjam.measures.statistics import crossed_estimate, digits_of, estimate, paired_difference, summarise
+from unjam.measures.statistics import (
+    LEAST,
+    Estimate,
+    crossed_estimate,
+    digits_of,
+    estimate,
+    estimate_of,
+    paired_by_training,
+    paired_difference,
+    probability_of_improvement,
+    signed,
+    summarise,
+    two_modes,
+)
 
+COUNTS = (3, 5, 10, 20)
+REPEATS = 1500
+RING = Path(__file__).parents[2] / "results" / "drivable" / "ring.json"
 NUMBERS = st.lists(st.floats(-1e3, 1e3), min_size=2, max_size=12)
 
 
-def test_interval_covers_the_true_mean_about_as_often_as_it_says() -> None:
-    generator = np.random.default_rng(0)
-    found = [estimate(list(generator.normal(3.0, 2.0, 20))) for _ in range(200)]
-    covered = np.mean([each.low <= 3.0 <= each.high for each in found])
-    assert 0.85 <= covered <= 0.99
+def coverage(found: Sequence[Estimate], true: float) -> float:
+    return float(np.mean([each.low <= true <= each.high for each in found]))
+
+
+@pytest.mark.parametrize("trim", [0.0, 0.25])
+@pytest.mark.parametrize("count", COUNTS)
+def test_intervals_of_normal_values_cover_what_they_say(count: int, trim: float) -> None:
+    drawn = np.random.default_rng(count).normal(3.0, 2.0, (2 * REPEATS, count))
+    assert 0.93 <= coverage([estimate(values, trim=trim) for values in drawn], 3.0) <= 0.97
+
+
+def returns_on_ring() -> dict[str, np.ndarray]:
+    """The returns of each driver that was measured on the ring, a row per length of it."""
+    found = json.loads(RING.read_text())
+    return {
+        driver: np.array(
+            [[row["return"] for row in lengths[driver]["episodes"]] for lengths in found.values()]
+        )
+        for driver in found["220"]
+    }
+
+
+def coverage_of_resampled(pools: Sequence[np.ndarray], count: int) -> float:
+    generator = np.random.default_rng(count)
+    repeats = 2 * REPEATS // len(pools)
+    drawn = [(generator.choice(pool, (repeats, count)), float(pool.mean())) for pool in pools]
+    return float(np.mean([coverage([estimate(each) for each in values], true) for values, true in drawn]))
+
+
+@pytest.mark.parametrize("count", COUNTS)
+def test_intervals_of_real_returns_cover_what_they_say(count: int) -> None:
+    returns = returns_on_ring()
+    same_length = [values - values.mean(1, keepdims=True) for values in returns.values()]
+    assert 0.93 <= coverage_of_resampled([values.ravel() for values in same_length], count) <= 0.97
+    beyond = [values - returns["human"] for driver, values in returns.items() if driver != "human"]
+    same_length = [values - values.mean(1, keepdims=True) for values in beyond]
+    assert 0.93 <= coverage_of_resampled([values.ravel() for values in same_length], count) <= 0.97
+
+
+@pytest.mark.parametrize("count", COUNTS)
+def test_of_few_episodes_over_all_lengths_intervals_cover_a_little_less(count: int) -> None:
+    """Lengths drawn evenly make returns flat, for which Student's t of three values covers 92 %."""
+    found = coverage_of_resampled([values.ravel() for values in returns_on_ring().values()], count)
+    assert (0.93 if count >= 10 else 0.90) <= found <= 0.97
+
+
+@pytest.mark.parametrize("count", [5, 10, 20])
+@pytest.mark.parametrize("share", [0.05, 0.5, 0.9])
+def test_intervals_of_shares_cover_and_stay_possible(share: float, count: int) -> None:
+    drawn = np.where(np.random.default_rng(count).random((REPEATS, 1, count)) < share, 1.0, -1.0)
+    found = [probability_of_improvement(values) for values in drawn]
+    assert all(0.0 <= each.low <= each.mean <= each.high <= 1.0 for each in found)
+    assert coverage(found, share) >= 0.90
+
+
+def test_an_interval_is_cut_at_what_is_possible() -> None:
+    values = [0.0, 0.0, 0.0, 0.9]
+    assert estimate(values).low < 0.0
+    cut = estimate(values, bounds=(0.0, 1.0))
+    assert (cut.low, cut.high) == (0.0, pytest.approx(estimate(values).high))
+    rows = [{"collisions": value, "return": -value} for value in values]
+    assert estimate_of(rows, "collisions").low == 0.0
+    assert estimate_of(rows, "return").low < -0.9
+
+
+def test_a_trimmed_mean_leaves_the_ends_out() -> None:
+    found = estimate([1.0, 2.0, 3.0, 4.0, 100.0], trim=0.25)
+    assert (found.mean, found.largest) == (3.0, 100.0)
+    # Winsorised 2 2 3 4 4: squares 4, over h (h - 1) = 6, times t of two degrees of freedom.
+    assert found.high == pytest.approx(3.0 + 4.30265 * np.sqrt(4 / 6), rel=1e-5)
+    assert np.isnan(estimate([0.0, 0.0, 0.0, 0.0, 6.0], trim=0.25).low)
 
 
 def test_interval_is_as_wide_as_theory_says() -> None:
@@ -43,10 +128,12 @@ def test_values_that_are_no_numbers_are_left_out_and_not_counted() -> None:
     assert estimate([1.0, float("nan"), 2.0, 4.0]).count == 3
 
 
-def test_one_value_has_no_interval() -> None:
-    found = estimate([3.0, float("nan")])
-    assert (found.mean, found.count) == (3.0, 1)
+@pytest.mark.parametrize(("values", "words"), [([3.0], "+3"), ([3.0, 5.0], "+4 (+3 to +5)")])
+def test_one_value_or_two_have_no_interval_but_a_range(values: list[float], words: str) -> None:
+    found = estimate([*values, float("nan")])
+    assert (found.mean, found.count) == (np.mean(values), len(values))
     assert np.isnan([found.low, found.high]).all()
+    assert signed(found) == words
 
 
 def test_equal_values_have_an_interval_of_no_width() -> None:
@@ -68,11 +155,13 @@ def test_the_same_values_give_the_same_interval(values: list[float]) -> None:
 
 
 @given(NUMBERS)
-def test_interval_holds_its_mean_and_stays_within_the_values(values: list[float]) -> None:
+def test_interval_is_around_its_mean_and_knows_the_range(values: list[float]) -> None:
     found = estimate(values)
     slack = 1e-9 * (1 + max(map(abs, values)))
-    assert min(values) - slack <= found.low <= found.mean + slack
-    assert found.mean - slack <= found.high <= max(values) + slack
+    assert (found.smallest, found.largest) == (min(values), max(values))
+    if len(values) >= LEAST:
+        assert found.mean - found.low == pytest.approx(found.high - found.mean, abs=slack)
+        assert found.low <= found.mean <= found.high
 
 
 def test_does_not_touch_the_generator_that_others_use() -> None:
@@ -91,8 +180,7 @@ def test_differences_are_paired_by_seed_and_not_by_order() -> None:
     ours = rows_of(s1=11.0, s2=22.0, s3=33.0)
     others = rows_of(s3=30.0, s1=10.0, s2=20.0)
     found = paired_difference(ours, others, "return")
-    assert found == estimate([1.0, 2.0, 3.0])
-    assert found.low > 0  # by order, the differences would be -19, 12 and 13
+    assert found == estimate([1.0, 2.0, 3.0])  # by order, the differences would be -19, 12 and 13
 
 
 def test_pairing_takes_the_traffic_out_of_the_difference() -> None:
@@ -118,7 +206,8 @@ def test_summary_has_an_estimate_of_every_metric() -> None:
     rows = [{"seed": seed, **dict.fromkeys(METRICS, float(seed))} for seed in range(4)]
     found = summarise(rows)
     assert list(found) == list(METRICS)
-    assert set(found.values()) == {estimate([0.0, 1.0, 2.0, 3.0])}
+    values = [0.0, 1.0, 2.0, 3.0]
+    assert all(found[name] == estimate(values, bounds=METRICS[name].bounds) for name in METRICS)
 
 
 @pytest.mark.parametrize(("between", "shared"), [(1.0, 0.5), (0.3, 2.0), (1.0, 0.0)])
@@ -138,3 +227,67 @@ def test_crossed_intervals_cover_what_they_say(trainings: int, between: float, s
 def test_a_crossed_interval_of_equal_numbers_is_a_point() -> None:
     found = crossed_estimate(np.full((3, 4), 2.5))
     assert (found.mean, found.low, found.high, found.count) == (2.5, 2.5, 2.5, 3)
+
+
+def test_trainings_of_two_modes_or_too_few_have_a_range_and_no_interval() -> None:
+    seeds = np.random.default_rng(0).normal(0.0, 1.0, 20)
+    modes = np.array([0.0, 1.0, 2.0, 80.0, 81.0])[:, None] + seeds
+    found = crossed_estimate(modes)
+    assert np.isnan(found.low)
+    assert np.isnan(found.high)
+    assert signed(found) == "+33 (-0 to +81)"
+    assert np.isnan(crossed_estimate(modes[:2]).low)
+    assert crossed_estimate(np.array([0.0, 10.0, 20.0, 30.0, 40.0])[:, None] + seeds).low < 20.0
+
+
+@pytest.mark.parametrize("count", [4, 5, 8, 10, 20])
+def test_two_modes_are_seen_and_seldom_made_up(count: int) -> None:
+    generator = np.random.default_rng(count)
+    normal = generator.normal(0.0, 1.0, (REPEATS, count))
+    assert np.mean([two_modes(values) for values in normal]) < 0.03
+    apart = normal + 30.0 * (np.arange(count) >= count // 2)
+    assert np.mean([two_modes(values) for values in apart]) > 0.9
+
+
+def test_two_modes_need_two_values_each() -> None:
+    assert not two_modes([0.0, 0.0, 0.0, 0.0, 6.0])
+    assert not two_modes([0.0, 0.0, 6.0])
+    assert not two_modes([1.0] * 5)
+    assert two_modes([0.0, 0.0, 0.0, 6.0, 6.0])
+
+
+def test_differences_of_trainings_are_on_the_seeds_that_all_have_driven() -> None:
+    runs = [rows_of(s1=3.0, s2=5.0, s3=1.0), rows_of(s2=6.0, s1=4.0, s3=float("nan"))]
+    found = paired_by_training(runs, rows_of(s1=1.0, s2=2.0, s3=0.0, s4=9.0), "return")
+    assert found.tolist() == [[2.0, 3.0], [3.0, 4.0]]
+
+
+def test_probability_of_improvement_counts_ties_half_and_stays_possible() -> None:
+    assert probability_of_improvement(np.array([[1.0, 0.0, -1.0, 2.0]])).mean == 0.625
+    never = probability_of_improvement(-np.ones((1, 10)))
+    assert (never.mean, never.low) == (0.0, 0.0)
+    assert never.high == pytest.approx(0.2775, abs=1e-4)  # z^2 / (n + z^2)
+    better = probability_of_improvement(np.array([[1.0] * 10, [1.0] * 10, [1.0] * 9 + [-1.0]]))
+    assert better.mean == pytest.approx(29 / 30)
+    assert 0.0 < better.low < better.mean < better.high <= 1.0
+
+
+def test_trainings_that_all_agree_do_not_make_certain_and_two_say_nothing() -> None:
+    found = probability_of_improvement(np.ones((3, 20)))
+    assert (found.mean, found.high) == (1.0, 1.0)
+    assert found.low < 0.2
+    assert np.isnan(probability_of_improvement(np.ones((2, 20))).low)
+
+
+@pytest.mark.parametrize("trainings", [3, 5, 10, 20])
+@pytest.mark.parametrize("shift", [0.0, 1.0])
+def test_probabilities_of_improvement_cover(shift: float, trainings: int) -> None:
+    generator = np.random.default_rng(trainings)
+    tables = (
+        shift
+        + generator.standard_normal((REPEATS, trainings, 1))
+        + generator.standard_normal((REPEATS, 1, 20))
+        + generator.standard_normal((REPEATS, trainings, 20))
+    )
+    true = float(np.mean(generator.normal(shift, np.sqrt(3.0), 400_000) > 0))
+    assert coverage([probability_of_improvement(table) for table in tables], true) >= 0.92

@@ -57,8 +57,8 @@ class Effect:
     def words(self) -> str:
         """What everybody on the road gains, in a line: time, flow and fuel, or speed where nobody leaves."""
         cut, time = self.delay_cut, f"travel time {signed(self.travel_time, 1)} s"
-        if cut.mean == cut.mean:
-            time += f" ({100 * cut.mean:.0f} % less delay)" if cut.mean > 0 else " (more delay)"
+        if cut.low > 0 or cut.high < 0:
+            time += f" ({100 * cut.mean:.0f} % less delay)" if cut.low > 0 else " (more delay)"
         first = time if self.travel_time.count else f"mean speed {signed(self.speed, 2)} m/s"
         lost = ": a loss, whatever the speed" if self.flow.high < 0 else ""
         return f"{first}, flow {signed(self.flow)} veh/h{lost}, fuel {signed(self.fuel, 1)} ml/km"

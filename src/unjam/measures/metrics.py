@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from math import inf
 from typing import Any
 
 import numpy as np
@@ -34,6 +35,8 @@ CALM_SECONDS = 60.0
 """how long traffic must stay calm before its wave counts as dissolved"""
 PETROL_DENSITY = 742.0
 """[mg/ml], as in SUMO's PollutantsInterface"""
+SHARE, SIGNED = (0.0, 1.0), (-inf, inf)
+"""bounds of metrics; others are not negative"""
 LAST_OF_PEAK = 600.0
 """end of a peak of demand in which flow is counted [s]: then it is capacity, not demand"""
 
@@ -247,6 +250,8 @@ class Metric:
     label: str
     unit: str
     digits: int = 2
+    bounds: tuple[float, float] = (0.0, inf)
+    """what it can be"""
 
 
 METRICS: dict[str, Metric] = {
@@ -257,18 +262,18 @@ METRICS: dict[str, Metric] = {
     "speed_limit_ratio_steady": Metric(speed_limit_ratio_steady, "mean speed / limit, steady", "", 3),
     "speed_std_fleet": Metric(speed_std_fleet, "speed std across vehicles", "m/s"),
     "speed_std_fleet_steady": Metric(speed_std_fleet_steady, "speed std across vehicles, steady", "m/s"),
-    "share_standing": Metric(share_standing, "share of time standing", "", 3),
+    "share_standing": Metric(share_standing, "share of time standing", "", 3, SHARE),
     "time_to_dissolve": Metric(time_to_dissolve, "time until the wave is dissolved", "s", 0),
     "cav_mean_speed": Metric(cav_mean_speed, "CAV's mean speed", "m/s"),
     "speed_std_cav": Metric(speed_std_cav, "CAV's speed std over time", "m/s"),
-    "return": Metric(episode_return, "return", "", 0),
-    "return_eq16": Metric(return_eq16, "return, Eq. 16", "", 0),
+    "return": Metric(episode_return, "return", "", 0, SIGNED),
+    "return_eq16": Metric(return_eq16, "return, Eq. 16", "", 0, SIGNED),
     "mean_abs_accel": Metric(mean_abs_accel, "CAV's mean |acceleration|", "m/s2", 3),
     "mean_abs_jerk": Metric(mean_abs_jerk, "CAV's mean |jerk|", "m/s3", 3),
     "min_ttc": Metric(min_ttc, "smallest time to collision", "s"),
     "min_headway": Metric(min_headway, "smallest time headway", "s"),
     "cav_min_ttc": Metric(cav_min_ttc, "CAV's smallest time to collision", "s"),
-    "share_short_headway": Metric(share_short_headway, "CAV's share of time below one second", "", 4),
+    "share_short_headway": Metric(share_short_headway, "CAV's share of time below one second", "", 4, SHARE),
     "max_drac": Metric(max_drac, "CAV's largest braking needed (DRAC)", "m/s2"),
     "max_jerk": Metric(max_jerk, "CAV's largest jerk", "m/s3", 1),
     "cav_max_braking": Metric(cav_max_braking, "CAV's hardest braking", "m/s2"),
@@ -290,16 +295,16 @@ METRICS: dict[str, Metric] = {
     "people_beyond_9": Metric(
         brakings_beyond("people", 9.0), "people's brakings beyond 9 m/s2", "per million", 0
     ),
-    "filter_share": Metric(filter_share, "decisions in which the filter braked", "", 4),
-    "overridden": Metric(overridden, "commands overridden in following", "", 4),
-    "yielded": Metric(yielded, "commands overridden at a crossing", "", 4),
+    "filter_share": Metric(filter_share, "decisions in which the filter braked", "", 4, SHARE),
+    "overridden": Metric(overridden, "commands overridden in following", "", 4, SHARE),
+    "yielded": Metric(yielded, "commands overridden at a crossing", "", 4, SHARE),
     "collisions": Metric(collisions, "vehicles in collisions", "", 0),
-    "shield_override_share": Metric(shield_override_share, "commands overridden", "", 4),
+    "shield_override_share": Metric(shield_override_share, "commands overridden", "", 4, SHARE),
     "shield_max_braking": Metric(shield_max_braking, "hardest braking added", "m/s2"),
     "fuel_ml_per_km": Metric(fuel_ml_per_km, "fuel", "ml/km", 1),
     "throughput_veh_per_h": Metric(throughput_veh_per_h, "flow", "veh/h", 0),
     "travel_time": Metric(travel_time, "travel time, waiting included", "s", 1),
-    "delay": Metric(delay, "delay, waiting included", "s", 1),
+    "delay": Metric(delay, "delay, waiting included", "s", 1, SIGNED),
     "backlog_veh": Metric(backlog_veh, "vehicles waiting to enter", "", 0),
 }
 
