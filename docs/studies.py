@@ -9,7 +9,8 @@ from tables import RESULTS, metrics_of
 from tables import rows_of as rows_of_file
 
 from unjam.studies import STUDIES
-from unjam.studies.comparison import interval, number, unbroken
+from unjam.measures.table import unbroken
+from unjam.studies.comparison import interval, number
 from unjam.studies.study import REFERENCES, VARIANTS
 
 FREE = 15.0

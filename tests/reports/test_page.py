@@ -363,19 +363,21 @@ def test_all_controls_can_be_reached_by_tab_and_have_names(open_page: Opener, dr
 
 def test_the_table_has_all_metrics_of_all_drivers(open_page: Opener, trained: Path) -> None:
     table = open_page(trained).page.locator("section:has(h2:text-is('All metrics')) table")
-    assert table.locator("thead th").all_inner_texts() == ["metric", "human", "pi", "trained"]
+    assert table.locator("thead th").all_inner_texts() == [
+        *("metric", "human", "pi", "trained", "pi − human", "trained − human")
+    ]
     rows = table.locator("tbody tr")
-    assert rows.count() == len(METRICS) + 1  # the verdict stands above them
+    assert rows.count() == len(METRICS) + 2  # above them the verdict, and who earns more how often
     assert rows.first.locator("th").inner_text() == "could a car drive so?"
-    for row, metric in zip(rows.all()[1:], METRICS.values(), strict=True):
+    for row, metric in zip(rows.all()[2:], METRICS.values(), strict=True):
         assert row.locator("th").inner_text().replace("\n", " ") == f"{metric.label} {metric.unit}".strip()
-        assert row.locator("td").count() == 3
+        assert row.locator("td").count() == 5
         assert all(row.locator("td b").all_inner_texts())
 
 
 def test_a_metric_shows_its_definition_when_pointed_at(open_page: Opener, driven: Path) -> None:
     page = open_page(driven).page
-    for head, metric in zip(page.locator("tbody th").all()[1:], METRICS.values(), strict=True):
+    for head, metric in zip(page.locator("tbody th").all()[2:], METRICS.values(), strict=True):
         assert head.get_attribute("title") == " ".join((metric.function.__doc__ or "").split())
 
 

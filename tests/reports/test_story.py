@@ -1,20 +1,19 @@
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 from unjam.measures.metrics import METRICS
 from unjam.measures.statistics import Estimate, estimate
 from unjam.reports.results import Results
 from unjam.reports.story import (
+    baseline_of_columns,
     cards_of,
-    cell_of,
     columns_of,
     lead_of,
     notes_of,
     signed,
-    table_of,
     title_of,
 )
 
@@ -208,24 +207,14 @@ def test_the_same_driver_on_another_road_is_not_taken_for_the_same() -> None:
     assert returns == [5.0, 9.0]
 
 
-def test_the_table_has_every_metric_of_every_driver_with_its_definition() -> None:
-    verdict, *table = table_of(columns_of([trained_on_pi([10.0, 20.0], [5.0, 5.0])]))
-    assert verdict["label"] == "could a car drive so?"
-    assert [row["label"] for row in table] == [metric.label for metric in METRICS.values()]
-    assert all(len(row["cells"]) == 3 for row in table)
-    for row, metric in zip(table, METRICS.values(), strict=True):
-        assert row["about"] == " ".join((metric.function.__doc__ or "").split())
-        assert row["unit"] == metric.unit
-    returns = next(row for row in table if row["label"] == "return")["cells"]
-    assert returns[1] == {"mean": "5", "interval": "[5, 5]"}
-    assert returns[2]["mean"] == "15"
-
-
-def test_a_cell_says_how_many_values_it_stands_for() -> None:
-    assert cell_of(estimate([1.0, 1.0]), 2, 2) == {"mean": "1.00", "interval": "[1.00, 1.00]"}
-    assert cell_of(estimate([1.0, 1.0, np.nan]), 1, 3) == {"mean": "1.0", "interval": "[1.0, 1.0] 2 of 3"}
-    assert cell_of(estimate([1.0, np.nan]), 0, 2) == {"mean": "1", "interval": "1 of 2"}
-    assert cell_of(estimate([np.nan]), 0, 1) == {"mean": "–", "interval": ""}
+def test_folders_are_compared_with_who_drove_the_same_episodes_in_all() -> None:
+    first, second = trained_on_pi([1.0], [5.0]), trained_on_pi([2.0], [5.0])
+    second = replace(second, folder=Path("runs/ring-002"))
+    assert baseline_of_columns([first]) == baseline_of_columns([first, second]) == "human"
+    elsewhere = replace(second, rows={**second.rows, "human": rows_of([9.0])})
+    assert baseline_of_columns([first, elsewhere]) == ""
+    assert baseline_of_columns([driven("a", human=rows_of([1.0]), pi=rows_of([1.0]))] * 2) == ""
+    assert baseline_of_columns([driven(pi=rows_of([1.0]))]) == ""
 
 
 def test_a_difference_shows_its_sign() -> None:

@@ -21,7 +21,7 @@ from unjam.cli.options import (
     scenario_changes,
     with_options,
 )
-from unjam.cli.output import aside, console, counting_steps, metrics_table, print_json
+from unjam.cli.output import aside, console, counting_steps, print_json, print_metrics
 from unjam.errors import MissingPartError
 from unjam.processes import has_display
 
@@ -89,7 +89,7 @@ def drive(
     if json:
         print_json(result.document())
     elif any(row["status"] != "failed" for rows in result.rows.values() for row in rows):
-        console.print(metrics_table(result.rows))
+        print_metrics(result.rows)
         for label, effect in beside_people(result.rows).items():
             console.print(f"{label} beside people alone, {effect.flow.count} paired seeds: {effect.words}")
         for note in result.notes:

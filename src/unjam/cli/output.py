@@ -4,19 +4,29 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any, Self
+from textwrap import fill
+from typing import TYPE_CHECKING, Any, Self
 
 from rich.console import Console
+from rich.markup import escape
+from rich.measure import Measurement
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
 from unjam.files import to_json
+
+if TYPE_CHECKING:
+    from unjam.measures.table import Cell
 
 LINE_SECONDS = 5.0
 """time between two plain lines of progress where there is no terminal"""
 
 PIPE_WIDTH = 160
 """columns of a table where there is no terminal"""
+NARROW = 18, 7
+"""columns of the names of metrics and of their units where there is little room"""
+WORDS_WIDTH = 22
+"""columns of headings and verdicts: as wide as most numbers with their intervals"""
 
 console = Console(highlight=False, width=None if sys.stdout.isatty() else PIPE_WIDTH)
 aside = Console(stderr=True, highlight=False, width=None if sys.stderr.isatty() else PIPE_WIDTH)
@@ -38,28 +48,51 @@ def new_table(words: Sequence[str] = (), numbers: Sequence[str] = (), style: str
     return table
 
 
-def metrics_table(rows_by_driver: dict[str, list[dict[str, Any]]]) -> Table:
-    """Return the table of the verdict and all metrics: mean and 95 % bootstrap interval over episodes."""
-    from unjam.measures.drivable import verdicts
-    from unjam.measures.metrics import METRICS
-    from unjam.measures.statistics import digits_of, estimate
+def print_metrics(rows_by_driver: dict[str, list[dict[str, Any]]]) -> None:
+    """Print the verdict and all metrics, with 95 % intervals, and what each driver is beyond the baseline.
 
-    table = new_table(("metric", "unit"), list(rows_by_driver))
-    table.add_row("could a car drive so?", "", *(said or "–" for said in verdicts(rows_by_driver).values()))
-    for name, metric in METRICS.items():
-        cells = []
-        for rows in rows_by_driver.values():
-            found = estimate([row[name] for row in rows])
-            if found.count == 0:
-                cells.append("–")
-                continue
-            digits = digits_of(found, metric.digits)
-            mean, low, high = (f"{value:.{digits}f}" for value in (found.mean, found.low, found.high))
-            interval = f" [dim]\\[{low}, {high}][/dim]" if found.count > 1 else ""
-            share = f" [dim]{found.count} of {len(rows)}[/dim]" if found.count < len(rows) else ""
-            cells.append(f"{mean}{interval}{share}")
-        table.add_row(metric.label, metric.unit, *cells)
-    return table
+    Where not all drivers fit beside each other there are several tables; where not even one does, intervals
+    stand below means.
+    """
+    from unjam.measures.table import baseline_of, headings_of, table_of
+
+    baseline = baseline_of(rows_by_driver)
+    headings, rows = headings_of(rows_by_driver, baseline), table_of(rows_by_driver, baseline)
+    columns = {label: [number] for number, label in enumerate(rows_by_driver)}
+    compared = [label for label in columns if label != baseline]
+    for label, number in zip(compared, range(len(columns), len(headings)), strict=False):
+        columns[label].append(number)  # nobody is compared without a baseline
+
+    def of(chosen: Sequence[int], separator: str) -> Table:
+        table = new_table(("metric", "unit"), [fill(headings[number], WORDS_WIDTH) for number in chosen])
+        for column in table.columns[2:]:
+            column.no_wrap = True
+        if separator != " ":
+            table.columns[0].width, table.columns[1].width = NARROW
+        for row in rows:
+            table.add_row(row.label, row.unit, *(_marked(row.cells[number], separator) for number in chosen))
+        return table
+
+    def fits(chosen: Sequence[int], separator: str) -> bool:
+        unlimited = console.options.update_width(10 * PIPE_WIDTH)
+        return Measurement.get(console, unlimited, of(chosen, separator)).maximum <= console.width
+
+    separator = " " if all(fits(each, " ") for each in columns.values()) else "\n"
+    blocks = [list[int]()]
+    for each in columns.values():
+        together = sorted([*blocks[-1], *each])
+        if blocks[-1] and not fits(together, separator):
+            blocks.append(each)
+        else:
+            blocks[-1] = together
+    for block in blocks:
+        console.print(of(block, separator))
+
+
+def _marked(cell: "Cell", separator: str) -> str:
+    """Return a cell in rich's markup: its interval dim, verdicts in lines."""
+    interval = escape(cell.interval).join(("[dim]", "[/dim]")) if cell.interval else ""
+    return separator.join(filter(None, (escape(fill(cell.mean, WORDS_WIDTH)), interval)))
 
 
 class Counted:

@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from unjam.cli.options import DEFAULT_WORKERS, HumansOption, JsonOption, WorkersOption, scenario_changes
-from unjam.cli.output import aside, console, counting_steps, metrics_table, new_table, print_json
+from unjam.cli.output import aside, console, counting_steps, new_table, print_json, print_metrics
 from unjam.errors import InputError
 
 
@@ -37,8 +37,8 @@ def evaluate(
       unjam evaluate runs/ring-001 --humans drivers.json --out runs/among-others
     """
     from unjam.drivers.registry import DRIVERS
+    from unjam.measures.statistics import signed
     from unjam.reports.html import write_report
-    from unjam.reports.story import signed
     from unjam.training.evaluate import comparison, judge
     from unjam.training.folder import read_config
     from unjam.training.train import TrainResult, gain_of
@@ -62,7 +62,7 @@ def evaluate(
         drivers = [{"driver": one, "episodes": rows, "mean": means[one]} for one, rows in found.rows.items()]
         print_json({"run": str(run), "scenario": config.scenario, "gain": gain, "drivers": drivers})
         return
-    console.print(metrics_table(found.rows))
+    print_metrics(found.rows)
     if result.gain is not None:
         console.print(f"return beyond the expert, 95 % interval: {signed(result.gain)}")
     aside.print(f"report: {result.report}")

@@ -27,7 +27,7 @@ from unjam.cli.options import (
     scenario_changes,
     with_options,
 )
-from unjam.cli.output import Counted, aside, console, metrics_table, print_json
+from unjam.cli.output import Counted, aside, console, print_json, print_metrics
 from unjam.errors import InputError
 
 LINE_EVERY = 5
@@ -88,7 +88,7 @@ def train(
         config = load_config(asked.file, asked.preset, changes)
         folder = new_folder(out, config.scenario)
     check_possible(config)
-    from unjam.reports.story import signed  # and torch: seconds that nobody waits for a wrong word
+    from unjam.measures.statistics import signed  # and torch: seconds that nobody waits for a wrong word
     from unjam.training.evaluate import Evaluation
     from unjam.training.train import steps_to_train
     from unjam.training.train import train as run
@@ -111,7 +111,7 @@ def train(
     for name, of in (result.roads or {"": result}).items():
         if name:
             console.print(f"{name}:")
-        console.print(metrics_table(of.rows))
+        print_metrics(of.rows)
         if of.gain is not None:
             console.print(f"return beyond the expert, held-out seeds, 95 % interval: {signed(of.gain)}")
         aside.print(f"controller: {of.controller}")

@@ -1,6 +1,6 @@
 """Means over seeds and over trainings, and how far to trust them: intervals that cover what they say.
 
-An interval is Student's t: it covers 95 % from three values on, where a percentile bootstrap of five covers 84 %.
+An interval is Student's t: it covers 95 % from three values on; a percentile bootstrap of five covers 84 %.
 Where none would cover there is none, and words show the range of the values instead.
 """
 
@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import t as student
 
-from unjam.measures.metrics import METRICS, SHARE, SIGNED
+from unjam.measures.metrics import METRICS, SIGNED
 
 CONFIDENCE = 0.95
 LEAST = 3
@@ -165,7 +165,7 @@ def crossed_estimate(values: Any) -> Estimate:
 
     Both trainings and seeds are drawn at random, and every training meets every seed: two-way random effects
     without repetition. The interval is that of Student's t with Satterthwaite's degrees of freedom. Of fewer
-    than `LEAST` trainings or seeds, and of trainings of two modes, there is none, but the range of their means.
+    than `LEAST` trainings or seeds, and of trainings of two modes, there is none, but the range of means.
 
     Args:
         values: of each training on each seed, shape (T, S).

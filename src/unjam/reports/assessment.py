@@ -16,10 +16,10 @@ from unjam.files import check_folder, write_whole
 from unjam.measures.effect import FLOW_LOST, LEAST_JUDGED
 from unjam.measures.recommendation import percent
 from unjam.measures.statistics import Estimate, signed
+from unjam.measures.table import cell_of
 from unjam.reports.figures import INK, LINES, STYLE, data_uri, new_figure, space_time
 from unjam.reports.html import filled
 from unjam.reports.results import command_to_repeat, read_results
-from unjam.reports.story import cell_of
 
 ASSESSMENT_FILE, ASSESSMENT_PAGE = "assessment.json", "assessment.html"
 EFFECTS = (
@@ -123,7 +123,7 @@ def _table(found: dict[str, Any]) -> list[dict[str, Any]]:
     for field, metric, label, unit, digits in EFFECTS:
         people = _estimate(found["people"][metric])
         cells = [signed(each["effect"][field], digits) for each in judged]
-        rows.append((label, unit, [cell_of(people, digits, people.count)["mean"], *cells]))
+        rows.append((label, unit, [cell_of(people, digits).mean, *cells]))
     relative = [
         f"{100 * each['effect']['travel_time'].mean / each['effect']['people_time']:+.1f}" for each in judged
     ]

@@ -16,6 +16,7 @@ from matplotlib.figure import Figure
 from unjam import __version__
 from unjam.files import check_folder, write_whole
 from unjam.measures.statistics import estimate_of
+from unjam.measures.table import headings_of, table_of
 from unjam.reports.figures import (
     colour_table,
     data_uri,
@@ -28,7 +29,15 @@ from unjam.reports.figures import (
 from unjam.reports.film import split_lines
 from unjam.reports.model import errors, examples, model_section, trust
 from unjam.reports.results import Results, Shown, command_to_repeat, read_results
-from unjam.reports.story import cards_of, columns_of, lead_of, names_of, notes_of, table_of, title_of
+from unjam.reports.story import (
+    baseline_of_columns,
+    cards_of,
+    columns_of,
+    lead_of,
+    names_of,
+    notes_of,
+    title_of,
+)
 from unjam.scenarios.scenario import VEHICLE_LENGTH
 
 MOST_PANELS = 6
@@ -72,6 +81,7 @@ def render(results: Sequence[Results]) -> str:
     single = results[0] if len(results) == 1 else None
     sources = list(zip(names_of(results), results, strict=True))
     counts = [len(column.rows) for column in columns]
+    rows, baseline = {column.name: column.rows for column in columns}, baseline_of_columns(results)
     drawn = [", ".join(f"{key} {value:g} m" for key, value in episode.drawn.items()) for episode in panels]
     return filled(
         "report.html",
@@ -86,7 +96,9 @@ def render(results: Sequence[Results]) -> str:
         model=model_section(single) if single else None,
         columns=columns,
         episodes=list(dict.fromkeys((min(counts), max(counts)))),
-        table=table_of(columns),
+        headings=headings_of(rows, baseline),
+        baseline=baseline,
+        table=table_of(rows, baseline),
         sources=[(name, result, command_to_repeat(result)) for name, result in sources],
         script=Markup(page_part("replay.js")),
         replay_data=Markup(json.dumps(replay_data(panels)).replace("<", "\\u003c")),

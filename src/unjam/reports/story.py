@@ -6,10 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from unjam.measures.drivable import verdicts
 from unjam.measures.effect import beside_people
-from unjam.measures.metrics import METRICS, Metric
-from unjam.measures.statistics import Estimate, digits_of, estimate_of, paired_difference, signed
+from unjam.measures.statistics import estimate_of, paired_difference, signed
+from unjam.measures.table import baseline_of
 from unjam.reports.results import Results, Shown
 
 CLOSE_HEADWAY = 1.0
@@ -42,6 +41,14 @@ def columns_of(results: Sequence[Results]) -> list[Column]:
                 name = f"{folder}: {label}"
             columns.setdefault(name, Column(name, rows, result.shown.get(label)))
     return list(columns.values())
+
+
+def baseline_of_columns(results: Sequence[Results]) -> str:
+    """Return beside whom the table of `columns_of` sets the drivers; of several folders who is in all."""
+    first, *others = (baseline_of(result.rows) for result in results)
+    same = {tuple(_episodes(result.rows.get(first, []))) for result in results}
+    own = len(results) > 1 and any(result.trained in (None, first) for result in results)
+    return first if all(other == first for other in others) and len(same) == 1 and not own else ""
 
 
 def _episodes(rows: Sequence[dict[str, Any]]) -> list[tuple[str, str]]:
@@ -182,37 +189,3 @@ def cards_of(result: Results) -> list[dict[str, str]]:
         detail = "of one seed" if np.isnan(gain.low) else f"95 % interval {gain.low:+.0f} to {gain.high:+.0f}"
         cards.insert(0, {"label": "Return beyond the expert", "value": f"{gain.mean:+.0f}", "detail": detail})
     return cards
-
-
-def table_of(columns: Sequence[Column]) -> list[dict[str, Any]]:
-    """Return the table of all metrics: a row per metric, a cell per column, mean and 95 % interval.
-
-    First the verdict: could a car drive so?
-    """
-    found = verdicts({column.name: column.rows for column in columns})
-    said = [{"mean": found[column.name] or "–", "interval": ""} for column in columns]
-    about = "The first reason against it; docs: What a car can drive."
-    verdict = {"label": "could a car drive so?", "unit": "", "about": about, "cells": said}
-    return [verdict, *(_row_of(columns, name, metric) for name, metric in METRICS.items())]
-
-
-def _row_of(columns: Sequence[Column], name: str, metric: Metric) -> dict[str, Any]:
-    return {
-        "label": metric.label,
-        "unit": metric.unit,
-        "about": " ".join((metric.function.__doc__ or "").split()),
-        "cells": [
-            cell_of(estimate_of(column.rows, name), metric.digits, len(column.rows)) for column in columns
-        ],
-    }
-
-
-def cell_of(found: Estimate, digits: int, wanted: int) -> dict[str, str]:
-    """Return a cell: mean and interval; how many of `wanted` values it stands for, where that is not all."""
-    if found.count == 0:
-        return {"mean": "–", "interval": ""}
-    digits = digits_of(found, digits)
-    interval = "" if np.isnan(found.low) else f"[{found.low:.{digits}f}, {found.high:.{digits}f}]"
-    if found.count < wanted:
-        interval = f"{interval} {found.count} of {wanted}".strip()
-    return {"mean": f"{found.mean:.{digits}f}", "interval": interval}

@@ -1,18 +1,13 @@
 """What was driven as tables of pandas, and as a notebook shows it."""
 
-from typing import Any
-
 import pandas as pd
 
 from unjam.measures.metrics import METRICS
 from unjam.measures.statistics import summarise
+from unjam.measures.table import Rows, baseline_of, headings_of, table_of
 from unjam.reports.figures import data_uri, space_time
 from unjam.reports.results import shown_of
-from unjam.reports.story import Column, table_of
 from unjam.worlds.record import Episode
-
-Rows = dict[str, list[dict[str, Any]]]
-"""by driver: a row of metrics per episode, failed ones too"""
 
 
 def frame_of_rows(rows_by_driver: Rows) -> pd.DataFrame:
@@ -40,13 +35,13 @@ def frame_of_metrics(rows_by_driver: Rows) -> pd.DataFrame:
 
 def html_of(rows_by_driver: Rows, shown: dict[str, Episode]) -> str:
     """Return the report's table and its picture of all vehicles over time, as HTML for a notebook."""
-    rows = table_of([Column(label, rows, None) for label, rows in rows_by_driver.items()])
+    baseline = baseline_of(rows_by_driver)
     cells = [
-        [f"{row['label']} [{row['unit']}]" if row["unit"] else row["label"]]
-        + [f"{cell['mean']} {cell['interval']}".strip() for cell in row["cells"]]
-        for row in rows
+        [f"{row.label} [{row.unit}]" if row.unit else row.label, *map(str, row.cells)]
+        for row in table_of(rows_by_driver, baseline)
     ]
-    table = pd.DataFrame(cells, columns=["", *rows_by_driver]).to_html(index=False, border=0)
+    headings = ["", *headings_of(rows_by_driver, baseline)]
+    table = pd.DataFrame(cells, columns=headings).to_html(index=False, border=0)
     if not shown:
         return table
     picture = data_uri(space_time([shown_of(label, episode) for label, episode in shown.items()]))

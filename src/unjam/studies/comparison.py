@@ -23,6 +23,7 @@ from unjam.measures.statistics import (
     paired_difference,
     probability_of_improvement,
 )
+from unjam.measures.table import unbroken
 from unjam.reports.figures import INK, LINES, STYLE, new_figure, space_time
 from unjam.reports.results import Shown, read_results
 from unjam.studies.study import (
@@ -183,11 +184,6 @@ def interval(entries: dict[str, Any], digits: int, sign: str = "") -> str:
     """Return an estimate with its interval as pages show it."""
     mean, low, high = (number(entries[name], digits, sign) for name in ("mean", "low", "high"))
     return unbroken(f"{mean} [{low}, {high}]")
-
-
-def unbroken(text: str) -> str:
-    """Return a text that stays on one line of a table."""
-    return text.replace(" ", "\N{NO-BREAK SPACE}")
 
 
 def _mean_and_std(values: Sequence[float]) -> dict[str, float]:
