@@ -175,7 +175,7 @@ def search(
       unjam search ring --vary policy.exploration_std=0.05..0.5 --executor ray --workers 64 --out /shared/it
     """
     from unjam.training.config import load_config
-    from unjam.training.search import BEST, check_space, space_of
+    from unjam.training.search import BEST, check_space, space_of, words_of_trial
     from unjam.training.search import search as run
 
     base, space = load_config(asked.file, asked.preset, asked.flags | asked.settings), space_of(vary or [])
@@ -186,13 +186,15 @@ def search(
     found = run(base, space, trials, folder, workers, runner, (lambda line: None) if json else aside.print)
     best = folder / BEST
     if json:
-        rows = [{"trial": one.number, "gain": one.gain, "values": one.values} for one in found]
+        rows = [
+            {"trial": one.number, "gain": one.gain, "last": one.last, "values": one.values} for one in found
+        ]
         print_json({"folder": str(folder), "best": str(best), "trials": rows})
         return
     for one in found[:5]:
-        values = ", ".join(f"{key}={value}" for key, value in one.values.items())
-        gain = "failed" if one.gain is None else f"{one.gain:+.1f}"
-        console.print(f"trial {one.number}: {gain} beyond the expert, validation seeds: {values}")
+        console.print(words_of_trial(one))
+    untrained = sum(one.gain is not None and one.gain <= 0 for one in found)
+    console.print(f"{untrained} of {len(found)} trainings kept the untrained network")
     console.print(f"train with the best: unjam train --config {best}", soft_wrap=True)
 
 

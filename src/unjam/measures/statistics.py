@@ -111,6 +111,14 @@ def interval_of(found: Estimate, digits: str) -> str:
     return f"({found.smallest:{digits}} to {found.largest:{digits}})"
 
 
+def over_trainings(
+    values: Sequence[float], trim: float = 0.0, bounds: tuple[float, float] = SIGNED
+) -> Estimate:
+    """Return the estimate of a number of each training: of two modes there is no interval, but the range."""
+    found = estimate(values, trim=trim, bounds=bounds)
+    return replace(found, low=nan, high=nan) if two_modes(values) else found
+
+
 def paired_by_training(
     runs: Sequence[Sequence[dict[str, Any]]], others: Sequence[dict[str, Any]], name: str
 ) -> Any:

@@ -104,7 +104,7 @@ def cell_of(found: Estimate, digits: int, wanted: int | None = None, sign: str =
     """Return a cell: mean and interval, unless that is a point; of how many, where `wanted` are more."""
     if found.count == 0:
         return Cell("–")
-    shown = f"{sign}.{digits_of(found, digits)}f"
+    shown = f"{sign if found.mean else ''}.{digits_of(found, digits)}f"
     interval = "" if found.smallest == found.largest else interval_of(found, shown)
     if wanted is not None and found.count < wanted:
         interval = f"{interval} {found.count} of {wanted}".strip()

@@ -188,6 +188,16 @@ def read_progress(folder: Path) -> list[dict[str, Any]]:
     return rows
 
 
+def validations_of(progress: Sequence[dict[str, Any]]) -> tuple[float, float] | None:
+    """Return the best return and the last on the validation seeds, beyond the expert's; None without any.
+
+    Where the best is not above zero the untrained network was kept, which earns what the expert does.
+    """
+    validated = [row["return_validation"] for row in progress if row["return_validation"] is not None]
+    expert = progress[0]["return_expert"] or 0.0 if progress else 0.0
+    return (max(validated) - expert, validated[-1] - expert) if validated else None
+
+
 def seconds_by_part(progress: Sequence[dict[str, Any]]) -> dict[str, float]:
     """Return the wall time of each part of training [s], over all rows of progress."""
     parts = dict.fromkeys(part for row in progress for part in row["seconds"])

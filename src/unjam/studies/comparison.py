@@ -5,7 +5,9 @@ trainings of each variant: mean and range over the seeds.
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import asdict, fields, replace
+from functools import partial
+from math import inf, nan
 from pathlib import Path
 from typing import Any
 
@@ -15,17 +17,20 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 
 from unjam.files import to_json, write_whole
+from unjam.measures.metrics import METRICS
 from unjam.measures.statistics import (
     Estimate,
-    estimate,
+    crossed_estimate,
     estimate_of,
-    interquartile_mean,
+    interval_of,
+    over_trainings,
+    paired_by_training,
     paired_difference,
     probability_of_improvement,
 )
-from unjam.measures.table import unbroken
+from unjam.measures.table import cell_of, unbroken
 from unjam.reports.figures import INK, LINES, STYLE, new_figure, space_time
-from unjam.reports.results import Shown, read_results
+from unjam.reports.results import Shown, read_results, validations_of
 from unjam.studies.study import (
     PAPERS_ROADS,
     REFERENCES,
@@ -37,6 +42,7 @@ from unjam.studies.study import (
     Table,
     TrainedRun,
     planned,
+    read_part,
 )
 from unjam.training.config import load_config
 
@@ -71,6 +77,8 @@ HONEST = (
 )
 """metrics of the deterministic policy on held-out seeds"""
 EXPERTS = tuple(label for label in REFERENCES if label not in ("human", "zero", "constant +0.1"))
+INTERQUARTILE = 0.25
+"""share left out at either end: Agarwal et al. 2021, `Deep RL at the edge of the statistical precipice`"""
 POINTS = 100
 """of a curve"""
 DRAWN = {"return_mean": "return, in training", "cav_mean_speed": "CAV's mean speed, in training [m/s]"}
@@ -90,7 +98,8 @@ def comparison_of(title: str, variants: Sequence[str], road: str = "ring") -> St
         write_whole(folder / "curves.json", to_json({road: curves}))
         draw_curves(road, curves, references, metric).savefig(folder / "curves.png")
 
-    return Study(title, lambda seeds: planned([road], variants, seeds), write, (road,))
+    tables = {"checkpoints": partial(_checkpoints, road)}
+    return Study(title, lambda seeds: planned([road], variants, seeds), write, (road,), tables=tables)
 
 
 def metric_of(road: str, variant: str) -> str:
@@ -112,6 +121,8 @@ def table_rows(studies: StudyFolder, road: str, variants: Sequence[str], seeds: 
     for label, found in references.items():
         row = {"road": road, "name": label, "learns": False, "trainings": 0, "episodes": len(found)}
         row |= {"best_expert": label == best, **estimates(found, HONEST)}
+        beyond = paired_difference(found, references[best], metric_of(road, variants[0]))
+        row["beyond_best_expert"] = entries(beyond)
         convention = {key: _mean_and_std(_finite(found, name)) for key, (name, _) in CONVENTION.items()}
         rows.append({**row, "paper_convention": convention, "steady_by_draw": _by_draw(road, found)})
     trained = {variant: studies.trained(road, variant, seeds) for variant in variants}
@@ -136,9 +147,9 @@ def _of_variant(
     for name in HONEST:
         own = name != "return" or metric == "return"  # returns of another reward are no returns here
         values = [_mean(_finite(run.rows, name)) if own else float("nan") for run in runs]
-        row[name] = entries(estimate(values, interquartile_mean))
-    gains = [paired_difference(run.rows, references[best], metric).mean for run in runs]
-    improved = probability_of_improvement([run.rows for run in runs], references[best], metric)
+        row[name] = entries(over_trainings(values, INTERQUARTILE, METRICS[name].bounds))
+    differences = paired_by_training([run.rows for run in runs], references[best], metric)
+    validated = [found for run in runs if (found := validations_of(run.progress))]
     return {
         **row,
         "paper_convention": {
@@ -147,10 +158,11 @@ def _of_variant(
         },
         "steady_by_draw": _by_draw(road, [one for run in runs for one in run.rows]),
         "beyond": {"expert": best, "metric": metric},
-        "beyond_best_expert": entries(estimate(gains)),
-        "probability_of_improvement": entries(improved),
+        "beyond_best_expert": entries(crossed_estimate(differences)),
+        "probability_of_improvement": entries(probability_of_improvement(differences)),
+        "kept_untrained": sum(best <= 0 for best, _ in validated),
         "seconds": _mean([run.seconds for run in runs]),
-        "gains": gains,
+        "gains": differences.mean(1).tolist(),
     }
 
 
@@ -170,9 +182,9 @@ def estimates(rows: Table, names: Sequence[str]) -> dict[str, dict[str, float]]:
     return {name: entries(estimate_of(rows, name)) for name in names}
 
 
-def entries(found: Estimate) -> dict[str, float]:
+def entries(found: Estimate) -> dict[str, Any]:
     """Return an estimate as tables keep it."""
-    return {"mean": found.mean, "low": found.low, "high": found.high}
+    return asdict(found)
 
 
 def number(value: float | None, digits: int, sign: str = "") -> str:
@@ -181,9 +193,11 @@ def number(value: float | None, digits: int, sign: str = "") -> str:
 
 
 def interval(entries: dict[str, Any], digits: int, sign: str = "") -> str:
-    """Return an estimate with its interval as pages show it."""
-    mean, low, high = (number(entries[name], digits, sign) for name in ("mean", "low", "high"))
-    return unbroken(f"{mean} [{low}, {high}]")
+    """Return an estimate as pages show it: with its interval, else its range, where that is known."""
+    nothing: dict[str, Any] = {"count": 0, "smallest": nan, "largest": nan}  # of tables of before
+    known: dict[str, Any] = nothing | {key: nan if value is None else value for key, value in entries.items()}
+    found = Estimate(**{field.name: known[field.name] for field in fields(Estimate)})
+    return unbroken(f"{number(found.mean, digits, sign)} {interval_of(found, f'{sign}.{digits}f')}".strip())
 
 
 def _mean_and_std(values: Sequence[float]) -> dict[str, float]:
@@ -232,6 +246,24 @@ def curves_of(studies: StudyFolder, road: str, variants: Sequence[str], seeds: i
         for name in (*RETURNS, *SPEEDS) if metric_of(road, variant) == metric else SPEEDS:
             found[variant][name] = [_on(grid, run.progress, name) for run in runs]
     return found
+
+
+def _checkpoints(road: str, folder: Path) -> pd.DataFrame:
+    """Return what validation chose beside the last checkpoint, and how many kept the untrained network.
+
+    From the curves, on the validation seeds. Tables of before know who kept it by a gain of zero alone.
+    """
+    curves, table = read_part(folder, "curves")[road], []
+    for row in read_part(folder, "table"):
+        if "return_validation" in curves.get(row.get("variant"), {}):
+            values = np.array(curves[row["variant"]]["return_validation"])
+            best, last = values.max(1), values[:, -1]
+            kept = row.get("kept_untrained", sum(gain == 0 for gain in row["gains"]))
+            cells = {"": row["name"], "trainings": len(values), "best trained": number(best.mean(), 0)}
+            cells["last checkpoint"] = number(last.mean(), 0)
+            cells["last − best"] = str(cell_of(over_trainings(last - best, bounds=(-inf, 0.0)), 0, sign="+"))
+            table.append({**cells, "kept the untrained network": f"{kept} of {len(values)}"})
+    return pd.DataFrame(table)
 
 
 def _on(grid: np.ndarray, progress: Table, name: str) -> list[float]:

@@ -17,7 +17,8 @@ from unjam.drivers.driver import Driver
 from unjam.drivers.follower_stopper import FollowerStopper
 from unjam.files import to_json, write_whole
 from unjam.measures.drivable import DRIVABLE, verdicts
-from unjam.measures.statistics import crossed_estimate
+from unjam.measures.statistics import crossed_estimate, estimate
+from unjam.measures.table import cell_of
 from unjam.scenarios.ring import Ring
 from unjam.scenarios.scenario import Scenario
 from unjam.studies.study import Study, StudyFolder, planned
@@ -71,12 +72,11 @@ def table(road: str, folder: Path) -> pd.DataFrame:
     """Return who earns what on a road, over all lengths, and what each is beyond the tuned expert."""
     found = pd.read_json(folder / f"{road}.json", typ="series")
     labels = list(found.iloc[0])
-    returns = {label: _of(found, label, "return") for label in labels}
     trainings = [label for label in labels if label.startswith("training")]
     shown = [label for label in labels if label not in trainings]
-    rows = [_row(found, returns, label, [label]) for label in shown]
+    rows = [_row(found, label, [label]) for label in shown]
     if trainings:
-        rows.append(_row(found, returns, f"residual, {len(trainings)} trainings", trainings))
+        rows.append(_row(found, f"residual, {len(trainings)} trainings", trainings))
     return pd.DataFrame(rows)
 
 
@@ -86,9 +86,15 @@ def _of(found: Any, label: str, name: str) -> np.ndarray:
     return np.array(by_length, np.float64).mean(0)
 
 
-def _row(found: Any, returns: dict[str, np.ndarray], label: str, members: list[str]) -> dict[str, Any]:
-    beyond = np.array([returns[member] - returns[TUNED] for member in members])
-    gain = crossed_estimate(beyond) if len(members) > 1 else None
+def _beyond(found: Any, members: list[str], baseline: str, name: str, digits: int) -> str:
+    """Return what drivers, or several trainings, are beyond another driver on the same seeds."""
+    beyond = np.array([_of(found, member, name) - _of(found, baseline, name) for member in members])
+    return str(
+        cell_of(crossed_estimate(beyond) if len(members) > 1 else estimate(beyond[0]), digits, sign="+")
+    )
+
+
+def _row(found: Any, label: str, members: list[str]) -> dict[str, Any]:
     mean = partial(_mean_of, found, members)
     drivable = [found[length][member]["drivable"] for length in found.index for member in members]
     worst = [each for each in drivable if each != DRIVABLE]
@@ -96,10 +102,9 @@ def _row(found: Any, returns: dict[str, np.ndarray], label: str, members: list[s
     return {
         "driver": label,
         "return": f"{mean('return'):.0f}",
-        "beyond the tuned expert": f"{gain.mean:+.0f} [{gain.low:+.0f}, {gain.high:+.0f}]"
-        if gain
-        else f"{beyond.mean():+.0f}",
+        "beyond the tuned expert": _beyond(found, members, TUNED, "return", 0),
         "mean speed [m/s]": f"{mean('mean_speed'):.2f}",
+        "beyond people [m/s]": _beyond(found, members, "human", "mean_speed", 2),
         "flow [veh/h]": f"{mean('throughput_veh_per_h'):.0f}",
         "fuel [ml/km]": f"{mean('fuel_ml_per_km'):.0f}",
         "smallest headway [s]": f"{min(headways):.2f}" if headways else "–",

@@ -9,6 +9,7 @@ against the traffic at about 20 km/h, 5.6 m/s; on motorways it is 15 to 20 km/h.
 import json
 from dataclasses import dataclass, field
 from functools import partial
+from math import nan
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ from unjam.drivers.wrappers import Impaired
 from unjam.files import make_folder, to_json, write_whole
 from unjam.manifest import manifest
 from unjam.measures.metrics import measure
-from unjam.measures.statistics import paired_difference
+from unjam.measures.statistics import Estimate, paired_difference
 from unjam.measures.waves import wave_speed
 from unjam.reports.figures import png_bytes, space_time
 from unjam.reports.results import read_results
@@ -201,8 +202,7 @@ def _carried_over_table(folder: Path) -> pd.DataFrame:
 
 
 def _mean_and_range(values: pd.Series) -> str:
-    found = {"mean": values.mean(), "low": values.min(), "high": values.max()}
-    return interval(found, 2) if len(values) > 1 else number(found["mean"], 2)
+    return interval(entries(Estimate(values.mean(), nan, nan, len(values), values.min(), values.max())), 2)
 
 
 def people_on_ring(

@@ -23,7 +23,7 @@ from unjam.drivers.network import Network
 from unjam.drivers.observation import observation_size
 from unjam.drivers.residual import ResidualDriver
 from unjam.files import to_json, write_whole
-from unjam.measures.statistics import estimate, estimate_of
+from unjam.measures.statistics import estimate_of, over_trainings
 from unjam.reports.figures import LINES, STYLE, new_figure, stacked_bars
 from unjam.reports.results import read_progress, seconds_by_part
 from unjam.studies.comparison import entries
@@ -80,7 +80,9 @@ def untrained(
             returns = {label: estimate_of(driven, "return").mean for label, driven in found.rows.items()}
             for kind in bases:
                 values = [returns[f"{kind} {number}"] for number in range(policies)]
-                rows.append({"road": road, "policy": kind, "returns": values, **entries(estimate(values))})
+                rows.append(
+                    {"road": road, "policy": kind, "returns": values, **entries(over_trainings(values))}
+                )
             rows.append({"road": road, "policy": "expert alone", "mean": returns["expert alone"]})
     return rows
 
@@ -102,7 +104,7 @@ def convergence(studies: StudyFolder, seeds: int) -> Table:
                 "arrivals": [there[0]["actual_steps"] if there else None for there in near],
                 "stayed": sum(value >= enough for value in last),
                 "trainings": len(found),
-                "last": entries(estimate(last)),
+                "last": entries(over_trainings(last)),
             }
         )
     return rows

@@ -16,7 +16,7 @@ from unjam.errors import InputError, MissingPartError, UnjamError, wrong
 from unjam.files import make_folder, to_json, write_whole
 from unjam.manifest import manifest
 from unjam.parameters import changed, nested, parse_value
-from unjam.reports.results import read_progress
+from unjam.reports.results import read_progress, validations_of
 from unjam.training.config import RunConfig, load_config, to_toml
 from unjam.training.executors import CommandLine, Executor, OnLine, running, training_command
 from unjam.training.folder import check_possible
@@ -123,6 +123,8 @@ class Trial:
     folder: Path
     gain: float | None
     """return beyond the expert's on the validation seeds, of the best controller; None where it failed"""
+    last: float | None
+    """the same of the last checkpoint"""
 
 
 def search(
@@ -167,17 +169,23 @@ def search(
                 failed = done.result() != 0
                 _tell(study, number, None if failed else validation_gain(_trial_folder(folder, number)))
                 on_line(_words(study, number, trials))
-    found = [
-        Trial(trial.number, trial.params, _trial_folder(folder, trial.number), trial.value)
-        for trial in study.get_trials()
-    ]
+    found = [_trial(folder, trial.number, trial.params, trial.value) for trial in study.get_trials()]
     found.sort(key=lambda trial: -math.inf if trial.gain is None else trial.gain, reverse=True)
-    rows = [{"trial": one.number, "gain": one.gain, "folder": str(one.folder), **one.values} for one in found]
+    rows = [
+        {"trial": one.number, "gain": one.gain, "last": one.last, "folder": str(one.folder), **one.values}
+        for one in found
+    ]
     write_whole(folder / FOUND, to_json({"manifest": manifest(), "trials": rows}, indent=1))
     if found[0].gain is None:
         raise UnjamError(f"all {len(found)} trainings failed; what they said is in {folder / 'plans'}")
     write_whole(folder / BEST, to_toml(trial_config(base, found[0].values)))
     return found
+
+
+def _trial(folder: Path, number: int, values: dict[str, Any], gain: float | None) -> Trial:
+    place = _trial_folder(folder, number)
+    validated = validations_of(read_progress(place))
+    return Trial(number, values, place, gain, validated[1] if gain is not None and validated else None)
 
 
 def _trial_folder(folder: Path, number: int) -> Path:
@@ -253,9 +261,20 @@ def _tell(study: "Study", number: int, gain: float | None) -> None:
 
 def validation_gain(folder: Path) -> float | None:
     """Return a training's best validation beyond its expert's; None where there was no validation."""
-    rows = read_progress(folder)
-    validated = [row["return_validation"] for row in rows if row["return_validation"] is not None]
-    return max(validated) - (rows[0]["return_expert"] or 0.0) if validated else None
+    found = validations_of(read_progress(folder))
+    return found and found[0]
+
+
+def words_of_trial(trial: Trial) -> str:
+    """Return what a trial has reached: the controller that validation chose, and the last checkpoint."""
+    values = ", ".join(f"{key}={value}" for key, value in trial.values.items())
+    if trial.gain is None or trial.last is None:
+        return f"trial {trial.number}: failed: {values}"
+    kept = "" if trial.gain > 0 else " (the untrained network was kept)"
+    last = f"last checkpoint {trial.last:+.1f}"
+    return (
+        f"trial {trial.number}: {trial.gain:+.1f} beyond the expert, {last}, validation seeds{kept}: {values}"
+    )
 
 
 def _words(study: "Study", number: int, trials: int) -> str:
