@@ -125,7 +125,8 @@ def test_nothing_speaks_against_what_helps_and_harms_nobody() -> None:
         ({"drivable": ""}, "no car could drive so: no CAV drove"),
         (
             {"hard_braking": between(-1, 9)},
-            "people brake beyond 4.5 m/s² more often than alone: +4 [-1, +9] times in a million moments",
+            "people brake beyond 4.5 m/s² more often than alone: +4 [-1, +9] times in a million moments, "
+            "of which the mean's sign is asked",
         ),
     ],
 )

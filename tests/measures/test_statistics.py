@@ -22,6 +22,7 @@ from unjam.measures.statistics import (
     signed,
     summarise,
     two_modes,
+    verdict_on,
 )
 
 COUNTS = (3, 5, 10, 20)
@@ -247,6 +248,24 @@ def test_two_modes_are_seen_and_seldom_made_up(count: int) -> None:
     assert np.mean([two_modes(values) for values in normal]) < 0.03
     apart = normal + 30.0 * (np.arange(count) >= count // 2)
     assert np.mean([two_modes(values) for values in apart]) > 0.9
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "trainings", "words"),
+    [
+        (1.0, 3.0, 10, "The residual pays."),
+        (1.0, 3.0, 9, "It earns more: that is 9 trainings, and a residual pays where 10 show it."),
+        (-3.0, -1.0, 1, "It earns less: that is one training, and a residual pays where 10 show it."),
+        (-3.0, -1.0, 12, "The residual makes it worse."),
+        (-1.0, 3.0, 50, "No gain is shown: the interval holds zero."),
+        (0.0, 0.0, 50, "No gain is shown: the interval holds zero."),
+        (np.nan, np.nan, 50, "There is no interval: nothing is shown."),
+    ],
+)
+def test_words_follow_from_an_interval_without_zero_and_ten_trainings(
+    low: float, high: float, trainings: int, words: str
+) -> None:
+    assert verdict_on(Estimate((low + high) / 2, low, high, 20), trainings) == words
 
 
 def test_two_modes_need_two_values_each() -> None:

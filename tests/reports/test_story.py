@@ -51,17 +51,17 @@ def driven(folder: str = "runs/drive-001", scenario: str = "ring", **rows: list[
 EXPERT = [100.0, 140.0, 180.0, 120.0]
 
 
-def test_a_gain_above_zero_is_said_to_pay() -> None:
+def test_a_gain_above_zero_is_that_of_one_training() -> None:
     lead = lead_of(trained_on_pi([112.0, 148.0, 190.0, 130.0], EXPERT))
     assert lead.startswith("On 4 held-out seeds the trained controller earns 145 an episode")
     assert f"its expert pi alone 135: {signed(estimate([12.0, 8.0, 10.0, 10.0]))}." in lead
-    assert lead.endswith("The residual pays.")
+    assert lead.endswith("It earns more: that is one training, and a residual pays where 10 show it.")
 
 
-def test_a_gain_below_zero_is_said_to_make_it_worse() -> None:
+def test_a_gain_below_zero_is_said_to_be_less() -> None:
     lead = lead_of(trained_on_pi([90.0, 120.0, 170.0, 100.0], EXPERT))
     assert "-15 [" in lead
-    assert lead.endswith("The residual makes it worse.")
+    assert "It earns less: that is one training" in lead
 
 
 @pytest.mark.parametrize("trained", [[125.0, 125.0, 205.0, 110.0], [90.0, 150.0, 155.0, 125.0], EXPERT])
@@ -72,7 +72,7 @@ def test_a_gain_that_may_be_zero_is_not_claimed(trained: list[float]) -> None:
 def test_one_seed_shows_no_gain_and_makes_up_no_interval() -> None:
     result = trained_on_pi([150.0], [100.0])
     lead = lead_of(result)
-    assert "+50" in lead
+    assert lead.endswith("+50. There is no interval: nothing is shown.")
     assert "pays" not in lead
     assert "holds zero" not in lead
     assert not any("nan" in text for text in (lead, *(card["detail"] for card in cards_of(result))))

@@ -80,6 +80,11 @@ def test_the_document_of_several_drivers_is_a_list_of_such(compared: DriveResult
         assert len(entry["episodes"]) == 3
         assert entry["mean"].keys() == entry["interval"].keys() == METRICS.keys()
         assert entry["report"] == str(compared.report)
+    expert = document["drivers"][0]["baseline"]
+    assert expert in ("pi", "idm")
+    for entry in document["drivers"]:
+        assert entry["baseline"] == expert
+        assert (entry["beyond_baseline"] is None) == (entry["driver"] == expert)
 
 
 def test_the_document_of_one_driver_is_strict_json_with_null_for_nan() -> None:

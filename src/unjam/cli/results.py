@@ -37,7 +37,7 @@ def evaluate(
       unjam evaluate runs/ring-001 --humans drivers.json --out runs/among-others
     """
     from unjam.drivers.registry import DRIVERS
-    from unjam.measures.statistics import signed
+    from unjam.measures.statistics import signed, verdict_on
     from unjam.reports.html import write_report
     from unjam.training.evaluate import comparison, judge
     from unjam.training.folder import read_config
@@ -64,7 +64,7 @@ def evaluate(
         return
     print_metrics(found.rows)
     if result.gain is not None:
-        console.print(f"return beyond the expert, 95 % interval: {signed(result.gain)}")
+        console.print(f"return beyond the expert: {signed(result.gain)}. {verdict_on(result.gain)}")
     aside.print(f"report: {result.report}")
 
 

@@ -88,7 +88,10 @@ def train(
         config = load_config(asked.file, asked.preset, changes)
         folder = new_folder(out, config.scenario)
     check_possible(config)
-    from unjam.measures.statistics import signed  # and torch: seconds that nobody waits for a wrong word
+    from unjam.measures.statistics import (  # and torch: seconds that nobody waits for a wrong word
+        signed,
+        verdict_on,
+    )
     from unjam.training.evaluate import Evaluation
     from unjam.training.train import steps_to_train
     from unjam.training.train import train as run
@@ -113,7 +116,9 @@ def train(
             console.print(f"{name}:")
         print_metrics(of.rows)
         if of.gain is not None:
-            console.print(f"return beyond the expert, held-out seeds, 95 % interval: {signed(of.gain)}")
+            console.print(
+                f"return beyond the expert, held-out seeds: {signed(of.gain)}. {verdict_on(of.gain)}"
+            )
         aside.print(f"controller: {of.controller}")
         after_training(of.folder, of.gain, config.steps)
     aside.print(f"report: {result.report}")

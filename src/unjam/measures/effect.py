@@ -133,7 +133,7 @@ def reasons_against(effect: Effect) -> list[str]:
         (
             effect.hard_braking.mean <= 0,
             "people brake beyond 4.5 m/s² more often than alone: "
-            f"{signed(effect.hard_braking)} times in a million moments",
+            f"{signed(effect.hard_braking)} times in a million moments, of which the mean's sign is asked",
         ),
     )
     return [reason for fine, reason in checks if not fine]

@@ -19,6 +19,9 @@ CONFIDENCE = 0.95
 LEAST = 3
 """values without which there is no interval: that of two is thirteen times as wide as they are apart"""
 
+ENOUGH_TRAININGS = 10
+"""without which nothing is said of a way to learn, only of these trainings"""
+
 
 @dataclass(frozen=True)
 class Estimate:
@@ -109,6 +112,19 @@ def interval_of(found: Estimate, digits: str) -> str:
     if found.count < 2 or isnan(found.smallest):
         return ""
     return f"({found.smallest:{digits}} to {found.largest:{digits}})"
+
+
+def verdict_on(gain: Estimate, trainings: int = 1) -> str:
+    """Return what may be said of a return beyond the expert's: that a residual pays needs ten trainings."""
+    if isnan(gain.low):
+        return "There is no interval: nothing is shown."
+    if gain.low <= 0 <= gain.high:
+        return "No gain is shown: the interval holds zero."
+    if trainings < ENOUGH_TRAININGS:
+        who = "one training" if trainings == 1 else f"{trainings} trainings"
+        more = "more" if gain.low > 0 else "less"
+        return f"It earns {more}: that is {who}, and a residual pays where {ENOUGH_TRAININGS} show it."
+    return "The residual pays." if gain.low > 0 else "The residual makes it worse."
 
 
 def over_trainings(

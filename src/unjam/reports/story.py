@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from unjam.measures.effect import beside_people
-from unjam.measures.statistics import estimate_of, paired_difference, signed
-from unjam.measures.table import baseline_of
+from unjam.measures.statistics import estimate_of, paired_difference, signed, verdict_on
+from unjam.measures.table import baseline_of, cell_of
 from unjam.reports.results import Results, Shown
 
 CLOSE_HEADWAY = 1.0
@@ -87,18 +87,10 @@ def lead_of(result: Results) -> str:
     if expert is None:
         return f"On {len(trained)} held-out seeds the trained controller earns {earned:.0f} an episode."
     gain = paired_difference(trained, expert, "return")
-    if np.isnan(gain.low):
-        verdict = "One seed has no interval: it shows nothing."
-    elif gain.low > 0:
-        verdict = "The residual pays."
-    elif gain.high < 0:
-        verdict = "The residual makes it worse."
-    else:
-        verdict = "No gain is shown: the interval holds zero."
     alone = estimate_of(expert, "return").mean
     return (
         f"On {gain.count} held-out seeds the trained controller earns {earned:.0f} an episode, its expert "
-        f"{result.about['expert']} alone {alone:.0f}: {signed(gain)}. {verdict}"
+        f"{result.about['expert']} alone {alone:.0f}: {signed(gain)}. {verdict_on(gain)}"
     )
 
 
@@ -186,6 +178,7 @@ def cards_of(result: Results) -> list[dict[str, str]]:
     expert = result.rows.get(result.about.get("expert", ""))
     if result.trained and expert is not None:
         gain = paired_difference(rows, expert, "return")
-        detail = "of one seed" if np.isnan(gain.low) else f"95 % interval {gain.low:+.0f} to {gain.high:+.0f}"
-        cards.insert(0, {"label": "Return beyond the expert", "value": f"{gain.mean:+.0f}", "detail": detail})
+        beyond = cell_of(gain, 0, sign="+")
+        detail = f"95 % interval {beyond.interval}" if gain.low < gain.high else f"of {gain.count} seeds"
+        cards.insert(0, {"label": "Return beyond the expert", "value": beyond.mean, "detail": detail})
     return cards

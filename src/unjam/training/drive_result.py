@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Any
 from unjam.measures.drivable import verdicts
 from unjam.measures.effect import Effect, beside_people
 from unjam.measures.metrics import METRICS
-from unjam.measures.statistics import Estimate, summarise
-from unjam.reports.summary import Rows, frame_of_metrics, frame_of_rows, html_of
+from unjam.measures.statistics import Estimate, paired_difference, summarise
+from unjam.measures.table import Rows, baseline_of
+from unjam.reports.summary import frame_of_metrics, frame_of_rows, html_of
 from unjam.worlds.record import Episode
 
 if TYPE_CHECKING:
@@ -35,7 +36,7 @@ class DriveResult:
         return {name: found.mean for name, found in self.summary(next(iter(self.rows))).items()}
 
     def summary(self, driver: str) -> dict[str, Estimate]:
-        """Return mean and 95 % bootstrap interval of every metric for a driver."""
+        """Return mean and 95 % interval of every metric for a driver."""
         return summarise(self.rows[driver])
 
     def table(self) -> "pd.DataFrame":
@@ -55,9 +56,23 @@ class DriveResult:
 
     def document(self) -> dict[str, Any]:
         """Return the result as `unjam drive --json` prints it; of several drivers, a list of such."""
-        said, effects = verdicts(self.rows), beside_people(self.rows)
-        documents = [self._document(driver, said[driver], effects.get(driver)) for driver in self.rows]
+        said, effects, baseline = verdicts(self.rows), beside_people(self.rows), baseline_of(self.rows)
+        documents = [
+            {
+                **self._document(driver, said[driver], effects.get(driver)),
+                "baseline": baseline or None,
+                "beyond_baseline": self._beyond(driver, baseline),
+            }
+            for driver in self.rows
+        ]
         return documents[0] if len(documents) == 1 else {"scenario": self.scenario, "drivers": documents}
+
+    def _beyond(self, driver: str, baseline: str) -> dict[str, list[float]] | None:
+        """Return the paired differences of all metrics; None of the baseline itself, and without one."""
+        if driver == baseline or not baseline:
+            return None
+        rows, others = self.rows[driver], self.rows[baseline]
+        return {name: _three(paired_difference(rows, others, name)) for name in METRICS}
 
     def _document(self, driver: str, verdict: str, effect: Effect | None) -> dict[str, Any]:
         summary = self.summary(driver)
@@ -78,5 +93,8 @@ class DriveResult:
 def _effect(effect: Effect) -> dict[str, Any]:
     """Return the paired differences to people alone as JSON: mean and ends of the interval."""
     names = ("travel_time", "delay_cut", "speed", "flow", "fuel", "hard_braking")
-    found = {name: getattr(effect, name) for name in names}
-    return {name: [each.mean, each.low, each.high] for name, each in found.items()}
+    return {name: _three(getattr(effect, name)) for name in names}
+
+
+def _three(found: Estimate) -> list[float]:
+    return [found.mean, found.low, found.high]
