@@ -8,7 +8,7 @@ import pandas as pd
 from tables import RESULTS
 
 from studies import rows_of
-from unjam.measures.statistics import estimate
+from unjam.measures.statistics import over_trainings
 from unjam.studies.comparison import interval, number
 from unjam.studies.study import VARIANTS
 
@@ -53,22 +53,25 @@ def of(rows: dict[str, dict[str, Any]], name: str, metric: str = "return") -> fl
 
 
 def verdict(held: bool) -> str:
-    """Return it in words."""
-    return "held" if held else "not held"
+    """Return it in words, where the sign of means is all that is asked."""
+    return "held, by the sign alone" if held else "not held, by the sign alone"
 
 
 def together(verdicts: list[str]) -> str:
     """Return the verdict on all parts of a claim: it holds where each holds, and fails where one fails."""
-    return next((word for word in ("not held", "undecided") if word in verdicts), "held")
+    worst = (found for word in ("not held", "undecided") for found in verdicts if found.startswith(word))
+    return next(worst, verdicts[0])
 
 
 def earns_more(rows: dict[str, dict[str, Any]], name: str, *others: str) -> str:
     """Say whether one earns more than all others, trainings of the same seed paired, 95 % interval."""
     gain = {one: np.array(rows[one]["gains"]) for one in (name, *others)}
-    found = [estimate((gain[name] - gain[other]).tolist()) for other in others]
+    found = [over_trainings(gain[name] - gain[other]) for other in others]
+    trainings = f"({len(gain[name])} trainings)"
     if all(difference.low > 0 for difference in found):
-        return "held"
-    return "not held" if any(difference.high < 0 for difference in found) else "undecided"
+        return f"held {trainings}"
+    lost = any(difference.high < 0 for difference in found)
+    return f"not held {trainings}" if lost else f"undecided {trainings}"
 
 
 def largest(values: dict[str, float]) -> str:

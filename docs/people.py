@@ -9,6 +9,7 @@ import pandas as pd
 from tables import RESULTS
 
 from unjam.measures.statistics import estimate
+from unjam.measures.table import cell_of
 
 NETWORKS = {"knowledge": "IDM + residual", "vanilla": "network alone", "nearest row": "nearest row"}
 MODELS = {
@@ -122,11 +123,7 @@ def ring() -> pd.DataFrame:
 
 def _mean(values: pd.Series, digits: int) -> str:
     found = estimate([float("nan") if value is None else float(value) for value in values])
-    if found.count == 0:
-        return "no wave"
-    interval = f" [{found.low:.{digits}f}, {found.high:.{digits}f}]" if found.count > 1 else ""
-    share = f" in {found.count} of {len(values)}" if found.count < len(values) else ""
-    return f"{found.mean:.{digits}f}{interval}{share}"
+    return str(cell_of(found, digits, len(values))) if found.count else "no wave"
 
 
 def claims() -> pd.DataFrame:

@@ -8,9 +8,10 @@ import pandas as pd
 from tables import RESULTS, metrics_of
 from tables import rows_of as rows_of_file
 
-from unjam.studies import STUDIES
+from unjam.measures.statistics import over_trainings
 from unjam.measures.table import unbroken
-from unjam.studies.comparison import interval, number
+from unjam.studies import STUDIES
+from unjam.studies.comparison import entries, interval, number
 from unjam.studies.study import REFERENCES, VARIANTS
 
 FREE = 15.0
@@ -24,8 +25,15 @@ def page_table(study: str, name: str) -> pd.DataFrame:
 
 
 def rows_of(study: str, road: str) -> list[dict[str, Any]]:
-    """Return the rows of a study's table on a road."""
+    """Return the rows of a study's table on a road.
+
+    Tables of before have percentile intervals: they are made anew from the trainings' gains, where these are.
+    """
     rows = json.loads((RESULTS / study / "table.json").read_text())
+    for row in rows:
+        if "gains" in row and "smallest" not in row["beyond_best_expert"]:
+            row["beyond_best_expert"] = entries(over_trainings(row["gains"]))
+            row["probability_of_improvement"] = {"mean": row["probability_of_improvement"]["mean"]}
     return [row for row in rows if row["road"] == road]
 
 
@@ -82,7 +90,7 @@ def honest(
             key, digits = COLUMNS[name]
             cells[name] = number(row[key]["mean"], digits)
         cells["beyond"] = "" if beyond is None else interval(beyond, 0, "+")
-        cells["better"] = "" if better is None else f"{100 * better['mean']:.0f} %"
+        cells["better"] = "" if better is None else interval({"low": None, "high": None, **better}, 2)
         table.append(cells)
     return pd.DataFrame(table)
 

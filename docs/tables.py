@@ -8,7 +8,8 @@ import pandas as pd
 from IPython.display import HTML
 
 from unjam.measures.metrics import METRICS
-from unjam.measures.statistics import estimate
+from unjam.measures.statistics import estimate_of, paired_difference
+from unjam.measures.table import baseline_of, cell_of
 from unjam.reports.model import error_text
 
 RESULTS = Path(__file__).parent.parent / "results"
@@ -25,25 +26,31 @@ def rows_of(name: str) -> dict[str, list[dict]]:
 
 
 def metrics_of(name: str, metrics: Sequence[str]) -> pd.DataFrame:
-    """Return a table of a results file: a row per driver, mean and 95 % bootstrap interval per metric."""
+    """Return a table of a results file: a row per driver, mean and 95 % interval per metric.
+
+    Last comes the first metric beyond people alone, else beyond the best expert, same seeds paired.
+    """
     table = {}
-    for driver, rows in rows_of(name).items():
+    by_driver = rows_of(name)
+    baseline = baseline_of(by_driver)
+    for driver, rows in by_driver.items():
         cells = {}
         for metric in metrics:
-            found, about = estimate([row[metric] for row in rows]), METRICS[metric]
+            found, about = estimate_of(rows, metric), METRICS[metric]
             heading = f"{about.label} [{about.unit}]" if about.unit else about.label
-            cells[heading] = f"{found.mean:.{about.digits}f}" if found.count else "never"
-            if found.count > 1:
-                cells[heading] += f" [{found.low:.{about.digits}f}, {found.high:.{about.digits}f}]"
-            if 0 < found.count < len(rows):
-                cells[heading] += f" in {found.count} of {len(rows)}"
+            cells[heading] = str(cell_of(found, about.digits, len(rows))) if found.count else "never"
+        first = METRICS[metrics[0]]
+        if baseline:
+            beyond = paired_difference(rows, by_driver[baseline], metrics[0])
+            shown = "" if driver == baseline else str(cell_of(beyond, first.digits, sign="+"))
+            cells[f"{first.label} − {baseline}"] = shown
         table[driver] = cells
     return pd.DataFrame.from_dict(table, orient="index")
 
 
 def mean_of(name: str, driver: str, metric: str) -> float:
     """Return the mean of one metric of one driver in a results file."""
-    return estimate([row[metric] for row in rows_of(name)[driver]]).mean
+    return estimate_of(rows_of(name)[driver], metric).mean
 
 
 def knowledge_rows(road: str) -> pd.DataFrame:

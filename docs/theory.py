@@ -7,7 +7,8 @@ import numpy as np
 import pandas as pd
 from tables import RESULTS
 
-from unjam.studies.comparison import interval
+from unjam.measures.statistics import over_trainings
+from unjam.studies.comparison import entries, interval
 from unjam.studies.study import VARIANTS
 
 
@@ -21,7 +22,9 @@ def untrained() -> pd.DataFrame:
     table: dict[str, dict[str, str]] = {}
     for row in measured()["untrained"]:
         cells = table.setdefault(row["road"], {"": row["road"]})
-        cells[row["policy"]] = interval(row, 0) if "low" in row else f"{row['mean']:.0f}"
+        cells[row["policy"]] = (
+            interval(entries(over_trainings(row["returns"])), 0) if "returns" in row else f"{row['mean']:.0f}"
+        )
     return pd.DataFrame(table.values())
 
 
