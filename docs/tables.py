@@ -25,14 +25,14 @@ def rows_of(name: str) -> dict[str, list[dict]]:
     return rows
 
 
-def metrics_of(name: str, metrics: Sequence[str]) -> pd.DataFrame:
+def metrics_of(name: str, metrics: Sequence[str], compared: bool = True) -> pd.DataFrame:
     """Return a table of a results file: a row per driver, mean and 95 % interval per metric.
 
-    Last comes the first metric beyond people alone, else beyond the best expert, same seeds paired.
+    Last comes, where it is `compared`, the first metric beyond people alone, else beyond the best expert.
     """
     table = {}
     by_driver = rows_of(name)
-    baseline = baseline_of(by_driver)
+    baseline = baseline_of(by_driver) if compared else ""
     for driver, rows in by_driver.items():
         cells = {}
         for metric in metrics:

@@ -2,6 +2,7 @@ import json
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -10,6 +11,7 @@ import pytest
 from unjam.errors import InputError
 from unjam.files import write_whole
 from unjam.studies import STUDIES, TOGETHER, study
+from unjam.studies.comparison import comparison_of
 from unjam.studies.reproduce import estimated_seconds, make_plan, reproduce, studies_of
 from unjam.studies.study import PlannedRun, StudyFolder
 from unjam.training.folder import read_config
@@ -100,10 +102,34 @@ def test_the_table_is_made_of_the_rows_of_its_trainings(reproduced: Made) -> Non
     lengths = table["plain"]["steady_by_draw"]["length"]
     assert list(lengths) == sorted(lengths, key=float)
     assert min(lengths.values()) <= table["plain"]["mean_speed_steady"]["mean"] <= max(lengths.values())
+    assert table[best]["beyond_best_expert"]["mean"] == 0.0
+    assert table["human"]["beyond_best_expert"]["count"] > 0
+    assert math.isnan(beyond_of(table["plain"], "low"))  # two trainings have a range
+    assert beyond_of(table["plain"], "smallest") <= beyond <= beyond_of(table["plain"], "largest")
     convention = table["plain"]["paper_convention"]
     assert convention["speed"]["mean"] == pytest.approx(np.mean([row["cav_mean_speed"] for row in progress]))
     assert math.isclose(convention["reward"]["mean"], np.mean([row["return_mean"] for row in progress]))
     assert set(pd.read_csv(folder / "little" / "table.csv")["name"]) == set(table)
+
+
+def beyond_of(row: dict[str, Any], part: str) -> float:
+    value = row["beyond_best_expert"][part]
+    return math.nan if value is None else value
+
+
+def test_the_last_checkpoint_stands_beside_the_one_that_was_chosen(tmp_path: Path) -> None:
+    curves = {"trpo": {"return_validation": [[1.0, 9.0, 5.0], [2.0, 3.0, 3.0], [1.0, 6.0, 0.0]]}}
+    rows = [
+        {"name": "PI", "gains": []},
+        {"name": "TRPO", "variant": "trpo", "gains": [0.0, 2.0, 0.0]},
+        {"name": "SAC", "variant": "sac", "gains": [1.0, 2.0, 3.0]},  # of another reward: no returns here
+    ]
+    (tmp_path / "curves.json").write_text(json.dumps({"ring": curves}))
+    (tmp_path / "table.json").write_text(json.dumps(rows))
+    [row] = comparison_of("", ("trpo",)).tables["checkpoints"](tmp_path).to_dict("records")
+    assert (row["best trained"], row["last checkpoint"]) == ("6", "3")
+    assert row["last − best"] == "-3 [-11, +0]"
+    assert row["kept the untrained network"] == "2 of 3"
 
 
 def test_a_training_with_other_settings_is_not_taken_for_ours(reproduced: Made) -> None:

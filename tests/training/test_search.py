@@ -13,7 +13,17 @@ from unjam.errors import InputError, MissingPartError, UnjamError
 from unjam.files import to_json
 from unjam.training.config import load_config
 from unjam.training.executors import CommandLine, Processes
-from unjam.training.search import Choice, Range, check_space, search, space_of, trial_config, validation_gain
+from unjam.training.search import (
+    Choice,
+    Range,
+    Trial,
+    check_space,
+    search,
+    space_of,
+    trial_config,
+    validation_gain,
+    words_of_trial,
+)
 
 BASE = small_config(evaluation__every=1)
 SPACE = space_of(["trpo.target_kl=0.001..0.1:log", "trpo.critic_batch=8,16", "trpo.critic_epochs=1..9"])
@@ -76,6 +86,25 @@ def test_a_training_is_worth_its_best_validation_beyond_its_expert(tmp_path: Pat
     assert validation_gain(tmp_path) is None
 
 
+@pytest.mark.parametrize(
+    ("gain", "last", "words"),
+    [
+        (7.0, 1.0, "trial 3: +7.0 beyond the expert, last checkpoint +1.0, validation seeds: agent=ppo"),
+        (
+            -2.0,
+            -3.0,
+            "trial 3: -2.0 beyond the expert, last checkpoint -3.0, validation seeds "
+            "(the untrained network was kept): agent=ppo",
+        ),
+        (None, None, "trial 3: failed: agent=ppo"),
+    ],
+)
+def test_a_trial_says_what_its_last_checkpoint_earns(
+    gain: float | None, last: float | None, words: str
+) -> None:
+    assert words_of_trial(Trial(3, {"agent": "ppo"}, Path("trials/3"), gain, last)) == words
+
+
 class Trainings:
     """Stands for trainings: each is worth what its target_kl says, and can be made to fail or to stop."""
 
@@ -120,6 +149,7 @@ def test_the_best_comes_first_and_is_there_to_be_trained_with(tmp_path: Path, tr
     assert abs(math.log10(best.trpo.target_kl) + 2) < 0.2
     written = json.loads((tmp_path / "search" / "search.json").read_text())
     assert [row["gain"] for row in written["trials"]] == pytest.approx(gains)
+    assert all(row["last"] <= row["gain"] for row in written["trials"])
     assert written["manifest"]["packages"]["torch"]
 
 
