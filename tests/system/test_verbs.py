@@ -92,7 +92,7 @@ def test_drive_prints_a_table_and_the_path_of_a_report(unjam: Run, tmp_path: Pat
     ran = unjam("drive", "ring", "-d", "human", "-d", "pi:window=10", *SMALL, "--out", "mine")
     assert ran.returncode == 0, ran.stderr
     header, *lines = ran.stdout.splitlines()
-    assert header.split() == ["metric", "unit", "human", "pi:window=10"]
+    assert header.split() == ["metric", "unit", "human", "pi:window=10", "pi:window=10", "−", "human"]
     assert len(lines) >= len(METRICS_OF_THE_DESIGN)
     assert "report: mine/report.html" in ran.stderr
     assert (tmp_path / "mine" / "report.html").is_file()

@@ -120,7 +120,8 @@ def test_where_all_harm_nobody_is_chosen() -> None:
 
 def test_each_batch_is_told_in_a_line() -> None:
     lines: list[str] = []
-    choose([ACC, PI], MadeUp({}), Budget(6), 0.02, lines.append)
-    assert lines[0] == (
-        "choosing, 2 seeds: 2 of 2 left, travel time known to ±0.0 % of people's (wanted: ±2 %)"
-    )
+    choose([ACC, PI], MadeUp({}), Budget(60), 0.02, lines.append)
+    assert lines[:2] == [
+        "choosing, 2 seeds: 2 of 2 left, too few for an interval of travel time (wanted: ±2 %)",
+        "choosing, 4 seeds: 2 of 2 left, travel time known to ±0.0 % of people's (wanted: ±2 %)",
+    ]

@@ -6,6 +6,7 @@ share, is set aside early. Those that are chosen are judged on fresh seeds, and 
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from math import isfinite
 from typing import Any, NamedTuple
 
 from unjam.measures.drivable import DRIVABLE
@@ -166,5 +167,7 @@ def _wide(widths: Sequence[float], precision: float) -> str:
     """Return how wide the widest interval is, in words."""
     if not widths:
         return "all are set aside"
-    widest = max(widths)
-    return f"travel time known to ±{100 * widest:.1f} % of people's (wanted: ±{100 * precision:g} %)"
+    wanted = f"(wanted: ±{100 * precision:g} %)"
+    if not all(map(isfinite, widths)):
+        return f"too few for an interval of travel time {wanted}"
+    return f"travel time known to ±{100 * max(widths):.1f} % of people's {wanted}"
