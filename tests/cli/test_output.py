@@ -1,0 +1,46 @@
+"""Can a table of metrics be read, however narrow the terminal?"""
+
+from io import StringIO
+from typing import Any
+
+import pytest
+from rich.console import Console
+
+from unjam.cli import output
+from unjam.measures.metrics import METRICS
+
+USUAL: dict[str, Any] = {"status": "completed", "reason": "", **dict.fromkeys(METRICS, 1.0)}
+LABELS = ("human", "pi", "idm", "a_long_file_of_mine.py:a_long_name_of_mine")
+
+
+def rows_of(first: float) -> list[dict[str, Any]]:
+    returns = (first, first + 100.0, first + 300.0)
+    return [{**USUAL, "seed": seed, "return": value} for seed, value in enumerate(returns)]
+
+
+def printed(monkeypatch: pytest.MonkeyPatch, width: int, labels: tuple[str, ...] = LABELS) -> list[str]:
+    text = StringIO()
+    monkeypatch.setattr(output, "console", Console(file=text, width=width, highlight=False))
+    output.print_metrics({label: rows_of(1000.0 * number) for number, label in enumerate(labels)})
+    return [line.rstrip() for line in text.getvalue().splitlines()]
+
+
+@pytest.mark.parametrize("width", [80, 120, 160, 400])
+def test_no_interval_is_broken_and_no_line_is_too_long(monkeypatch: pytest.MonkeyPatch, width: int) -> None:
+    lines = printed(monkeypatch, width)
+    assert max(map(len, lines)) <= width
+    assert not any("…" in line for line in lines)
+    assert all(line.count("[") == line.count("]") for line in lines)
+    assert sum(line.count("pi") for line in lines if line.startswith("metric")) >= 2  # it, and beyond people
+    assert "+1000" in "\n".join(lines)
+
+
+def test_where_there_is_room_all_drivers_stand_in_one_table(monkeypatch: pytest.MonkeyPatch) -> None:
+    def tables(width: int) -> int:
+        return sum(line.startswith("metric") for line in printed(monkeypatch, width))
+
+    assert (tables(400), tables(120) > 1) == (1, True)
+
+
+def test_a_driver_by_itself_is_compared_with_nobody(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert printed(monkeypatch, 120, ("pi",))[0].split() == ["metric", "unit", "pi"]
