@@ -12,8 +12,7 @@ SMALLEST_GAP = 1e-3
 EMERGENCY_BRAKING = 9.0
 """`emergencyDecel` of a passenger car, beyond which `finalizeSpeed` lets nobody brake [m/s2]"""
 CREEPING = 1e-4
-"""acceleration from standstill below which a vehicle stays where it is: SUMO's NUMERICAL_EPS_SPEED over the
-time step [m/s2]"""
+"""SUMO's NUMERICAL_EPS_SPEED over the time step: people no faster than that after a step stand [m/s2]"""
 
 
 def people_speed(
@@ -27,9 +26,5 @@ def people_speed(
     gap = at_least(gap, SMALLEST_GAP)
     acceleration = idm_acceleration(speed, leader_speed, gap, people, by_squaring)
     wanted = next_speed(speed, at_least(acceleration, -EMERGENCY_BRAKING), step)
-    return moving(at_most(wanted, people.desired_speed), step)
-
-
-def moving(speed: Array, step: float) -> Array:
-    """Return speeds, those zero that SUMO does not take for driving."""
-    return speed * (speed > CREEPING * step)
+    wanted = at_most(wanted, people.desired_speed)
+    return wanted * (wanted > CREEPING * step)

@@ -7,6 +7,7 @@ ring of the first CAV, then of the second, and so on.
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import reduce
 from typing import Any, cast
 
 import numpy as np
@@ -22,8 +23,9 @@ from unjam.scenarios.ring import Ring
 from unjam.scenarios.road import ClosedRoad
 from unjam.scenarios.scenario import VEHICLE_LENGTH, Scenario
 from unjam.worlds.audit import MOVING_SPEED
+from unjam.worlds.batch.lanes import Leader, leaders
 from unjam.worlds.batch.noise import Noise, Numbers, QuickNoise, SeededNoise
-from unjam.worlds.batch.people import moving, people_speed
+from unjam.worlds.batch.people import people_speed
 from unjam.worlds.batch.record import CONTACT, RingLog, Rings, as_numpy
 from unjam.worlds.cars import Cars
 from unjam.worlds.closed import HISTORY
@@ -52,8 +54,8 @@ def why_not(scenario: Scenario) -> str:
 class RingBatch:
     """W rings of the same kind, each with a seed of its own; equal to SUMO's, but for rounding.
 
-    People see the car ahead however far it is. SUMO's look no farther than a lane, a quarter of the ring, and
-    what they need to stop: on rings with few vehicles both differ.
+    With noise that is drawn quickly people follow the car ahead and nobody else. SUMO's also look at the last
+    car of the next lane, and no farther than they must: see `unjam.worlds.batch.lanes`.
     """
 
     single, kept = False, None
@@ -115,7 +117,7 @@ class RingBatch:
             else QuickNoise(draw, vehicles, cavs, worlds)
         )
         self._reward = make_reward(reward or scenario.reward)
-        self._controlled = False
+        self._controlled, self._quick = False, draw is not None
         self._forget()
 
     def _forget(self) -> None:
@@ -217,16 +219,24 @@ class RingBatch:
             raise InputError(f"driver: step {self.decisions}: not {self.rows} accelerations that are finite")
         return self.limits.keep(found)
 
+    def _people_speed(self, speed: Array, ahead: Leader) -> Array:
+        """Return the speeds after this step of all vehicles, if people drive them, shape (vehicles, W)."""
+        people, step = self._people, self.scenario.simulation_step
+        if self._quick:
+            return people_speed(speed, *ahead, people, step)
+        seen = leaders(speed, self._position, ahead, self._loop, people, step)
+        return reduce(namespace(speed).minimum, (people_speed(speed, *each, people, step) for each in seen))
+
     def _simulate(self, wanted: Array | None) -> Array:
         """Simulate one step, and return what CAVs were told; None: they are human."""
         step, speed, own = self.scenario.simulation_step, self._speed, self._places
-        moved = people_speed(speed[:-1], speed[1:], self._gap, self._people, step)
+        moved = self._people_speed(speed[:-1], Leader(speed[1:], self._gap))
         cavs, told = self._followed(), None
         if wanted is not None:
             told, done = self._cars.carry_out("all", wanted, cavs)
             commanded = next_speed(cavs.speed, done, step)
             obeyed = at_most(at_least(commanded, cavs.speed - self._brakes), self.scenario.top_speed)
-            moved[own] = moving(obeyed, step).reshape(self._shape)
+            moved[own] = obeyed.reshape(self._shape)
             if self._keep:
                 self._log.told.append(told)
                 self._log.commanded.append(commanded)
