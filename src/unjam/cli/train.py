@@ -213,7 +213,7 @@ def tune(
     screen: Annotated[
         bool | None,
         typer.Option(
-            help="Try settings on batches of imagined rings, which equal SUMO's, and only the finalists in SUMO "
+            help="Try settings on batches of imagined rings, equal to SUMO's, and only finalists in SUMO "
             "itself; without it, where the road is such a ring."
         ),
     ] = None,
