@@ -63,11 +63,16 @@ RINGS: dict[str, tuple[Ring, str]] = {
     "a wide ring, where people see past the car ahead": (Ring(length=(800, 900), horizon=300), "pi"),
     "commands that are held": (replace(SHORT, steps_per_decision=5, horizon=80, warmup=52), "pi"),
     "a coarser step": (replace(SHORT, simulation_step=0.3), "pi"),
-    "commands beyond the brakes": (replace(SHORT, action_limit=8.0), "follower-stopper"),
+    "commands beyond the brakes": (replace(SHORT, action_limit=8.0), "pi:time_constant=0"),
     "the paper's PI": (SHORT, "pi:time_constant=0"),
     "late cars": (replace(SHORT, actuator=Actuator(delay=0.2, lag=0.3)), "pi"),
     "raw": (replace(SHORT, actuation="raw", safety=NO_FILTER), "pi"),
     "wild people": (replace(SHORT, noise=10.0), "pi"),
+    "people who brake as hard as they can": (replace(SHORT, noise=20.0), "human"),
+    "people faster than they want": (
+        Ring(length=400, vehicles=12, horizon=300, humans=replace(SHORT.humans, desired_speed=3.0)),
+        "human",
+    ),
     "calm people": (replace(SHORT, noise=0.0), "pi"),
     "people of another kind": (replace(SHORT, humans=QUICK_PEOPLE), "pi"),
 }
@@ -108,6 +113,14 @@ def test_who_collides_ends_there_and_others_go_on(simulation: Simulation) -> Non
         assert_alike(episode, run_episode(ring, Constant(0.6), seed, simulation=simulation))
     assert {episode.status for episode in found} == {"collision"}
     assert len({episode.steps for episode in found}) > 1
+
+
+def test_people_collide_where_sumo_says_so(simulation: Simulation) -> None:
+    ring, driver = Ring(noise=40.0, horizon=90), named_driver("human", 0.1)
+    found = run_batch(tasks(ring, driver, (1, 2, 3)))
+    for episode, seed in zip(found, (1, 2, 3), strict=True):
+        assert_alike(episode, run_episode(ring, driver, seed, simulation=simulation))
+    assert {episode.status for episode in found} == {"collision"}
 
 
 def doubles(values: Floats) -> Tensor:

@@ -9,7 +9,7 @@ Source: SUMO's MSVehicle (`planMoveInternal`), MSCFModel (`brakeGap`).
 from collections.abc import Iterator
 from typing import NamedTuple
 
-from unjam.physics.arrays import Array, at_most, namespace
+from unjam.physics.arrays import Array, at_least, at_most, namespace
 from unjam.physics.idm import IDMParameters, IDMRows
 from unjam.physics.stopping import stopping_distance
 from unjam.scenarios.ring import EDGES
@@ -17,6 +17,8 @@ from unjam.scenarios.scenario import VEHICLE_LENGTH
 
 LOOK_AHEAD = 5 * VEHICLE_LENGTH
 """lanes beyond the own one that are seen at least: SUMO's CRLL_LOOK_AHEAD lengths of a vehicle [m]"""
+CONTACT = -1e-3
+"""gap below which SUMO says that vehicles collide: its NUMERICAL_EPS [m]"""
 NOBODY = 1e6
 """gap that SUMO's `freeSpeed` takes where nobody is ahead, behind who drives as fast as is wanted [m]"""
 
@@ -75,3 +77,27 @@ def leaders(
         looked_at = looked_at + lane_length
         seen = seen + lane_length
         sees = sees & ((seen <= sight) | (looked_at <= LOOK_AHEAD))
+
+
+def end_of_lane(speed: Array, position: Array, loop: Array, people: IDMParameters | IDMRows) -> Leader:
+    """Return whom people follow who drive faster than they want: the end of their lane, as if it stood there.
+
+    Shapes as in `leaders`. The gap is at least what SUMO's `getSecureGap` says of the desired speed.
+    """
+    lane_length = loop / EDGES
+    wanted = people.desired_speed
+    secure = wanted * (people.time_headway + wanted / people.braking)
+    return Leader(0.0 * speed, at_least(lane_length - position % lane_length, secure))
+
+
+def touching(position: Array, gap: Array, loop: Array) -> Array:
+    """Return which vehicles touch the one ahead as SUMO sees it: where both fronts are on the same lane.
+
+    Args:
+        position: front bumpers along the ring [m], shape (vehicles, ...).
+        gap: to the vehicle ahead [m], likewise.
+        loop: length of the ring [m].
+    """
+    xp = namespace(position)
+    lane = xp.floor(position % loop / (loop / EDGES))
+    return (gap < CONTACT) & (lane == xp.concatenate([lane[1:], lane[:1]]))

@@ -4,7 +4,7 @@ Sources: SUMO's MSCFModel_IDM (`_v`), MSCFModel (`finalizeSpeed`) and MSVehicle 
 """
 
 from unjam.physics.arrays import Array, at_least, at_most
-from unjam.physics.idm import IDMParameters, IDMRows, by_squaring, idm_acceleration
+from unjam.physics.idm import PARAMETER_NAMES, IDMParameters, IDMRows, by_squaring, idm_acceleration
 from unjam.physics.kinematics import next_speed
 
 SMALLEST_GAP = 1e-3
@@ -28,3 +28,8 @@ def people_speed(
     wanted = next_speed(speed, at_least(acceleration, -EMERGENCY_BRAKING), step)
     wanted = at_most(wanted, people.desired_speed)
     return wanted * (wanted > CREEPING * step)
+
+
+def without_gap(people: IDMParameters | IDMRows) -> IDMRows:
+    """Return people who keep no gap at standstill, as to the end of a lane."""
+    return IDMRows(**{name: getattr(people, name) for name in PARAMETER_NAMES})._replace(minimum_gap=0.0)

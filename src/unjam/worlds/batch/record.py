@@ -10,12 +10,10 @@ from unjam.physics.arrays import Array
 from unjam.scenarios.ring import Ring
 from unjam.scenarios.road import ClosedRoad
 from unjam.scenarios.scenario import VEHICLE_LENGTH
+from unjam.worlds.batch.lanes import touching
 from unjam.worlds.closed import ClosedLog
 from unjam.worlds.record import Episode, Floats
 from unjam.worlds.world import Driven
-
-CONTACT = -1e-3
-"""gap below which SUMO says that vehicles collide: its NUMERICAL_EPS [m]"""
 
 
 @dataclass(frozen=True)
@@ -97,18 +95,18 @@ class RingLog:
         before = moments[1][:, -1]
         # Not wrapped: who touches the car ahead is a little before or beyond it.
         ahead = np.append(before[1:], before[0] + road.loop_length)
-        touching = ahead - before - VEHICLE_LENGTH < CONTACT
+        collided = touching(before, ahead - before - VEHICLE_LENGTH, road.loop_length)
         facts = {
             "seed": tuple(seed),
-            "status": "collision" if touching.any() else "completed",
+            "status": "collision" if collided.any() else "completed",
             "step": scenario.decision_step,
             "warmup": scenario.warmup,
             "drawn": road.drawn,
-            "collisions": int((touching | np.roll(touching, 1)).sum()),
+            "collisions": int((collided | np.roll(collided, 1)).sum()),
             "limit_speed": road.limit_speed,
         }
         rows = np.arange(len(road.cav_ids)) * self.start.shape[1] + number
-        return replace(log, crashed=bool(touching.any())).episode(moments, facts, driven, rows)
+        return replace(log, crashed=bool(collided.any())).episode(moments, facts, driven, rows)
 
 
 def as_numpy(values: Any) -> Floats:

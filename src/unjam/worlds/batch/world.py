@@ -23,10 +23,10 @@ from unjam.scenarios.ring import Ring
 from unjam.scenarios.road import ClosedRoad
 from unjam.scenarios.scenario import VEHICLE_LENGTH, Scenario
 from unjam.worlds.audit import MOVING_SPEED
-from unjam.worlds.batch.lanes import Leader, leaders
+from unjam.worlds.batch.lanes import CONTACT, Leader, end_of_lane, leaders, touching
 from unjam.worlds.batch.noise import Noise, Numbers, QuickNoise, SeededNoise
-from unjam.worlds.batch.people import people_speed
-from unjam.worlds.batch.record import CONTACT, RingLog, Rings, as_numpy
+from unjam.worlds.batch.people import people_speed, without_gap
+from unjam.worlds.batch.record import RingLog, Rings, as_numpy
 from unjam.worlds.cars import Cars
 from unjam.worlds.closed import HISTORY
 from unjam.worlds.reward import Outcome, make_reward, time_headway
@@ -126,7 +126,7 @@ class RingBatch:
         ring = self._loop * 0.0
         each_cav = self._loops.reshape(self._shape) * 0.0
         self._running, self._made = ring + 1.0, ring
-        self._sums, self._driven, self._smallest = dict[str, Array](), ring, ring + np.inf
+        self._sums, self._driven, self._crashed = dict[str, Array](), ring, ring > 0.0
         self._headway, self._braking = each_cav + np.inf, each_cav
 
     def start(self, controlled: bool, on_progress: OnProgress | None = None) -> LocalState | None:
@@ -143,7 +143,7 @@ class RingBatch:
             if left % each == 0 and left // each <= longest:
                 seen.append(self.perceive().each(as_numpy))
             self._simulate(None)
-        if bool(self._crashed().any()):
+        if bool(self._crashed.any()):
             raise EpisodeError("collision in the all-human warm-up of a ring")
         self._controlled = controlled
         if controlled:
@@ -190,7 +190,6 @@ class RingBatch:
             log.wanted.append(wanted)
         told = [self._simulate(wanted) for _ in range(each)]
         self.decisions += 1
-        crashed = self._crashed()
         after, _, gap = self._followed()
         applied: Array = (
             sum(told) / each if told[0] is not None else (after - before) / self.scenario.decision_step
@@ -199,18 +198,14 @@ class RingBatch:
             speeds=self._speed[:-1].T,
             accelerations=applied.reshape(self._shape).T,
             headways=time_headway(gap, after).reshape(self._shape).T,
-            crashed=crashed,
+            crashed=self._crashed,
             waiting=self._running * 0.0,
         )
         for name, term in self._reward(outcome).items():
             self._sums[name] = self._sums.get(name, 0.0) + term * self._running
         self._made = self._made + self._running
         self._driven = self._driven + outcome.speeds.mean(-1) * self._running
-        self._running = self._running * ~crashed
-
-    def _crashed(self) -> Array:
-        """Return on which rings vehicles have touched, shape (W,)."""
-        return self._smallest < CONTACT
+        self._running = self._running * ~self._crashed
 
     def _checked(self, command: Command | None) -> Array:
         """Return what is wanted, within the limits; raise `InputError` where it is not finite numbers."""
@@ -225,7 +220,15 @@ class RingBatch:
         if self._quick:
             return people_speed(speed, *ahead, people, step)
         seen = leaders(speed, self._position, ahead, self._loop, people, step)
-        return reduce(namespace(speed).minimum, (people_speed(speed, *each, people, step) for each in seen))
+        xp = namespace(speed)
+        found = reduce(xp.minimum, (people_speed(speed, *each, people, step) for each in seen))
+        beyond = speed > people.desired_speed  # noise did it
+        if bool(beyond.any()):
+            end = end_of_lane(speed, self._position, self._loop, people)
+            slower = people_speed(speed, *end, without_gap(people), step)
+            slowest = speed - people.comfortable_deceleration * step
+            found = xp.where(beyond, xp.minimum(found, xp.maximum(slower, slowest)), found)
+        return found
 
     def _simulate(self, wanted: Array | None) -> Array:
         """Simulate one step, and return what CAVs were told; None: they are human."""
@@ -243,8 +246,9 @@ class RingBatch:
         xp = namespace(moved)
         ahead = xp.concatenate([moved[1:], moved[:1]])
         self._gap = self._gap + (ahead - moved) * step
-        self._smallest = xp.minimum(self._smallest, xp.amin(self._gap, 0))
         self._position = next_position(self._position, moved, step)
+        if bool((self._gap < CONTACT).any()):
+            self._crashed = self._crashed | touching(self._position, self._gap, self._loop).any(0)
         speeds = moved
         if self.scenario.noise > 0:
             speeds = at_least(moved + self._noise.of_people() * self._scale, 0.0)
