@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from unjam.drivers.safety import SafetyFilter
 from unjam.errors import InputError
 from unjam.measures.metrics import measure
 from unjam.scenarios import FigureEight, Ring
+from unjam.scenarios.population import Population, write_population
 from unjam.training.speed import neural_driver
 from unjam.worlds.batch.run import begin, run_batch
 from unjam.worlds.batch.world import RingBatch, why_not
@@ -63,14 +65,13 @@ RINGS: dict[str, tuple[Ring, str]] = {
     "a wide ring, where people see past the car ahead": (Ring(length=(800, 900), horizon=300), "pi"),
     "commands that are held": (replace(SHORT, steps_per_decision=5, horizon=80, warmup=52), "pi"),
     "a coarser step": (replace(SHORT, simulation_step=0.3), "pi"),
-    "commands beyond the brakes": (replace(SHORT, action_limit=8.0), "pi:time_constant=0"),
     "the paper's PI": (SHORT, "pi:time_constant=0"),
     "late cars": (replace(SHORT, actuator=Actuator(delay=0.2, lag=0.3)), "pi"),
     "raw": (replace(SHORT, actuation="raw", safety=NO_FILTER), "pi"),
     "wild people": (replace(SHORT, noise=10.0), "pi"),
     "people who brake as hard as they can": (replace(SHORT, noise=20.0), "human"),
     "people faster than they want": (
-        Ring(length=400, vehicles=12, horizon=300, humans=replace(SHORT.humans, desired_speed=3.0)),
+        Ring(length=(400, 400), vehicles=12, horizon=300, humans=replace(SHORT.humans, desired_speed=3.0)),
         "human",
     ),
     "calm people": (replace(SHORT, noise=0.0), "pi"),
@@ -113,6 +114,31 @@ def test_who_collides_ends_there_and_others_go_on(simulation: Simulation) -> Non
         assert_alike(episode, run_episode(ring, Constant(0.6), seed, simulation=simulation))
     assert {episode.status for episode in found} == {"collision"}
     assert len({episode.steps for episode in found}) > 1
+
+
+class Hasty(Driver):
+    """Brakes harder than its brakes can, now and then."""
+
+    def act(self, state: LocalState, memory: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
+        return np.where(np.asarray(state.speed) > 2.0, -8.0, 0.8), memory
+
+
+def test_brakes_do_what_they_can(simulation: Simulation) -> None:
+    ring = replace(SHORT, action_limit=8.0)
+    (found,) = run_batch(tasks(ring, Hasty(), (1,)))
+    assert_alike(found, run_episode(ring, Hasty(), 1, simulation=simulation))
+    assert found.audit.cavs.hardest == pytest.approx(6.0)
+
+
+def test_each_of_a_population_drives_in_its_own_way(tmp_path: Path, simulation: Simulation) -> None:
+    one = SHORT.humans
+    slow = replace(one, time_headway=1.5, desired_speed=4.0, comfortable_deceleration=2.2)
+    quick = replace(one, max_acceleration=1.8, minimum_gap=1.5, exponent=2.0)
+    write_population(tmp_path / "people.json", Population(one, (one, slow, quick), (-9.0, 3.0)))
+    ring = replace(SHORT, population=str(tmp_path / "people.json"), warmup=130)
+    driver = named_driver("pi", 0.1)
+    for found, seed in zip(run_batch(tasks(ring, driver, (1, 2))), (1, 2), strict=True):
+        assert_alike(found, run_episode(ring, driver, seed, simulation=simulation))
 
 
 def test_people_collide_where_sumo_says_so(simulation: Simulation) -> None:
