@@ -15,8 +15,8 @@ from unjam.measures.metrics import METRICS, measure
 from unjam.measures.waves import speed_along_road, wave_speed
 from unjam.scenarios.scenario import VEHICLE_LENGTH
 from unjam.worlds.audit import Audit, Following, following
+from unjam.worlds.neighbours import loop_neighbours, loop_state
 from unjam.worlds.record import Episode, Floats, Trajectory, failed_episode, outcome_of
-from unjam.worlds.sumo.neighbours import loop_neighbours, loop_state
 
 LENGTH = 200.0
 LIMIT = 8.0

@@ -17,6 +17,8 @@ def short(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(speed, "TRACI_STEPS", 50)
     monkeypatch.setattr(speed, "VIRTUAL", {"long": (500, 20), "short": (50, 10)})
     monkeypatch.setattr(speed, "SIZES", {22: 200, 66: 100})
+    monkeypatch.setattr(speed, "BATCH", 2200)
+    monkeypatch.setattr(speed, "BATCH_DECISIONS", 20)
 
 
 @pytest.fixture(autouse=True)
@@ -57,6 +59,10 @@ def test_measures_rates_and_their_ratios_and_gives_back_the_cores_that_it_did_no
             rollouts["steps_per_s"] / found["episode_steps_per_s"]
         )
     assert found["virtual"]["long"]["over_actual"] > 2.0
+    batch = found["batch"]
+    assert batch["rings"] == 100
+    assert batch["over_bare"] == pytest.approx(batch["steps_per_s"] / found["bare_steps_per_s"])
+    assert [entry["vehicles"] for entry in batch["scaling"]] == [22, 66]
     for road in found["roads"].values():
         assert road["over_bare"] == pytest.approx(road["episode_steps_per_s"] / road["bare_steps_per_s"])
     costs = [entry["us_per_vehicle_step"] for entry in found["scaling"]]

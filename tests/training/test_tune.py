@@ -3,15 +3,21 @@
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from unjam.controller import load_controller
 from unjam.drivers import PISaturation
+from unjam.drivers.registry import named_driver
 from unjam.errors import InputError
-from unjam.scenarios import Ring
+from unjam.measures.drivable import drivable_in_all
+from unjam.measures.metrics import measure
+from unjam.scenarios import FigureEight, Ring
 from unjam.training.search import Choice, Range
 from unjam.training.seeds import TUNE, tuning_seeds
 from unjam.training.tune import EPISODES, FINALISTS, TUNED, space_around, tune
+from unjam.worlds.episode import run_episode
+from unjam.worlds.sumo.simulation import Simulation
 from unjam.worlds.workers import Workers
 
 SMALL = Ring(horizon=60)
@@ -44,6 +50,29 @@ def test_the_same_seed_tries_the_same_settings_whoever_drives(tmp_path: Path) ->
             (folder := tmp_path / str(count)).mkdir()
             tried.append(tune(SMALL, "pi", SPACE, STEPS, folder, workers).settings)
     assert tried[0] == tried[1]
+
+
+def test_screened_settings_are_judged_as_sumo_judges_them(tmp_path: Path, simulation: Simulation) -> None:
+    steps = FINAL + 10 * EPISODES * 60
+    with Workers(1) as workers:
+        found = tune(SMALL, "pi", SPACE, steps, tmp_path, workers, screen=True)
+    assert (found.actual_steps, found.imagined_steps) == (FINAL, 10 * EPISODES * 60)
+    assert len(found.settings) == 10
+    for setting in (found.settings[1], found.settings[9]):  # of two batches
+        driver = named_driver(setting.driver, 0.1)
+        rows = [
+            measure(run_episode(SMALL.part(part, EPISODES), driver, seed, simulation=simulation))
+            for part, seed in enumerate(tuning_seeds(EPISODES))
+        ]
+        assert setting.score == pytest.approx(np.mean([row["return"] for row in rows]), rel=1e-9)
+        assert setting.verdict == drivable_in_all(rows)
+    written = json.loads((tmp_path / TUNED).read_text())
+    assert written["imagined_steps"] == found.imagined_steps
+
+
+def test_roads_that_cannot_be_stepped_in_a_batch_are_not_screened(tmp_path: Path) -> None:
+    with Workers(1) as workers, pytest.raises(InputError, match=r"screen: .*no ring"):
+        tune(FigureEight(), "pi", SPACE, 10**9, tmp_path, workers, screen=True)
 
 
 def test_too_few_steps_are_refused_before_anything_is_driven(tmp_path: Path) -> None:

@@ -146,7 +146,7 @@ def bench(
     rounds: Annotated[int, typer.Option(min=1, help="Rounds in which all parts are measured in turn.")] = 7,
     json: JsonOption = False,
 ) -> None:
-    """Measure how fast episodes run here, beside bare SUMO, the same over TraCI, and virtual ones.
+    """Measure how fast episodes run here, beside bare SUMO, over TraCI, in a batch, and virtual ones.
 
     One core. Look at the ratios: steps per second change with the machine, and with the minute.
 
@@ -168,6 +168,12 @@ def bench(
         (f"{residual} in every step", found["every_step_steps_per_s"], every_step),
         ("the first of these over TraCI", found["traci_steps_per_s"], slower),
     ]
+    batch = found["batch"]
+    words, times = (
+        f"a batch of {batch['rings']:,} rings, the first of these",
+        f"{batch['over_bare']:.0f} of bare",
+    )
+    rows.append((words, batch["steps_per_s"], times))
     for rollouts in found["virtual"].values():
         words = f"{rollouts['rows']:,} rollouts of {rollouts['decisions']} decisions"
         times = f"{rollouts['over_actual']:.0f} times run_episode"
@@ -183,4 +189,7 @@ def bench(
     console.print(f"{filtered}; its audit takes {100 * found['audit_share']:.1f} % of the time")
     for entry in found["scaling"]:
         cost = f"{entry['us_per_vehicle_step']:.2f} us a vehicle-step"
+        console.print(f"{entry['vehicles']:>5} vehicles: {cost}")
+    for entry in batch["scaling"]:
+        cost = f"{1e3 * entry['us_per_vehicle_step']:.1f} ns a vehicle-step in a batch"
         console.print(f"{entry['vehicles']:>5} vehicles: {cost}")

@@ -208,9 +208,7 @@ def tune(
     *,
     scenario: ScenarioArgument,
     expert: Annotated[str, typer.Option("--expert", help="Name of the expert, as in unjam drivers.")] = "pi",
-    steps: Annotated[
-        int, typer.Option(min=1, help="Actual steps in all: as many as a training.")
-    ] = 2_000_000,
+    steps: Annotated[int, typer.Option(min=1, help="Steps in all: as many as a training.")] = 2_000_000,
     vary: Annotated[
         list[str] | None,
         typer.Option(help="What is varied, as in search; without it, all parameters, four times each way."),
@@ -219,6 +217,13 @@ def tune(
     settings: ScenarioSettingsOption = None,
     reward: RewardOption = "",
     seed: SeedOption = 0,
+    screen: Annotated[
+        bool | None,
+        typer.Option(
+            help="Try settings on batches of imagined rings, equal to SUMO's, and only finalists in SUMO "
+            "itself; without it, where the road is such a ring."
+        ),
+    ] = None,
     workers: WorkersOption = DEFAULT_WORKERS,
     out: OutOption = None,
     json: JsonOption = False,
@@ -239,6 +244,7 @@ def tune(
     from unjam.training.search import space_of
     from unjam.training.tune import space_around
     from unjam.training.tune import tune as run
+    from unjam.worlds.batch.world import why_not
     from unjam.worlds.reward import make_reward
     from unjam.worlds.workers import Workers
 
@@ -252,11 +258,14 @@ def tune(
         found = run(
             *(made, expert, space, steps, folder, pool, reward, seed),
             (lambda line: None) if json else aside.print,
+            not why_not(made) if screen is None else screen,
         )
     best, default = found.best, found.default
+    steps_of = {"actual_steps": found.actual_steps, "imagined_steps": found.imagined_steps}
     if json:
-        print_json({"file": str(found.file), "best": asdict(best), "default": asdict(default)})
+        print_json({"file": str(found.file), "best": asdict(best), "default": asdict(default), **steps_of})
         return
+    console.print(f"{found.actual_steps:,} actual steps, {found.imagined_steps:,} imagined")
     before = default.verdict if default.score is None else f"{default.score:.1f}"
     console.print(
         f"{best.driver}: {best.score:.1f} on tuning seeds; {default.driver}: {before}", soft_wrap=True

@@ -30,7 +30,7 @@ def distance_driven(speed: Array, new_speed: Array, time_step: float, steps: int
     return time_step * (steps * speed + (steps + 1) / 2 * (new_speed - speed))
 
 
-def gap_on_loop(position: Array, leader_position: Array, loop_length: float, leader_length: float) -> Array:
+def gap_on_loop(position: Array, leader_position: Array, loop_length: Array, leader_length: float) -> Array:
     """Return the bumper-to-bumper gap to the leader on a closed road.
 
     Positions are those of front bumpers along the road; they may run past the loop's length.

@@ -10,8 +10,8 @@ from unjam.errors import InputError, MissingPartError
 from unjam.files import check_folder
 from unjam.reports.figures import CAV_COLOUR, INK, colour_table
 from unjam.scenarios.scenario import VEHICLE_LENGTH
+from unjam.worlds.neighbours import places_along
 from unjam.worlds.record import Episode
-from unjam.worlds.sumo.neighbours import places_along
 from unjam.worlds.sumo.traffic import Scene
 
 SIZE = 640

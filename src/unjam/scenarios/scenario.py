@@ -184,6 +184,11 @@ class Scenario:
         """
         return self
 
+    def of_seed(self, seed: Sequence[int]) -> tuple[Road, Sequence[np.random.SeedSequence]]:
+        """Return the road of an episode's seed, and the seeds of noise, exploration and simulator."""
+        road, *others = np.random.SeedSequence(list(seed)).spawn(4)
+        return self.draw(np.random.default_rng(road)), others
+
     def possible_cavs(self) -> tuple[str, ...]:
         """Return the ids of all CAVs that an episode may have."""
         raise NotImplementedError

@@ -8,7 +8,7 @@ import itertools
 import os
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
 from statistics import median
@@ -29,8 +29,10 @@ from unjam.virtual.data import ActualData
 from unjam.virtual.model import EnvironmentModel, torch_generator
 from unjam.virtual.rollout import begin, draw_starts, imagine
 from unjam.virtual.settings import VirtualSettings
-from unjam.virtual.world import VirtualDynamics
+from unjam.virtual.world import VirtualDynamics, on_device
 from unjam.worlds.audit import brakings, following
+from unjam.worlds.batch.run import begin as begin_batch
+from unjam.worlds.batch.world import RingBatch
 from unjam.worlds.drive import Drive
 from unjam.worlds.episode import run_episode
 from unjam.worlds.record import Episode
@@ -44,6 +46,10 @@ SIZES = {22: 3000, 220: 800, 2200: 200}
 VIRTUAL = {"long": (2000, 50), "short": (1200, 10)}
 """virtual rows, and decisions of each: a model that is trusted for long; one that is not, as in an iteration
 of training on the ring"""
+BATCH = 90_112
+"""vehicles on all rings of a batch together: 4,096 rings of 22"""
+BATCH_DECISIONS = 100
+"""driven in each round"""
 METRES_PER_VEHICLE = 245 / 22
 OTHER_ROADS = ("figure-eight", "merge")
 """roads beside the ring on which `run_episode` is compared with SUMO alone"""
@@ -70,6 +76,8 @@ def measure_speed(rounds: int = ROUNDS, on_line: OnLine = lambda line: None) -> 
     residual driver that training makes by default, whose network chooses once a second.
     `over_bare_every_step`: the same with a network that chooses in every step.
     `over_traci`: steps/s of the same driving loop with libsumo over those through TraCI.
+    `batch`: steps/s of whole rings in a batch, in single precision and with noise that is drawn quickly, with
+    the driver of `over_bare`, over those of SUMO alone; and the cost of a vehicle-step by size of the rings.
     `virtual`: decisions/s of virtual rollouts, with the default ensemble and beginning them included, over
     those of `run_episode`.
     `over_unfiltered`: steps/s of `run_episode` over those without the safety filter.
@@ -93,6 +101,8 @@ def _measure(rounds: int, on_line: OnLine) -> dict[str, Any]:
     roads: dict[str, Rates] = {name: {"bare": [], "episode": []} for name in ("ring", *OTHER_ROADS)}
     rates: Rates = {name: [] for name in ("every_step", "unfiltered", "audit", "loop", "traci", *VIRTUAL)}
     torch.set_num_threads(1)
+    batches = {vehicles: _batch(vehicles, driver) for vehicles in SIZES}
+    rates |= {f"batch {vehicles}": [] for vehicles in batches}
     with Simulation() as simulation:
         for name in OTHER_ROADS:  # networks made, caches warm
             run_episode(SCENARIOS[name], driver, (0,), explore=True, simulation=simulation)
@@ -112,6 +122,8 @@ def _measure(rounds: int, on_line: OnLine) -> dict[str, Any]:
             rates["audit"].append(_rate(partial(_audit, driven), ring.horizon))
             for name, (rows, decisions) in VIRTUAL.items():
                 rates[name].append(_virtual_rate(driven, ring, driver, rows, decisions))
+            for vehicles, batch in batches.items():
+                rates[f"batch {vehicles}"].append(_batch_rate(batch, vehicles))
             rates["loop"].append(_loop_rate(ring, driver, simulation))
         with Simulation("traci") as simulation:
             rates["traci"].append(_loop_rate(replace(ring, horizon=TRACI_STEPS), driver, simulation))
@@ -119,6 +131,9 @@ def _measure(rounds: int, on_line: OnLine) -> dict[str, Any]:
     scaling = _scaling(driver, max(1, rounds // 2))
     costs = [entry["us_per_vehicle_step"] for entry in scaling]
     on_ring = roads.pop("ring")
+    in_batch = {vehicles: rates[f"batch {vehicles}"] for vehicles in batches}
+    batch_costs = {size: 1e6 / median(found) / size for size, found in in_batch.items()}
+    smallest = min(batch_costs)
     return {
         **_road(on_ring),
         "traci_steps_per_s": median(rates["traci"]),
@@ -127,6 +142,15 @@ def _measure(rounds: int, on_line: OnLine) -> dict[str, Any]:
         "over_unfiltered": _median_ratio(on_ring["episode"], rates["unfiltered"]),
         "audit_share": _median_ratio(on_ring["episode"], rates["audit"]),
         "over_traci": _median_ratio(rates["loop"], rates["traci"]),
+        "batch": {
+            "rings": BATCH // smallest,
+            "steps_per_s": median(in_batch[smallest]),
+            "over_bare": _median_ratio(in_batch[smallest], on_ring["bare"]),
+            "scaling": [
+                {"vehicles": size, "us_per_vehicle_step": cost} for size, cost in batch_costs.items()
+            ],
+            "growth": max(batch_costs.values()) / batch_costs[smallest],
+        },
         "virtual": {
             name: {
                 "rows": rows,
@@ -156,11 +180,36 @@ def _scaling(driver: ResidualDriver, rounds: int) -> list[dict[str, float]]:
     costs: dict[int, list[float]] = {vehicles: [] for vehicles in SIZES}
     for _ in range(rounds):
         for vehicles, horizon in SIZES.items():
-            length = round(vehicles * METRES_PER_VEHICLE)
-            ring = Ring(length=(length, length), vehicles=vehicles, cavs=vehicles // 22, horizon=horizon)
+            ring = _ring(vehicles, horizon)
             with Simulation() as simulation:
                 costs[vehicles].append(1e6 / _loop_rate(ring, driver, simulation) / vehicles)
     return [{"vehicles": vehicles, "us_per_vehicle_step": median(found)} for vehicles, found in costs.items()]
+
+
+def _ring(vehicles: int, horizon: int) -> Ring:
+    """Return a ring of the usual density, one CAV in 22."""
+    length = round(vehicles * METRES_PER_VEHICLE)
+    return Ring(length=(length, length), vehicles=vehicles, cavs=vehicles // 22, horizon=horizon)
+
+
+def _batch(vehicles: int, driver: ResidualDriver) -> Iterator[object]:
+    """Begin a batch of rings of that many vehicles each, and return what drives on as far as it is asked."""
+    rings, generator = BATCH // vehicles, torch_generator((0,), "cpu")
+    world = RingBatch(
+        [_ring(vehicles, 10**9)] * rings,
+        [(number,) for number in range(rings)],
+        partial(on_device, device="cpu"),
+        keep=False,
+        draw=lambda shape: torch.randn(shape, generator=generator),
+    )
+    return iter(begin_batch(world, driver, partial(on_device, device="cpu"), explore=True))
+
+
+@torch.no_grad()
+def _batch_rate(driving: Iterator[object], vehicles: int) -> float:
+    """Return steps of whole rings per second."""
+    some = itertools.islice(driving, BATCH_DECISIONS)
+    return _rate(lambda: deque(some, maxlen=0), BATCH // vehicles * BATCH_DECISIONS)
 
 
 def _rate(run: Callable[[], object], steps: int) -> float:

@@ -2,6 +2,7 @@
 
 from unjam.drivers.actuator import Actuator, Underway
 from unjam.drivers.safety import Ahead, SafetyFilter
+from unjam.physics.arrays import Array
 
 
 class Cars:
@@ -13,10 +14,10 @@ class Cars:
         self._late = not actuator.instant
         self._underway: dict[str, Underway] = {}
 
-    def carry_out(self, name: str, wanted: float, ahead: Ahead) -> tuple[float, float]:
+    def carry_out(self, name: str, wanted: Array, ahead: Ahead) -> tuple[Array, Array]:
         """Return what a car is told of the acceleration that is wanted, and what it does in this step [m/s2].
 
-        Once in each simulation step; all numbers are plain.
+        Once in each simulation step; all numbers are plain, or arrays of cars that share the name.
         """
         if not self._late:
             told = self._keep(wanted, ahead, self._step)

@@ -1,6 +1,7 @@
 """Driving: the one loop in which a driver and a world meet."""
 
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 
@@ -89,7 +90,12 @@ def drive(
     on_progress: OnProgress | None = None,
 ) -> Recorded:
     """Drive to the end, and return the world's record of it; arguments as `Drive` takes them."""
-    driving = Drive(world, driver, explore, memory, on_progress)
+    return driven_to_the_end(Drive(world, driver, explore, memory, on_progress))
+
+
+def driven_to_the_end(driving: Drive) -> Any:
+    """Return the record of a world in which a driver has just begun."""
+    world, driver = driving.world, driving.driver
     decisions = [
         decision[1:4] for decision in driving if decision is not None and decision.observation is not None
     ]

@@ -3,8 +3,6 @@
 from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
-
 from unjam.scenarios.road import ClosedRoad, MergingRoad, MotorwayRoad, OwnRoad, Road
 from unjam.scenarios.scenario import Scenario
 from unjam.worlds.sumo.closed import ClosedTraffic
@@ -35,8 +33,7 @@ def make_traffic(
     With `plain_numbers`, a single CAV on a closed road perceives and is driven in floats instead of arrays
     of one row. With `full`, fuel is recorded, and on roads with ends where on the plane vehicles are.
     """
-    road_seed, *seeds = np.random.SeedSequence(list(seed)).spawn(4)
-    road = scenario.draw(np.random.default_rng(road_seed))
+    road, seeds = scenario.of_seed(seed)
     traffic = KINDS[type(road)](scenario, road, Seed(tuple(seed), seeds), simulation, full)
     traffic.single = plain_numbers and isinstance(traffic, ClosedTraffic) and traffic.rows == 1
     return traffic

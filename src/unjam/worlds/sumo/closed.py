@@ -19,23 +19,16 @@ from unjam.drivers.safety import Ahead
 from unjam.errors import EpisodeError
 from unjam.physics.arrays import Array, at_least
 from unjam.physics.idm import idm_acceleration
-from unjam.physics.kinematics import gap_on_loop, next_position, next_speed
+from unjam.physics.kinematics import gap_on_loop, next_speed
 from unjam.scenarios.population import as_calibrated
 from unjam.scenarios.road import ClosedRoad
 from unjam.scenarios.scenario import VEHICLE_LENGTH, Scenario
-from unjam.worlds.audit import SHIELD_ROUNDING, Audit, brakings, following
-from unjam.worlds.record import Episode, Floats, trajectory
-from unjam.worlds.sumo.neighbours import loop_neighbours, loop_state, places_along
+from unjam.worlds.closed import HISTORY, NOISE_BLOCK, ClosedLog
+from unjam.worlds.neighbours import loop_neighbours, loop_state, places_along
+from unjam.worlds.record import Episode, Floats
 from unjam.worlds.sumo.simulation import LEAVE_TO_SUMO, Simulation
 from unjam.worlds.sumo.traffic import Scene, Seed, Traffic
 from unjam.worlds.world import Driven, OnProgress
-
-HISTORY = 60.0
-"""seconds of the warm-up that a driver may remember"""
-APPROACH = 50.0
-"""way before a crossing on which what SUMO adds is put down to the right of way [m]"""
-NOISE_BLOCK = 100
-"""steps for which noise is drawn at once"""
 
 
 class ClosedTraffic(Traffic[ClosedRoad]):
@@ -220,6 +213,22 @@ class ClosedTraffic(Traffic[ClosedRoad]):
             self._noise_rows = (draws * np.where(self._human_mask, scale, 0.0)).tolist()[::-1]
         return self._noise_rows.pop()
 
+    def _log(self) -> ClosedLog:
+        """Return what was logged since the log began."""
+        vehicles, cavs = len(self._human_mask), len(self.cavs)
+        return ClosedLog(
+            scenario=self.scenario,
+            road=self.road,
+            start=self.road.start_positions + np.array(self._started),
+            moved=np.array(self._log_moved).reshape(-1, vehicles),
+            speeds=np.array(self._log_speeds).reshape(-1, vehicles),
+            wanted=np.array(self._log_wanted).reshape(-1, cavs),
+            told=np.array(self._log_told).reshape(-1, cavs),
+            commanded=np.array(self._log_commanded).reshape(-1, cavs),
+            crashed=self.crashed,
+            fuel=np.array(self.log_fuel) if self.full else np.zeros((0, 0)),
+        )
+
     def speeds_and_positions(self) -> tuple[Floats, Floats]:
         """Return speeds [m/s] and positions [m] in every simulation step since the log began.
 
@@ -227,67 +236,17 @@ class ClosedTraffic(Traffic[ClosedRoad]):
 
         Positions are SUMO's Euler step over the recorded speeds, checked against SUMO's own odometer.
         """
-        step, road = self.scenario.simulation_step, self.road
-        start = road.start_positions + np.array(self._started)
-        moved = np.array(self._log_moved).reshape(-1, len(start)).T
-        speeds = np.array(self._log_speeds).reshape(-1, len(start)).T
-        positions = np.column_stack([start, next_position(start[:, None], moved.cumsum(1), step)])
-        self._check_odometer(road.vehicle_ids, road.start_positions, positions[:, -1])
-        return speeds, positions
+        return self._checked(self._log())
 
     def record(self, driven: Driven) -> Episode:
         """Return what happened since the start."""
-        road, each = self.road, self.scenario.steps_per_decision
-        moments = self.speeds_and_positions()
-        speeds, positions = (values[:, ::each] for values in moments)
-        gaps = gap_on_loop(positions, np.roll(positions, -1, axis=0), road.loop_length, VEHICLE_LENGTH)
-        states = loop_state(speeds, positions, self._near, road.loop_length)
-        (applied, filtered), shield = self._applied(), self._shield()
-        trajectories = tuple(
-            trajectory(
-                vehicle=name,
-                number=row,
-                start=0,
-                rows=None if self.single else np.full(self.decisions + 1, row),
-                states=states.each(lambda values: np.ascontiguousarray(values[row])),  # noqa: B023
-                applied=np.ascontiguousarray(applied[:, row]),
-                filtered=np.ascontiguousarray(filtered[:, row]),
-                shield=np.ascontiguousarray(shield[:, row]),
-                terminated=self.crashed,
-                driven=driven,
-            )
-            for row, name in enumerate(road.cav_ids)
-        )
-        return Episode(
-            **self._facts(),
-            vehicle_ids=road.vehicle_ids,
-            cav_ids=road.cav_ids,
-            speeds=np.ascontiguousarray(speeds.T),
-            positions=np.ascontiguousarray(positions.T),
-            gaps=np.ascontiguousarray(gaps.T),
-            fuel=np.array(self.log_fuel) if self.full else np.zeros((0, 0)),
-            loop_length=road.loop_length,
-            crossings=road.crossings,
-            outline=road.outline,
-            trajectories=trajectories,
-            audit=self._audit(*moments),
-        )
+        log, rows = self._log(), None if self.single else np.arange(len(self.cavs))
+        return log.episode(self._checked(log), self._facts(), driven, rows)
 
-    def _audit(self, speeds: Floats, positions: Floats) -> Audit:
-        """Return the physics of every simulation step; arrays of shape (vehicles, moments)."""
-        step, loop = self.scenario.simulation_step, self.road.loop_length
-        floor = self.scenario.safety.time_headway
-        states = loop_state(speeds, positions, self._near, loop).each(lambda values: values.T)
-        followed = states.speed, states.leader_speed, states.leader_gap
-        accelerations, driven = np.diff(speeds, axis=1) / step, np.zeros(len(speeds), bool)
-        if not self._controlled:
-            return Audit(brakings(accelerations), following=following(*followed, step), floor=floor)
-        driven[self._places] = True
-        before = [(end - states.route_position[:-1]) % loop for _, end in self.road.crossings]
-        ways = [end - start + APPROACH for start, end in self.road.crossings]
-        near = sum((left < way for left, way in zip(before, ways, strict=True)), np.zeros(1, bool))
-        found = following(*followed, step, self._added() > SHIELD_ROUNDING / step, near)
-        return Audit(brakings(accelerations[~driven]), brakings(accelerations[driven]), found, floor)
+    def _checked(self, log: ClosedLog) -> tuple[Floats, Floats]:
+        speeds, positions = log.moments()
+        self._check_odometer(self.road.vehicle_ids, self.road.start_positions, positions[:, -1])
+        return speeds, positions
 
     def last_applied(self) -> Floats:
         """Return what the CAVs were told in the last decision, once it was filtered [m/s2], shape (CAVs,)."""
@@ -300,31 +259,3 @@ class ClosedTraffic(Traffic[ClosedRoad]):
         driven = self.road.start_positions + np.array(self._simulation.distances(self.road.vehicle_ids))
         cavs = np.isin(np.arange(len(self.speeds)), self._places)
         return Scene(outline[:, 1:], places_along(outline, driven, loop), np.array(self.speeds), cavs)
-
-    def _applied(self) -> tuple[Floats, Floats]:
-        """Return what CAVs were told, and how much the filter took from it at most [m/s2], (T, CAVs) each.
-
-        Of humans it is what they did.
-        """
-        each, cavs = self.scenario.steps_per_decision, len(self.cavs)
-        if self._log_wanted:
-            wanted = np.array(self._log_wanted).reshape(-1, cavs)
-            taken = wanted[:, None] - np.array(self._log_told).reshape(-1, each, cavs)
-            return wanted - taken.mean(1), taken.max(1)
-        speeds = self._of_cavs(self._log_speeds)
-        did = np.diff(speeds[::each], axis=0) / self.scenario.decision_step
-        return did, np.zeros_like(did)
-
-    def _shield(self) -> Floats:
-        """Return the hardest braking that SUMO added to each command, zero if it let it pass, (T, CAVs)."""
-        return self._added().reshape(self.decisions, -1, len(self.cavs)).max(1).clip(0.0, None)
-
-    def _added(self) -> Floats:
-        """Return the braking that SUMO added to each command in each step [m/s2], shape (steps, CAVs)."""
-        moved = self._of_cavs(self._log_moved)
-        commanded = np.array(self._log_commanded).reshape(moved.shape) if self._controlled else moved
-        return (commanded - moved) / self.scenario.simulation_step
-
-    def _of_cavs(self, log: "array[float]") -> Floats:
-        """Return what was logged of the CAVs, shape (rows, CAVs)."""
-        return np.array(log).reshape(-1, len(self._human_mask))[:, self._places]

@@ -183,6 +183,11 @@ def _cav_layer(scenario: Scenario) -> Attributes:
     }
 
 
+def obedient_brakes(scenario: Scenario) -> float:
+    """Return how hard an obedient CAV can brake at all [m/s2]."""
+    return scenario.safety.braking if scenario.safety.active else OBEDIENT
+
+
 def _obedient_layer(scenario: Scenario) -> Attributes:
     """Return the attributes of a type that executes any safe command exactly.
 
@@ -190,12 +195,11 @@ def _obedient_layer(scenario: Scenario) -> Attributes:
     gap is the one that stays out of the way until the command would lead to a crash. Where a filter keeps it
     safe, it has a car's engine and brakes: SUMO only makes it yield, and others expect of it what it can do.
     """
-    safety = scenario.safety
-    brakes = safety.braking if safety.active else OBEDIENT
+    brakes = obedient_brakes(scenario)
     return {
         "color": CAV_COLOUR,
         "carFollowModel": "Krauss",
-        "accel": max(ACCELERATION, scenario.limits.highest) if safety.active else OBEDIENT,
+        "accel": max(ACCELERATION, scenario.limits.highest) if scenario.safety.active else OBEDIENT,
         **dict.fromkeys(("decel", "emergencyDecel", "apparentDecel"), brakes),
         "tau": scenario.simulation_step,
         "minGap": SMALLEST_CAV_GAP,

@@ -1,0 +1,7 @@
+#!/usr/bin/env bash
+# Measures what docs/virtual.md says of batches of rings: how far they are from SUMO's episodes of the same seeds
+# (parity.json), and how fast they are beside it, on one core (bench.json). About five minutes.
+set -eu
+cd "$(dirname "$0")"
+python parity.py > parity.json
+unjam bench --json --rounds 5 > bench.json

@@ -1,0 +1,35 @@
+"""How SUMO moves people who drive its IDM, as one formula on arrays: the model, and what SUMO clips of it.
+
+Sources: SUMO's MSCFModel_IDM (`_v`), MSCFModel (`finalizeSpeed`) and MSVehicle (`executeMove`).
+"""
+
+from unjam.physics.arrays import Array, at_least, at_most
+from unjam.physics.idm import PARAMETER_NAMES, IDMParameters, IDMRows, by_squaring, idm_acceleration
+from unjam.physics.kinematics import next_speed
+
+SMALLEST_GAP = 1e-3
+"""gap below which `_v` takes this one, SUMO's NUMERICAL_EPS [m]"""
+EMERGENCY_BRAKING = 9.0
+"""`emergencyDecel` of a passenger car, beyond which `finalizeSpeed` lets nobody brake [m/s2]"""
+CREEPING = 1e-4
+"""SUMO's NUMERICAL_EPS_SPEED over the time step: people no faster than that after a step stand [m/s2]"""
+
+
+def people_speed(
+    speed: Array, leader_speed: Array, gap: Array, people: IDMParameters | IDMRows, step: float
+) -> Array:
+    """Return the speeds after a step of people behind leaders, before noise is added [m/s].
+
+    Shapes: any, broadcast together. Units: m/s, m/s, m, s. SUMO divides steps of more than 0.375 s; those
+    are not here.
+    """
+    gap = at_least(gap, SMALLEST_GAP)
+    acceleration = idm_acceleration(speed, leader_speed, gap, people, by_squaring)
+    wanted = next_speed(speed, at_least(acceleration, -EMERGENCY_BRAKING), step)
+    wanted = at_most(wanted, people.desired_speed)
+    return wanted * (wanted > CREEPING * step)
+
+
+def without_gap(people: IDMParameters | IDMRows) -> IDMRows:
+    """Return people who keep no gap at standstill, as to the end of a lane."""
+    return IDMRows(**{name: getattr(people, name) for name in PARAMETER_NAMES})._replace(minimum_gap=0.0)

@@ -1,0 +1,59 @@
+"""Episodes of many rings at once, instead of one after the other in SUMO."""
+
+from collections.abc import Sequence
+from typing import cast
+
+import numpy as np
+
+from unjam.drivers.driver import Driver
+from unjam.drivers.residual import AGE
+from unjam.errors import InputError
+from unjam.scenarios.ring import Ring
+from unjam.tree import mapped
+from unjam.worlds.batch.noise import Numbers
+from unjam.worlds.batch.record import Rings
+from unjam.worlds.batch.world import RingBatch
+from unjam.worlds.drive import Drive, driven_to_the_end
+from unjam.worlds.episode import rewarded
+from unjam.worlds.record import Episode
+from unjam.worlds.reward import make_reward
+from unjam.worlds.workers import EpisodeTask
+
+
+def begin(world: RingBatch, driver: Driver, numbers: Numbers = np.asarray, explore: bool = False) -> Drive:
+    """Return a driver who has just begun in a batch, and remembers in its arrays.
+
+    Args:
+        world: where.
+        driver: of every CAV; where arrays are tensors, one who takes them.
+        numbers: makes the world's arrays.
+        explore: whether what was learned adds its exploration noise.
+    """
+    driving = Drive(world, driver, explore)
+    driving.memory = mapped(numbers, driving.memory)
+    if AGE in driving.memory:
+        driving.memory[AGE] = 0.0  # all rows began together: no network is asked while residuals are held
+    return driving
+
+
+def run_batch(tasks: Sequence[EpisodeTask], numbers: Numbers = np.asarray) -> list[Episode]:
+    """Return the episodes of tasks, as `run_episode` does in SUMO, but for rounding; all are stepped at once.
+
+    Args:
+        tasks: rings that differ in length and seed alone.
+        numbers: makes the arrays that are stepped.
+
+    Raises:
+        InputError: the tasks differ in more, or `batch.world.why_not` says why they cannot be run so.
+    """
+    first = tasks[0]
+    if any(
+        (each.driver, each.reward, each.explore) != (first.driver, first.reward, first.explore)
+        for each in tasks
+    ):
+        raise InputError("batch: the tasks differ in driver, reward or exploration, or want fuel")
+    scenarios, seeds = [cast(Ring, each.scenario) for each in tasks], [each.seed for each in tasks]
+    world = RingBatch(scenarios, seeds, numbers, first.reward)
+    rings: Rings = driven_to_the_end(begin(world, first.driver, numbers, first.explore))
+    earned = make_reward(first.reward or first.scenario.reward)
+    return [rewarded(episode, earned) for episode in rings.episodes]

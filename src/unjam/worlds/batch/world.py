@@ -1,0 +1,301 @@
+"""W whole rings as one world to drive in: vehicles times rings, stepped as arrays, free of the simulator.
+
+Arrays have the vehicles of a ring along their first axis, in road order, and the rings along their second; a
+row of the vehicles' speeds comes again at the end, so that who is ahead is a slice. CAVs' rows are ring after
+ring of the first CAV, then of the second, and so on.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import reduce
+from typing import Any, cast
+
+import numpy as np
+
+from unjam.drivers.command import Command
+from unjam.drivers.local_state import LocalState
+from unjam.drivers.safety import Ahead
+from unjam.errors import EpisodeError, InputError
+from unjam.physics.arrays import Array, at_least, at_most, namespace
+from unjam.physics.idm import IDMParameters, IDMRows, parameter_rows
+from unjam.physics.kinematics import gap_on_loop, next_position, next_speed
+from unjam.scenarios.ring import Ring
+from unjam.scenarios.road import ClosedRoad
+from unjam.scenarios.scenario import VEHICLE_LENGTH, Scenario
+from unjam.worlds.audit import MOVING_SPEED
+from unjam.worlds.batch.lanes import CONTACT, Leader, end_of_lane, leaders, touching
+from unjam.worlds.batch.noise import Noise, Numbers, QuickNoise, SeededNoise
+from unjam.worlds.batch.people import people_speed, without_gap
+from unjam.worlds.batch.record import RingLog, Rings, as_numpy
+from unjam.worlds.cars import Cars
+from unjam.worlds.closed import HISTORY
+from unjam.worlds.reward import Outcome, make_reward, time_headway
+from unjam.worlds.sumo.files import obedient_brakes
+from unjam.worlds.world import Driven, OnProgress
+
+LONGEST_STEP = 0.37
+"""simulation step up to which SUMO's IDM makes one step of it [s]"""
+
+
+def why_not(scenario: Scenario) -> str:
+    """Return why a scenario cannot be stepped in a batch exactly as SUMO does it; empty where it can."""
+    if not isinstance(scenario, Ring):
+        return f"{scenario.title}: it is no ring"
+    if scenario.human_control != "native":
+        return "human_control: people are commanded"
+    exact = scenario.actuation == "raw" or (scenario.actuation == "shielded" and scenario.safety.active)
+    if not exact:
+        return "actuation: SUMO's own check decides what CAVs do; allowed: raw, or a safety filter that acts"
+    if scenario.simulation_step > LONGEST_STEP:
+        return f"simulation_step: {scenario.simulation_step:g} s; allowed: <= {LONGEST_STEP:g} s"
+    return ""
+
+
+class RingBatch:
+    """W rings of the same kind, each with a seed of its own; equal to SUMO's, but for rounding.
+
+    With noise that is drawn quickly people follow the car ahead and nobody else. SUMO's also look at the last
+    car of the next lane, and no farther than they must: see `unjam.worlds.batch.lanes`.
+    """
+
+    single, kept = False, None
+
+    def __init__(
+        self,
+        scenarios: Sequence[Ring],
+        seeds: Sequence[Sequence[int]],
+        numbers: Numbers = np.asarray,
+        reward: str = "",
+        keep: bool = True,
+        draw: Callable[[tuple[int, ...]], Array] | None = None,
+    ) -> None:
+        """Put the vehicles on the roads; nothing moves yet.
+
+        Args:
+            scenarios: of each ring; they differ in their lengths alone.
+            seeds: of each ring, as `run_episode` takes them.
+            numbers: makes the arrays that are stepped, as NumPy's or torch's, in any precision.
+            reward: name; empty: the scenario's own.
+            keep: whether all is kept for episodes, some 16 bytes for each vehicle and step in float64.
+            draw: of all noise, for arrays of a shape; None: each ring draws what SUMO's episode would.
+
+        Raises:
+            InputError: a scenario cannot be stepped so, or they are not alike.
+        """
+        scenario = self.scenario = scenarios[0]
+        for each in scenarios:
+            if why := why_not(each):
+                raise InputError(f"batch: {why}")
+            if replace(each, length=scenario.length) != scenario:
+                raise InputError("batch: the scenarios differ in more than their lengths")
+        drawn = [each.of_seed(seed) for each, seed in zip(scenarios, seeds, strict=True)]
+        roads = self.roads = [cast(ClosedRoad, road) for road, _ in drawn]
+        self._scenarios, self._seeds, self._keep, self._numbers = scenarios, seeds, keep, numbers
+        worlds, vehicles, cavs = len(roads), len(roads[0].vehicle_ids), len(roads[0].cav_ids)
+        self.limits, self.rows, self.entered = scenario.limits, cavs * worlds, cavs * worlds
+        self.decisions = 0
+        places = np.array([roads[0].vehicle_ids.index(name) for name in roads[0].cav_ids])
+        self._places, self._ahead, self._behind = (
+            each.tolist() for each in (places, places + 1, (places - 1) % vehicles)
+        )
+        self._shape = cavs, worlds
+        start = np.stack([road.start_positions for road in roads], 1)
+        loops = np.array([road.loop_length for road in roads])
+        self._loop = numbers(loops)
+        self._loops = numbers(np.tile(loops, cavs))
+        self._gap = numbers(gap_on_loop(start, np.roll(start, -1, 0), loops, VEHICLE_LENGTH))
+        self._position = numbers(start)
+        self._speed = numbers(np.zeros((vehicles + 1, worlds)))
+        self._people = _people(roads, scenario, numbers)
+        self._scale = numbers(np.full((vehicles, 1), scenario.noise_per_step * scenario.simulation_step))
+        self._cars = Cars(scenario.safety, scenario.actuator, scenario.simulation_step)
+        self._brakes = obedient_brakes(scenario) * scenario.simulation_step
+        seeded = [others for _, others in drawn]
+        self._noise: Noise = (
+            SeededNoise(seeded, vehicles, (scenario.horizon, cavs), numbers)
+            if draw is None
+            else QuickNoise(draw, vehicles, cavs, worlds)
+        )
+        self._reward = make_reward(reward or scenario.reward)
+        self._controlled, self._quick = False, draw is not None
+        self._forget()
+
+    def _forget(self) -> None:
+        """Begin the log and the sums anew."""
+        self._log = RingLog(as_numpy(self._position), [self._speed[:-1]])
+        ring = self._loop * 0.0
+        each_cav = self._loops.reshape(self._shape) * 0.0
+        self._running, self._made = ring + 1.0, ring
+        self._sums, self._driven, self._crashed = dict[str, Array](), ring, ring > 0.0
+        self._headway, self._braking = each_cav + np.inf, each_cav
+
+    def start(self, controlled: bool, on_progress: OnProgress | None = None) -> LocalState | None:
+        """Run the warm-up, then hand the CAVs over, unless they stay human (`controlled` false).
+
+        Returns:
+            What the CAVs perceived in the last minute of the warm-up at the times of decisions, NumPy arrays
+            of shape (CAVs * W, moments), oldest first; None without a warm-up that may be remembered.
+        """
+        scenario, seen = self.scenario, list[LocalState]()
+        each, longest = scenario.steps_per_decision, round(HISTORY / scenario.decision_step)
+        for step in range(scenario.warmup):
+            left = scenario.warmup - step
+            if left % each == 0 and left // each <= longest:
+                seen.append(self.perceive().each(as_numpy))
+            self._simulate(None)
+        if bool(self._crashed.any()):
+            raise EpisodeError("collision in the all-human warm-up of a ring")
+        self._controlled = controlled
+        if controlled:
+            self._scale[self._places] = 0.0
+            self._noise.begin_anew()
+        self._forget()
+        if not seen or not scenario.recall_warmup:
+            return None
+        return seen[0].each(lambda *values: np.stack(values, 1), *seen[1:])
+
+    @property
+    def ended(self) -> bool:
+        """Whether the horizon is reached; a ring on which vehicles collided goes on, and counts no more."""
+        return self.decisions >= self.scenario.horizon
+
+    def perceive(self) -> LocalState:
+        """Return what the CAVs perceive now: arrays of shape (CAVs * W,)."""
+        speed, gap = self._speed, self._gap
+        return LocalState(
+            *self._followed(),
+            self._rows_at(speed, self._behind),
+            self._rows_at(gap, self._behind),
+            self._rows_at(self._position, self._places) % self._loops,
+            self._loops,
+        )
+
+    def _followed(self) -> Ahead:
+        """Return what the CAVs' filters know."""
+        speed, own = self._speed, self._places
+        return Ahead(
+            self._rows_at(speed, own), self._rows_at(speed, self._ahead), self._rows_at(self._gap, own)
+        )
+
+    def _rows_at(self, values: Array, places: list[int]) -> Array:
+        """Return what is at some places, ring after ring of each, shape (CAVs * W,)."""
+        return values[places[0]] if len(places) == 1 else values[places].reshape(-1)
+
+    def advance(self, command: Command | None) -> None:
+        """Simulate one decision, held over its simulation steps; None: the CAVs stay human."""
+        each, before = self.scenario.steps_per_decision, self._rows_at(self._speed, self._places)
+        wanted = self._checked(command) if self._controlled else None
+        log = self._log
+        if wanted is not None and self._keep:
+            log.wanted.append(wanted)
+        told = [self._simulate(wanted) for _ in range(each)]
+        self.decisions += 1
+        after, _, gap = self._followed()
+        applied: Array = (
+            sum(told) / each if told[0] is not None else (after - before) / self.scenario.decision_step
+        )
+        outcome = Outcome(
+            speeds=self._speed[:-1].T,
+            accelerations=applied.reshape(self._shape).T,
+            headways=time_headway(gap, after).reshape(self._shape).T,
+            crashed=self._crashed,
+            waiting=self._running * 0.0,
+        )
+        for name, term in self._reward(outcome).items():
+            self._sums[name] = self._sums.get(name, 0.0) + term * self._running
+        self._made = self._made + self._running
+        self._driven = self._driven + outcome.speeds.mean(-1) * self._running
+        self._running = self._running * ~self._crashed
+
+    def _checked(self, command: Command | None) -> Array:
+        """Return what is wanted, within the limits; raise `InputError` where it is not finite numbers."""
+        found: Any = () if command is None else command.acceleration
+        if np.shape(found) != (self.rows,) or not bool(namespace(found).isfinite(found).all()):
+            raise InputError(f"driver: step {self.decisions}: not {self.rows} accelerations that are finite")
+        return self.limits.keep(found)
+
+    def _people_speed(self, speed: Array, ahead: Leader) -> Array:
+        """Return the speeds after this step of all vehicles, if people drive them, shape (vehicles, W)."""
+        people, step = self._people, self.scenario.simulation_step
+        if self._quick:
+            return people_speed(speed, *ahead, people, step)
+        seen = leaders(speed, self._position, ahead, self._loop, people, step)
+        xp = namespace(speed)
+        found = reduce(xp.minimum, (people_speed(speed, *each, people, step) for each in seen))
+        beyond = speed > people.desired_speed  # noise did it
+        if bool(beyond.any()):
+            end = end_of_lane(speed, self._position, self._loop, people)
+            slower = people_speed(speed, *end, without_gap(people), step)
+            slowest = speed - people.comfortable_deceleration * step
+            found = xp.where(beyond, xp.minimum(found, xp.maximum(slower, slowest)), found)
+        return found
+
+    def _simulate(self, wanted: Array | None) -> Array:
+        """Simulate one step, and return what CAVs were told; None: they are human."""
+        step, speed, own = self.scenario.simulation_step, self._speed, self._places
+        moved = self._people_speed(speed[:-1], Leader(speed[1:], self._gap))
+        cavs, told = self._followed(), None
+        if wanted is not None:
+            told, done = self._cars.carry_out("all", wanted, cavs)
+            commanded = next_speed(cavs.speed, done, step)
+            obeyed = at_most(at_least(commanded, cavs.speed - self._brakes), self.scenario.top_speed)
+            moved[own] = obeyed.reshape(self._shape)
+            if self._keep:
+                self._log.told.append(told)
+                self._log.commanded.append(commanded)
+        xp = namespace(moved)
+        ahead = xp.concatenate([moved[1:], moved[:1]])
+        self._gap = self._gap + (ahead - moved) * step
+        self._position = next_position(self._position, moved, step)
+        if bool((self._gap < CONTACT).any()):
+            self._crashed = self._crashed | touching(self._position, self._gap, self._loop).any(0)
+        speeds = moved
+        if self.scenario.noise > 0:
+            speeds = at_least(moved + self._noise.of_people() * self._scale, 0.0)
+        self._speed = xp.concatenate([speeds, speeds[:1]])
+        if self._keep:
+            self._log.moved.append(moved)
+            self._log.speeds.append(speeds)
+        self._sum_up(cavs)
+        return told
+
+    def _sum_up(self, before: Ahead) -> None:
+        """Note how the CAVs follow at the beginning of a step, and how hard they brake in it."""
+        braking = (before.speed - self._rows_at(self._speed, self._places)) / self.scenario.simulation_step
+        counted = braking.reshape(self._shape) * self._running
+        self._braking = namespace(counted).maximum(self._braking, counted)
+        self._headway = self._with_headway(before)
+
+    def _with_headway(self, cavs: Ahead) -> Array:
+        """Return the smallest headways with those at a moment, shape (CAVs, W)."""
+        speed, gap = (each.reshape(self._shape) for each in (cavs.speed, cavs.gap))
+        xp, counts = namespace(speed), (speed > MOVING_SPEED) * (self._running > 0)
+        return xp.where(counts, xp.minimum(self._headway, gap / at_least(speed, MOVING_SPEED)), self._headway)
+
+    def noise(self) -> Array:
+        """Return standard normal noise of this decision, shape (CAVs * W,)."""
+        return self._noise.of_networks(self.decisions)
+
+    def record(self, driven: Driven) -> Rings:
+        """Return what happened since the start."""
+        headway, braking = self._with_headway(self._followed()), self._braking
+        made = as_numpy(self._made)
+        return Rings(
+            decisions=made,
+            crashed=1.0 - as_numpy(self._running),
+            terms={name: as_numpy(total) for name, total in self._sums.items()},
+            mean_speed=as_numpy(self._driven) / made,
+            headway=as_numpy(headway).min(0),
+            braking=as_numpy(braking).max(0),
+            episodes=self._log.episodes(self._scenarios, self.roads, self._seeds, made, driven)
+            if self._keep
+            else (),
+        )
+
+
+def _people(roads: Sequence[ClosedRoad], scenario: Ring, numbers: Numbers) -> IDMParameters | IDMRows:
+    """Return how people drive: all alike, or each vehicle's driver, shape (vehicles, W)."""
+    if not roads[0].people:
+        return scenario.humans
+    drivers = [parameter_rows([road.people[name] for name in road.vehicle_ids]) for road in roads]
+    return IDMRows(*(numbers(np.stack(values, 1)) for values in zip(*drivers, strict=True)))

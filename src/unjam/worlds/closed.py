@@ -1,0 +1,142 @@
+"""What was logged on a closed road, whoever simulated it, and the record that is made of it."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from unjam.physics.kinematics import gap_on_loop, next_position
+from unjam.scenarios.road import ClosedRoad
+from unjam.scenarios.scenario import VEHICLE_LENGTH, Scenario
+from unjam.worlds.audit import SHIELD_ROUNDING, Audit, brakings, following
+from unjam.worlds.neighbours import loop_neighbours, loop_state
+from unjam.worlds.record import Episode, Floats, trajectory
+from unjam.worlds.world import Driven
+
+HISTORY = 60.0
+"""seconds of the warm-up that a driver may remember"""
+APPROACH = 50.0
+"""way before a crossing on which what SUMO adds is put down to the right of way [m]"""
+NOISE_BLOCK = 100
+"""steps for which people's noise is drawn at once; what is left of a block is dropped as CAVs take over"""
+
+
+@dataclass(frozen=True)
+class ClosedLog:
+    """All simulation steps of a closed road: D decisions of S steps in all, N vehicles, C of them CAVs."""
+
+    scenario: Scenario
+    road: ClosedRoad
+    start: Floats
+    """front bumpers as the log began, not wrapped [m], shape (N,)"""
+    moved: Floats
+    """speeds with which the vehicles moved, before noise [m/s], shape (S, N)"""
+    speeds: Floats
+    """with noise, the first being that at the start [m/s], shape (S + 1, N)"""
+    wanted: Floats
+    """what the drivers asked for, within the limits [m/s2], shape (D, C); no rows where CAVs stayed human"""
+    told: Floats
+    """what of it passed the safety filter [m/s2], shape (S, C); likewise"""
+    commanded: Floats
+    """the speeds that this leads to [m/s], shape (S, C); likewise"""
+    crashed: bool = False
+    fuel: Floats = field(default_factory=lambda: np.zeros((0, 0)))
+    """[mg/s], shape (D, N); (0, 0) where it was not recorded"""
+
+    @property
+    def places(self) -> NDArray[np.intp]:
+        """Which of the vehicles are CAVs, in road order."""
+        return np.array([self.road.vehicle_ids.index(name) for name in self.road.cav_ids])
+
+    def moments(self) -> tuple[Floats, Floats]:
+        """Return speeds [m/s] and positions [m] in every simulation step, shape (N, S + 1): Euler steps."""
+        start, moved = self.start[:, None], self.moved.T
+        positions = next_position(start, moved.cumsum(1), self.scenario.simulation_step)
+        return self.speeds.T, np.column_stack([start, positions])
+
+    def episode(
+        self, moments: tuple[Floats, Floats], facts: dict[str, Any], driven: Driven, rows: Any
+    ) -> Episode:
+        """Return the record.
+
+        Args:
+            moments: of this log.
+            facts: what else the record says.
+            driven: what the driver decided.
+            rows: of the CAVs in it, shape (C,); None: decisions are plain numbers.
+        """
+        road, each = self.road, self.scenario.steps_per_decision
+        speeds, positions = (values[:, ::each] for values in moments)
+        decisions = speeds.shape[1] - 1
+        gaps = gap_on_loop(positions, np.roll(positions, -1, axis=0), road.loop_length, VEHICLE_LENGTH)
+        near = loop_neighbours(self.places, len(self.start))
+        states = loop_state(speeds, positions, near, road.loop_length)
+        (applied, filtered), shield = self._applied(), self._shield(decisions)
+        trajectories = tuple(
+            trajectory(
+                vehicle=name,
+                number=number if rows is None else int(rows[number]),
+                start=0,
+                rows=None if rows is None else np.full(decisions + 1, rows[number]),
+                states=states.each(lambda values: np.ascontiguousarray(values[number])),  # noqa: B023
+                applied=np.ascontiguousarray(applied[:, number]),
+                filtered=np.ascontiguousarray(filtered[:, number]),
+                shield=np.ascontiguousarray(shield[:, number]),
+                terminated=self.crashed,
+                driven=driven,
+            )
+            for number, name in enumerate(road.cav_ids)
+        )
+        return Episode(
+            **facts,
+            vehicle_ids=road.vehicle_ids,
+            cav_ids=road.cav_ids,
+            speeds=np.ascontiguousarray(speeds.T),
+            positions=np.ascontiguousarray(positions.T),
+            gaps=np.ascontiguousarray(gaps.T),
+            fuel=self.fuel,
+            loop_length=road.loop_length,
+            crossings=road.crossings,
+            outline=road.outline,
+            trajectories=trajectories,
+            audit=self._audit(*moments),
+        )
+
+    def _audit(self, speeds: Floats, positions: Floats) -> Audit:
+        """Return the physics of every simulation step; arrays of shape (vehicles, moments)."""
+        step, loop = self.scenario.simulation_step, self.road.loop_length
+        floor = self.scenario.safety.time_headway
+        near = loop_neighbours(self.places, len(self.start))
+        states = loop_state(speeds, positions, near, loop).each(lambda values: values.T)
+        followed = states.speed, states.leader_speed, states.leader_gap
+        accelerations, driven = np.diff(speeds, axis=1) / step, np.zeros(len(speeds), bool)
+        if not len(self.wanted):
+            return Audit(brakings(accelerations), following=following(*followed, step), floor=floor)
+        driven[self.places] = True
+        before = [(end - states.route_position[:-1]) % loop for _, end in self.road.crossings]
+        ways = [end - start + APPROACH for start, end in self.road.crossings]
+        close = sum((left < way for left, way in zip(before, ways, strict=True)), np.zeros(1, bool))
+        found = following(*followed, step, self._added() > SHIELD_ROUNDING / step, close)
+        return Audit(brakings(accelerations[~driven]), brakings(accelerations[driven]), found, floor)
+
+    def _applied(self) -> tuple[Floats, Floats]:
+        """Return what CAVs were told, and how much the filter took from it at most [m/s2], (D, C) each.
+
+        Of humans it is what they did.
+        """
+        each = self.scenario.steps_per_decision
+        if len(self.wanted):
+            taken = self.wanted[:, None] - self.told.reshape(len(self.wanted), each, -1)
+            return self.wanted - taken.mean(1), taken.max(1)
+        did = np.diff(self.speeds[::each, self.places], axis=0) / self.scenario.decision_step
+        return did, np.zeros_like(did)
+
+    def _shield(self, decisions: int) -> Floats:
+        """Return the hardest braking that was added to each command, zero if it passed, (D, C)."""
+        return self._added().reshape(decisions, -1, len(self.road.cav_ids)).max(1).clip(0.0, None)
+
+    def _added(self) -> Floats:
+        """Return the braking that SUMO added to each command in each step [m/s2], shape (S, C)."""
+        moved = self.moved[:, self.places]
+        return ((self.commanded if len(self.wanted) else moved) - moved) / self.scenario.simulation_step

@@ -1,0 +1,250 @@
+"""Does a batch of rings do what SUMO's episodes of the same seeds do?"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from unjam.drivers import Constant, Driver
+from unjam.drivers.actuator import Actuator
+from unjam.drivers.local_state import LocalState
+from unjam.drivers.registry import named_driver
+from unjam.drivers.safety import SafetyFilter
+from unjam.errors import InputError
+from unjam.measures.metrics import measure
+from unjam.scenarios import FigureEight, Ring
+from unjam.scenarios.population import Population, write_population
+from unjam.training.speed import neural_driver
+from unjam.worlds.batch.run import begin, run_batch
+from unjam.worlds.batch.world import RingBatch, why_not
+from unjam.worlds.drive import driven_to_the_end
+from unjam.worlds.episode import run_episode
+from unjam.worlds.record import Episode, Floats
+from unjam.worlds.sumo.simulation import Simulation
+from unjam.worlds.workers import EpisodeTask
+
+SHORT = Ring(horizon=300)
+NO_FILTER = SafetyFilter(active=False)
+QUICK_PEOPLE = replace(SHORT.humans, exponent=3.0, time_headway=1.4, desired_speed=12.0)
+
+
+def tasks(
+    ring: Ring, driver: Driver, seeds: Sequence[int], explore: bool = False, reward: str = ""
+) -> list[EpisodeTask]:
+    return [EpisodeTask(ring, driver, (seed,), reward, explore) for seed in seeds]
+
+
+def assert_alike(found: Episode, actual: Episode) -> None:
+    """Speeds and positions are the same to 1e-9; so is all that is measured, but for rounding."""
+    assert found.speeds.shape == actual.speeds.shape
+    assert np.abs(found.speeds - actual.speeds).max() < 1e-9
+    assert np.abs(found.positions - actual.positions).max() < 1e-9
+    assert found.vehicle_ids == actual.vehicle_ids
+    row = measure(found)
+    for name, value in measure(actual).items():
+        assert row[name] == (pytest.approx(value, 1e-7, 1e-9, True) if isinstance(value, float) else value)
+
+
+RINGS: dict[str, tuple[Ring, str]] = {
+    "people alone": (SHORT, "human"),
+    "people alone after a warm-up": (replace(SHORT, warmup=130), "human"),
+    "a CAV": (SHORT, "pi"),
+    "a CAV after a warm-up": (replace(SHORT, warmup=750), "pi"),
+    "a CAV that forgets the warm-up": (replace(SHORT, warmup=130, recall_warmup=False), "pi"),
+    "four CAVs": (replace(SHORT, cavs=4), "pi"),
+    "CAVs alone": (replace(SHORT, cavs=22), "pi"),
+    "a short ring": (Ring(length=(60, 80), vehicles=8, cavs=2, horizon=300, warmup=100), "pi"),
+    "a tiny ring": (Ring(length=(24, 28), vehicles=3, horizon=300), "pi"),
+    "a long ring": (Ring(length=(500, 560), vehicles=50, cavs=5, horizon=300), "pi"),
+    "a ring with few": (Ring(length=(300, 400), vehicles=2, horizon=300), "pi"),
+    "a wide ring, where people see past the car ahead": (Ring(length=(800, 900), horizon=300), "pi"),
+    "commands that are held": (replace(SHORT, steps_per_decision=5, horizon=80, warmup=52), "pi"),
+    "a coarser step": (replace(SHORT, simulation_step=0.3), "pi"),
+    "the paper's PI": (SHORT, "pi:time_constant=0"),
+    "late cars": (replace(SHORT, actuator=Actuator(delay=0.2, lag=0.3)), "pi"),
+    "raw": (replace(SHORT, actuation="raw", safety=NO_FILTER), "pi"),
+    "wild people": (replace(SHORT, noise=10.0), "pi"),
+    "people who brake as hard as they can": (replace(SHORT, noise=20.0), "human"),
+    "people faster than they want": (
+        Ring(length=(400, 400), vehicles=12, horizon=300, humans=replace(SHORT.humans, desired_speed=3.0)),
+        "human",
+    ),
+    "calm people": (replace(SHORT, noise=0.0), "pi"),
+    "people of another kind": (replace(SHORT, humans=QUICK_PEOPLE), "pi"),
+}
+
+
+@pytest.mark.parametrize("name", RINGS)
+def test_a_ring_of_the_batch_is_sumos_of_the_same_seed(name: str, simulation: Simulation) -> None:
+    ring, expert = RINGS[name]
+    driver = named_driver(expert, ring.decision_step)
+    for found, seed in zip(run_batch(tasks(ring, driver, (1, 2))), (1, 2), strict=True):
+        assert_alike(found, run_episode(ring, driver, seed, simulation=simulation))
+
+
+def test_it_stays_so_for_five_minutes(simulation: Simulation) -> None:
+    ring, driver = Ring(cavs=2), named_driver("pi", 0.1)
+    for found, seed in zip(run_batch(tasks(ring, driver, (7, 8))), (7, 8), strict=True):
+        assert found.steps == 3000
+        assert_alike(found, run_episode(ring, driver, seed, simulation=simulation))
+
+
+@pytest.mark.parametrize("hold", [1, 10])
+def test_a_network_sees_explores_and_is_recorded_as_in_sumo(hold: int, simulation: Simulation) -> None:
+    ring, driver = Ring(cavs=2, warmup=120, horizon=100), neural_driver(hold)
+    for found, seed in zip(run_batch(tasks(ring, driver, (1, 2), True)), (1, 2), strict=True):
+        actual = run_episode(ring, driver, seed, explore=True, simulation=simulation)
+        assert_alike(found, actual)
+        for one, other in zip(found.trajectories, actual.trajectories, strict=True):
+            for name in ("observations", "expert", "residual", "applied", "filtered", "reward"):
+                assert getattr(one, name) == pytest.approx(getattr(other, name), abs=1e-9), name
+            for name, values in other.memory.items():
+                assert one.memory[name] == pytest.approx(values, abs=1e-9, nan_ok=True), name
+
+
+def test_who_collides_ends_there_and_others_go_on(simulation: Simulation) -> None:
+    ring = Ring(length=(230, 260), horizon=200, actuation="raw", safety=NO_FILTER)
+    found = run_batch(tasks(ring, Constant(0.6), (1, 2, 3)))
+    for episode, seed in zip(found, (1, 2, 3), strict=True):
+        assert_alike(episode, run_episode(ring, Constant(0.6), seed, simulation=simulation))
+    assert {episode.status for episode in found} == {"collision"}
+    assert len({episode.steps for episode in found}) > 1
+
+
+class Hasty(Driver):
+    """Brakes harder than its brakes can, now and then."""
+
+    def act(self, state: LocalState, memory: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
+        return np.where(np.asarray(state.speed) > 2.0, -8.0, 0.8), memory
+
+
+def test_brakes_do_what_they_can(simulation: Simulation) -> None:
+    ring = replace(SHORT, action_limit=8.0)
+    (found,) = run_batch(tasks(ring, Hasty(), (1,)))
+    assert_alike(found, run_episode(ring, Hasty(), 1, simulation=simulation))
+    assert found.audit.cavs.hardest == pytest.approx(6.0)
+
+
+def test_each_of_a_population_drives_in_its_own_way(tmp_path: Path, simulation: Simulation) -> None:
+    one = SHORT.humans
+    slow = replace(one, time_headway=1.5, desired_speed=4.0, comfortable_deceleration=2.2)
+    quick = replace(one, max_acceleration=1.8, minimum_gap=1.5, exponent=2.0)
+    write_population(tmp_path / "people.json", Population(one, (one, slow, quick), (-9.0, 3.0)))
+    ring = replace(SHORT, population=str(tmp_path / "people.json"), warmup=130)
+    driver = named_driver("pi", 0.1)
+    for found, seed in zip(run_batch(tasks(ring, driver, (1, 2))), (1, 2), strict=True):
+        assert_alike(found, run_episode(ring, driver, seed, simulation=simulation))
+
+
+def test_people_collide_where_sumo_says_so(simulation: Simulation) -> None:
+    ring, driver = Ring(noise=40.0, horizon=90), named_driver("human", 0.1)
+    found = run_batch(tasks(ring, driver, (1, 2, 3)))
+    for episode, seed in zip(found, (1, 2, 3), strict=True):
+        assert_alike(episode, run_episode(ring, driver, seed, simulation=simulation))
+    assert {episode.status for episode in found} == {"collision"}
+
+
+def doubles(values: Floats) -> Tensor:
+    return torch.as_tensor(values)
+
+
+def singles(values: Floats) -> Tensor:
+    return torch.as_tensor(values, dtype=torch.float32)
+
+
+def test_tensors_do_what_arrays_do() -> None:
+    asked = tasks(Ring(horizon=200, cavs=2, warmup=100), neural_driver(10), range(3))
+    for one, other in zip(run_batch(asked), run_batch(asked, doubles), strict=True):
+        assert_alike(one, other)
+
+
+def test_single_precision_is_near() -> None:
+    asked = tasks(Ring(horizon=300), neural_driver(10), range(3))
+    for one, other in zip(run_batch(asked), run_batch(asked, singles), strict=True):
+        assert np.abs(one.speeds - other.speeds).max() < 1e-3
+        assert other.reward.sum() == pytest.approx(one.reward.sum(), rel=1e-4)
+
+
+def test_sums_are_those_of_the_episodes() -> None:
+    ring, driver, seeds = Ring(horizon=150, cavs=2, warmup=50), named_driver("pi", 0.1), [(1,), (2,)]
+    kept = run_batch(tasks(ring, driver, (1, 2)))
+    rings = driven_to_the_end(begin(RingBatch([ring] * 2, seeds, keep=False), driver))
+    assert rings.episodes == ()
+    for number, episode in enumerate(kept):
+        assert rings.decisions[number] == episode.steps
+        assert rings.crashed[number] == 0
+        assert rings.mean_speed[number] == pytest.approx(episode.speeds[1:].mean())
+        assert rings.headway[number] == pytest.approx(episode.audit.following.headway)
+        assert rings.braking[number] == pytest.approx(episode.audit.cavs.hardest)
+        for name, terms in episode.terms.items():
+            assert rings.terms[name][number] == pytest.approx(terms.sum())
+
+
+def test_quick_noise_is_of_the_same_size_and_cavs_have_none() -> None:
+    generator = torch.Generator().manual_seed(0)
+
+    def draw(shape: tuple[int, ...]) -> Tensor:
+        return torch.randn(shape, generator=generator)
+
+    ring = Ring(horizon=30, noise=2.0, humans=replace(Ring().humans, time_headway=0.5))
+    world = RingBatch([replace(ring, warmup=60)] * 50, [(seed,) for seed in range(50)], singles, draw=draw)
+    episodes = driven_to_the_end(begin(world, Constant(0.2), singles)).episodes
+    noise = [
+        each.speeds[1:] - np.diff(each.positions, axis=0) / each.step
+        for each in episodes
+        if each.speeds.min() > 0.5
+    ]
+    cav = episodes[0].vehicle_ids.index("cav_0")
+    added = np.array(noise)
+    assert np.abs(added[:, :, cav]).max() < 1e-3
+    people = np.delete(added, cav, axis=2)
+    assert people.std() == pytest.approx(ring.noise_per_step * ring.simulation_step, rel=0.05)
+
+
+@pytest.mark.parametrize(
+    ("scenario", "why"),
+    [
+        (FigureEight(), "it is no ring"),
+        (replace(SHORT, human_control="commanded"), "people are commanded"),
+        (replace(SHORT, safety=NO_FILTER), "SUMO's own check"),
+        (replace(SHORT, actuation="flow"), "SUMO's own check"),
+        (replace(SHORT, simulation_step=0.5), "simulation_step: 0.5"),
+    ],
+)
+def test_what_would_not_be_exact_is_refused(scenario: Any, why: str) -> None:
+    assert why in why_not(scenario)
+    with pytest.raises(InputError, match="batch: "):
+        run_batch(tasks(scenario, named_driver("pi", 0.1), (1,)))
+
+
+def test_rings_differ_in_their_lengths_alone() -> None:
+    driver = named_driver("pi", 0.1)
+    two = [EpisodeTask(each, driver, (1,)) for each in (SHORT, replace(SHORT, cavs=2))]
+    with pytest.raises(InputError, match="differ in more than their lengths"):
+        run_batch(two)
+    parts = [EpisodeTask(SHORT.part(part, 2), driver, (1,)) for part in range(2)]
+    assert len({episode.loop_length for episode in run_batch(parts)}) == 2
+    other = [*tasks(SHORT, driver, (1,)), *tasks(SHORT, named_driver("idm", 0.1), (2,))]
+    with pytest.raises(InputError, match="differ in driver"):
+        run_batch(other)
+
+
+class Broken(Driver):
+    """Answers something that is not finite in its third step."""
+
+    def initial_memory(self, n: int) -> dict[str, Any]:
+        return {"step": np.zeros(n)}
+
+    def act(self, state: LocalState, memory: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
+        step = memory["step"]
+        return np.where(step == 2, np.nan, 0.0) + 0.0 * state.speed, {"step": step + 1}
+
+
+def test_an_answer_that_is_not_finite_is_refused_with_its_step() -> None:
+    with pytest.raises(InputError, match="step 2"):
+        run_batch(tasks(SHORT, Broken(), (1, 2)))
