@@ -35,7 +35,8 @@ def test_there_is_one_for_each_preset_that_is_known_to_reach_furthest() -> None:
 @pytest.mark.parametrize("name", ["nothing", "", "../ring-best", "ring-best.unjam"])
 def test_another_name_lists_those_that_there_are(name: str) -> None:
     with pytest.raises(
-        InputError, match="allowed: unjam:figure-eight-best, unjam:figure-eight-tuned, unjam:merge-best, "
+        InputError,
+        match="allowed: unjam:figure-eight-best, unjam:figure-eight-tuned, unjam:merge-best, ",
     ):
         make_driver(f"{SHIPPED}{name}", 0.1)
 
@@ -43,20 +44,20 @@ def test_another_name_lists_those_that_there_are(name: str) -> None:
 def test_the_rings_earns_more_than_its_expert_on_every_seed() -> None:
     found = unjam.drive("ring", ["unjam:ring-tuned", "unjam:ring-best"], episodes=2, workers=1)
     gain = paired_difference(found.rows["unjam:ring-best"], found.rows["unjam:ring-tuned"], "return")
-    assert gain.low > 10
+    assert gain.smallest > 10
     assert {found.document()["drivers"][number]["drivable"] for number in (0, 1)} == {DRIVABLE}
 
 
 def test_the_tuned_expert_earns_more_than_the_papers_on_ring_and_jammed_ring() -> None:
     for road in ("ring", "ring-jammed"):
         found = unjam.drive(road, ["pi", "unjam:ring-tuned"], episodes=2, workers=1)
-        assert paired_difference(found.rows["unjam:ring-tuned"], found.rows["pi"], "return").low > 50
+        assert paired_difference(found.rows["unjam:ring-tuned"], found.rows["pi"], "return").smallest > 50
 
 
 def test_the_jammed_rings_dissolves_the_wave_sooner_than_its_expert() -> None:
     found = unjam.drive("ring-jammed", ["pi", "unjam:ring-jammed-best"], episodes=2, workers=1)
     sooner = paired_difference(found.rows["pi"], found.rows["unjam:ring-jammed-best"], "time_to_dissolve")
-    assert sooner.low > 5
+    assert sooner.smallest > 5
 
 
 @pytest.mark.slow

@@ -111,7 +111,7 @@ def test_the_gain_is_the_mean_difference_to_the_expert_on_the_same_seeds(trained
     assert trained.result.gain is not None
     assert trained.result.gain.mean == pytest.approx(np.mean(differences))
     assert trained.result.gain.count == 2
-    assert min(differences) <= trained.result.gain.low <= trained.result.gain.high <= max(differences)
+    assert (trained.result.gain.smallest, trained.result.gain.largest) == (min(differences), max(differences))
 
 
 def test_the_evaluation_of_a_folder_is_that_of_the_result(trained: Trained) -> None:
