@@ -72,7 +72,7 @@ def random_state(generator: np.random.Generator, rows: int, told: bool = False) 
         return LocalState(*near)
     speeds = generator.uniform(0.0, 30.0, (2, rows, SECTIONS_AHEAD))
     allowed, to_merge = generator.uniform(20.0, 30.0, rows), generator.uniform(-500.0, 2000.0, rows)
-    return LocalState(*near, allowed, to_merge, *speeds)
+    return LocalState(*near, None, allowed, to_merge, *speeds)
 
 
 def _equal(memory: Memory, other: Memory) -> bool:

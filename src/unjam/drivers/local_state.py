@@ -32,6 +32,8 @@ class LocalState(NamedTuple):
 
     # What only some roads offer; None elsewhere.
 
+    to_crossing: Array = None
+    """how far ahead a closed road next crosses itself [m]"""
     allowed_speed: Array = None
     """as fast as it may and wants to drive here [m/s]"""
     to_merge: Array = None
@@ -63,7 +65,7 @@ SECTIONS_AHEAD = 11
 SPEED_SCALE = 10.0
 """what speeds are divided by before a network sees them [m/s]"""
 
-_UNITS = ("m/s", "m/s", "m", "m/s", "m", "m", "m", "m/s", "m", "m/s", "m/s")
+_UNITS = ("m/s", "m/s", "m", "m/s", "m", "m", "m", "m", "m/s", "m", "m/s", "m/s")
 STATE_UNITS = dict(zip(LocalState._fields, _UNITS, strict=True))
 """units of a `LocalState`, in its order"""
 

@@ -9,6 +9,7 @@ import numpy as np
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
+from unjam.drivers.by_road import KINDS_OF_ROAD, ByRoad
 from unjam.drivers.car_following import ACC, BCM, IDM, LACC, OVM, Constant, Human
 from unjam.drivers.driver import Driver, Recipe
 from unjam.drivers.follower_stopper import FollowerStopper
@@ -159,6 +160,10 @@ def _filtered(recipe: Recipe, arrays: Arrays, held: Held) -> Driver:
     return Filtered(held(found.driver, INNER), found.action_limit, found.safety, found.time_step)
 
 
+def _by_road(recipe: Recipe, arrays: Arrays, held: Held) -> Driver:
+    return ByRoad(**{kind: held(recipe["drivers"][kind], kind) for kind in KINDS_OF_ROAD})
+
+
 RECIPES: dict[str, Callable[[Recipe, Arrays, Held], Driver]] = {
     "named": _named,
     "file": _file,
@@ -166,6 +171,7 @@ RECIPES: dict[str, Callable[[Recipe, Arrays, Held], Driver]] = {
     "mixed": _mixed,
     "impaired": _impaired,
     "filtered": _filtered,
+    "by-road": _by_road,
 }
 """how each kind of recipe becomes a driver again"""
 

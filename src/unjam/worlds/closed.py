@@ -71,7 +71,7 @@ class ClosedLog:
         decisions = speeds.shape[1] - 1
         gaps = gap_on_loop(positions, np.roll(positions, -1, axis=0), road.loop_length, VEHICLE_LENGTH)
         near = loop_neighbours(self.places, len(self.start))
-        states = loop_state(speeds, positions, near, road.loop_length)
+        states = loop_state(speeds, positions, near, road.loop_length, road.crossings)
         (applied, filtered), shield = self._applied(), self._shield(decisions)
         trajectories = tuple(
             trajectory(

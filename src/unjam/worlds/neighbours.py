@@ -26,7 +26,13 @@ def loop_neighbours(chosen: Any, vehicles: int) -> Neighbours:
     return Neighbours(chosen, (chosen + 1) % vehicles, (chosen - 1) % vehicles)
 
 
-def loop_state(speeds: Any, positions: Any, near: Neighbours, loop_length: float) -> LocalState:
+def loop_state(
+    speeds: Any,
+    positions: Any,
+    near: Neighbours,
+    loop_length: float,
+    crossings: tuple[tuple[float, float], ...] = (),
+) -> LocalState:
     """Return what the vehicles `near.own` perceive on a closed road.
 
     Args:
@@ -34,10 +40,11 @@ def loop_state(speeds: Any, positions: Any, near: Neighbours, loop_length: float
         positions: of the front bumpers along the road, not wrapped [m]; likewise.
         near: whose surroundings; integers give a state of plain numbers.
         loop_length: [m].
+        crossings: where the road crosses itself, from and to [m].
     """
     own, ahead, behind = near
     speed, position = speeds[own], positions[own]
-    return LocalState(  # names would cost as much as all the rest, in every step of a simulator
+    state = LocalState(  # names would cost as much as all the rest, in every step of a simulator
         speed,
         speeds[ahead],
         gap_on_loop(position, positions[ahead], loop_length, VEHICLE_LENGTH),
@@ -46,6 +53,11 @@ def loop_state(speeds: Any, positions: Any, near: Neighbours, loop_length: float
         position % loop_length,
         loop_length if type(position) is float else np.full(position.shape, loop_length),
     )
+    if not crossings:
+        return state
+    ways = [(start - position) % loop_length for start, _ in crossings]
+    nearest = min(ways) if type(position) is float else np.minimum.reduce(ways)
+    return state._replace(to_crossing=nearest)
 
 
 def places_along(outline: Floats, positions: Floats, loop_length: float) -> Floats:

@@ -45,6 +45,7 @@ class ClosedTraffic(Traffic[ClosedRoad]):
         """of the CAVs, in road order"""
         self._near = loop_neighbours(np.array(self._places), vehicles)
         self._near_single = loop_neighbours(self._places[0], vehicles)
+        self._loop = road.loop_length, road.crossings
         self._commanded = scenario.human_control == "commanded"
         self._drivers = self._drivers_of(road.vehicle_ids)
         needed = range(vehicles) if self._commanded else np.concatenate(self._near).tolist()
@@ -88,7 +89,7 @@ class ClosedTraffic(Traffic[ClosedRoad]):
             moments = list(range(scenario.warmup - each, -1, -each))[
                 : round(HISTORY / scenario.decision_step)
             ]
-            states = loop_state(*self.speeds_and_positions(), self._near, self.road.loop_length)
+            states = loop_state(*self.speeds_and_positions(), self._near, *self._loop)
             history = states.at(np.s_[:, moments[::-1]])
         self._controlled = controlled
         if controlled:
@@ -105,10 +106,10 @@ class ClosedTraffic(Traffic[ClosedRoad]):
         """Return what the CAVs perceive now: arrays of shape (CAVs,), or plain numbers of a single one."""
         near = self._near_positions
         if self.single:
-            return loop_state(self.speeds, near, self._near_single, self.road.loop_length)
+            return loop_state(self.speeds, near, self._near_single, *self._loop)
         positions = np.full(len(self.speeds), np.nan)
         positions[list(near)] = list(near.values())
-        return loop_state(np.array(self.speeds), positions, self._near, self.road.loop_length)
+        return loop_state(np.array(self.speeds), positions, self._near, *self._loop)
 
     def advance(self, command: Command | None) -> None:
         """Simulate one decision, held over its simulation steps; None: the CAVs stay human."""
@@ -256,6 +257,5 @@ class ClosedTraffic(Traffic[ClosedRoad]):
     def scene(self) -> Scene:
         """Return this moment as pictures show it."""
         outline, loop = self.road.outline, self.road.loop_length
-        driven = self.road.start_positions + np.array(self._simulation.distances(self.road.vehicle_ids))
-        cavs = np.isin(np.arange(len(self.speeds)), self._places)
-        return Scene(outline[:, 1:], places_along(outline, driven, loop), np.array(self.speeds), cavs)
+        places, cavs = self.positions(), np.isin(np.arange(len(self.speeds)), self._places)
+        return Scene(outline[:, 1:], places_along(outline, places, loop), np.array(self.speeds), cavs)
