@@ -18,6 +18,7 @@ from unjam.drivers.motorway_experts import Cruise, JamAhead
 from unjam.drivers.network import network_from_arrays
 from unjam.drivers.observation import FEATURES, FeatureName, observation_size
 from unjam.drivers.pi_saturation import PISaturation
+from unjam.drivers.remembering import Remembering
 from unjam.drivers.residual import EXPERT, ResidualDriver
 from unjam.drivers.road_experts import JamAbsorber, Pacer
 from unjam.drivers.safety import SafetyFilter
@@ -160,6 +161,10 @@ def _filtered(recipe: Recipe, arrays: Arrays, held: Held) -> Driver:
     return Filtered(held(found.driver, INNER), found.action_limit, found.safety, found.time_step)
 
 
+def _remembering(recipe: Recipe, arrays: Arrays, held: Held) -> Driver:
+    return Remembering(held(recipe["driver"], INNER), float(recipe["time_step"]))
+
+
 def _by_road(recipe: Recipe, arrays: Arrays, held: Held) -> Driver:
     return ByRoad(**{kind: held(recipe["drivers"][kind], kind) for kind in KINDS_OF_ROAD})
 
@@ -172,6 +177,7 @@ RECIPES: dict[str, Callable[[Recipe, Arrays, Held], Driver]] = {
     "impaired": _impaired,
     "filtered": _filtered,
     "by-road": _by_road,
+    "remembering": _remembering,
 }
 """how each kind of recipe becomes a driver again"""
 

@@ -28,6 +28,9 @@ class PolicySettings:
         "expert_memory",
     )
     """what the network sees; the paper's network sees `local` alone, and cannot know what PI will do"""
+    remember: bool = False
+    """whether what the network sees of the expert's memory has means of the own past besides: speed, its
+    spread, and gap, over ten seconds to some minutes"""
     authority: Positive = 1.0
     """largest residual, as a share of the action limit"""
     exploration_std: Positive = 0.1

@@ -12,6 +12,7 @@ from pydantic.dataclasses import dataclass
 from unjam.drivers.car_following import Constant
 from unjam.drivers.driver import Driver
 from unjam.drivers.observation import observed
+from unjam.drivers.remembering import Remembering
 from unjam.errors import InputError
 from unjam.learners.settings import Agents, PolicySettings
 from unjam.parameters import STRICT, Count, CountOrNone, Positive, build, changed, nested
@@ -155,7 +156,9 @@ class RunConfig(Agents):
 
         if self.expert == "none":
             return Constant()
-        return make_driver(self.expert, self.make_scenario().decision_step)
+        step = self.make_scenario().decision_step
+        expert = make_driver(self.expert, step)
+        return Remembering(expert, step) if self.policy.remember else expert
 
 
 def load_config(
