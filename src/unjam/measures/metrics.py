@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from math import inf
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -22,6 +22,7 @@ from unjam.measures.drivable import (
     share_short_headway,
     yielded,
 )
+from unjam.worlds.audit import BEYOND
 from unjam.worlds.record import Episode, Floats, outcome_of
 from unjam.worlds.reward import eq16
 
@@ -81,6 +82,11 @@ def mean_speed_steady(episode: Episode) -> float:
     return _mean_there(_steady(episode.speeds[1:]))
 
 
+def mean_speed_second_half(episode: Episode) -> float:
+    """Mean over all vehicles in the second half of the episode [m/s]."""
+    return _mean_there(episode.speeds[1 + episode.steps // 2 :])
+
+
 def speed_std_fleet(episode: Episode) -> float:
     """Standard deviation of speed across vehicles at one moment, averaged over the episode [m/s].
 
@@ -121,8 +127,8 @@ def episode_return(episode: Episode) -> float:
 
 def return_eq16(episode: Episode) -> float:
     """Sum of the paper's reward, Eq. 16 with its sign mended, not discounted."""
-    outcome = outcome_of(episode.speeds, episode.trajectories, episode.status == "collision")
-    return float(sum(term.sum() for term in eq16(outcome).values()))
+    seen = outcome_of(episode.speeds, episode.trajectories, episode.status == "collision")
+    return float(sum(term.sum() for term in eq16(seen).values()))
 
 
 def mean_abs_accel(episode: Episode) -> float:
@@ -132,15 +138,15 @@ def mean_abs_accel(episode: Episode) -> float:
 
 def mean_abs_jerk(episode: Episode) -> float:
     """Mean absolute change of the CAV's actual acceleration per second [m/s3]."""
-    speeds = [trajectory.states.speed for trajectory in episode.trajectories]
+    speeds = (trajectory.states.speed for trajectory in episode.trajectories)
     jerks = [np.abs(np.diff(speed, 2)).mean() for speed in speeds if len(speed) > 2]
     return float(np.mean(jerks) / episode.step**2) if jerks else float("nan")
 
 
 def share_standing(episode: Episode) -> float:
     """Share of vehicle-seconds spent below 0.1 m/s."""
-    there = ~np.isnan(episode.speeds[1:])
-    return _mean_there(np.where(there, episode.speeds[1:] < STANDING_SPEED, np.nan))
+    speeds = episode.speeds[1:]
+    return _mean_there(np.where(np.isnan(speeds), np.nan, speeds < STANDING_SPEED))
 
 
 def time_to_dissolve(episode: Episode) -> float:
@@ -155,8 +161,7 @@ def time_to_dissolve(episode: Episode) -> float:
     needed = round(CALM_SECONDS / episode.step)
     if calm[0] or len(calm) < needed:
         return float("nan")
-    runs = np.convolve(calm, np.ones(needed), "valid")
-    found = np.flatnonzero(runs > needed - 0.5)
+    found = np.flatnonzero(np.convolve(calm, np.ones(needed), "valid") > needed - 0.5)
     return float(found[0] * episode.step) if len(found) else float("nan")
 
 
@@ -254,10 +259,21 @@ class Metric:
     """what it can be"""
 
 
+def _beyond(who: Literal["people", "cavs"], name: str, whose: str) -> dict[str, Metric]:
+    """Return the metrics of how often somebody brakes hard."""
+    return {
+        f"{name}_beyond_{limit:g}".replace(".", "_"): Metric(
+            brakings_beyond(who, limit), f"{whose} brakings beyond {limit:g} m/s2", "per million", 0
+        )
+        for limit in BEYOND
+    }
+
+
 METRICS: dict[str, Metric] = {
     "mean_speed": Metric(mean_speed, "mean speed", "m/s"),
     "mean_speed_of_moments": Metric(mean_speed_of_moments, "mean speed, moments alike", "m/s"),
     "mean_speed_steady": Metric(mean_speed_steady, "mean speed, steady", "m/s"),
+    "mean_speed_second_half": Metric(mean_speed_second_half, "mean speed, second half", "m/s"),
     "speed_limit_ratio": Metric(speed_limit_ratio, "mean speed / limit", "", 3),
     "speed_limit_ratio_steady": Metric(speed_limit_ratio_steady, "mean speed / limit, steady", "", 3),
     "speed_std_fleet": Metric(speed_std_fleet, "speed std across vehicles", "m/s"),
@@ -278,23 +294,9 @@ METRICS: dict[str, Metric] = {
     "max_jerk": Metric(max_jerk, "CAV's largest jerk", "m/s3", 1),
     "cav_max_braking": Metric(cav_max_braking, "CAV's hardest braking", "m/s2"),
     "cut_in_max_braking": Metric(cut_in_max_braking, "CAV's hardest braking after a cut-in", "m/s2"),
-    "cav_beyond_3_5": Metric(
-        brakings_beyond("cavs", 3.5), "CAV's brakings beyond 3.5 m/s2", "per million", 0
-    ),
-    "cav_beyond_4_5": Metric(
-        brakings_beyond("cavs", 4.5), "CAV's brakings beyond 4.5 m/s2", "per million", 0
-    ),
-    "cav_beyond_9": Metric(brakings_beyond("cavs", 9.0), "CAV's brakings beyond 9 m/s2", "per million", 0),
+    **_beyond("cavs", "cav", "CAV's"),
     "people_max_braking": Metric(people_max_braking, "people's hardest braking", "m/s2"),
-    "people_beyond_3_5": Metric(
-        brakings_beyond("people", 3.5), "people's brakings beyond 3.5 m/s2", "per million", 0
-    ),
-    "people_beyond_4_5": Metric(
-        brakings_beyond("people", 4.5), "people's brakings beyond 4.5 m/s2", "per million", 0
-    ),
-    "people_beyond_9": Metric(
-        brakings_beyond("people", 9.0), "people's brakings beyond 9 m/s2", "per million", 0
-    ),
+    **_beyond("people", "people", "people's"),
     "filter_share": Metric(filter_share, "decisions in which the filter braked", "", 4, SHARE),
     "overridden": Metric(overridden, "commands overridden in following", "", 4, SHARE),
     "yielded": Metric(yielded, "commands overridden at a crossing", "", 4, SHARE),

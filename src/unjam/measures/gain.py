@@ -1,0 +1,71 @@
+"""What a driver gains on a road of many: 0 is people alone, 1 the best that is known there.
+
+So roads can be compared and averaged whose numbers are not alike: speed on closed roads, travel time on those
+with ends.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from unjam.measures.drivable import DRIVABLE, drivable_in_all
+from unjam.measures.effect import FLOW, FLOW_LOST
+from unjam.measures.statistics import Estimate, estimate, paired_difference
+
+WORST, MOST = -1.0, 1.5
+"""between which a gain counts"""
+LEAST = 0.03
+"""share of people's own number by which the best must be better: else there is only to lose"""
+
+Rows = Sequence[dict[str, Any]]
+
+
+def worth(row: dict[str, Any]) -> float:
+    """Return what a road is judged by, larger being better, from a row of `measure`.
+
+    Minus the travel time, waiting included [s], on roads with ends; the mean speed of all in the second half
+    of the episode [m/s] on closed ones.
+    """
+    return -row["travel_time"] if np.isfinite(row["travel_time"]) else row["mean_speed_second_half"]
+
+
+def ceiling(row: dict[str, Any]) -> float:
+    """Return what nobody can be better than in the long run: that of a free road, or of one without waves."""
+    if np.isfinite(row["travel_time"]):
+        return row["delay"] - row["travel_time"]
+    return row["mean_speed"] / row["speed_limit_ratio"]
+
+
+def gain(rows: Rows, people: Rows, best: float) -> Estimate:
+    """Return what a driver gains on one road, the same seeds paired.
+
+    A driver that no car could drive, or that is shown to lower flow by more than 1 %, gains nothing: what it
+    loses counts. Where the best is hardly better than people, what is not lost is all that counts.
+
+    Args:
+        rows: of `measure`, of the driver.
+        people: of people alone on the same seeds.
+        best: mean of `worth` of the best that is known there.
+    """
+    alone = {str(row["seed"]): worth(row) for row in people}
+    before = float(np.mean(list(alone.values())))
+    least = LEAST * abs(before)
+    scale = max(best - before, least)
+    found = estimate([(worth(row) - alone[str(row["seed"])]) / scale for row in rows])
+    mean, low, high = (float(np.clip(each, WORST, MOST)) for each in (found.mean, found.low, found.high))
+    flow = paired_difference(rows, people, FLOW)
+    slower = flow.high < -FLOW_LOST * float(np.mean([row[FLOW] for row in people]))
+    verdict = drivable_in_all(rows, people)
+    if best - before < least or slower or verdict != DRIVABLE:
+        mean, low, high = min(mean, 0.0), min(low, 0.0), min(high, 0.0)
+    return Estimate(mean, low, high, found.count)
+
+
+def mean_gain(gains: Mapping[str, Estimate]) -> Estimate:
+    """Return the mean gain over roads, each with seeds of its own: their errors are independent."""
+    means = np.array([each.mean for each in gains.values()])
+    halves = np.array([(each.high - each.low) / 2.0 for each in gains.values()])
+    half = float(np.sqrt((halves**2).sum()) / len(halves))
+    mean = float(means.mean())
+    return Estimate(mean, mean - half, mean + half, len(means))

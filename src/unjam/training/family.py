@@ -1,0 +1,104 @@
+"""The family of roads on which one controller is trained and judged: what it sees, and what is held out.
+
+Each road draws its size, its people and their noise from the seed. Held out are whole axes (a density, a
+number of vehicles, people, a demand, a radius) and new combinations of what is seen; which, was fixed before
+anything was trained or tuned on them.
+"""
+
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from unjam.scenarios import make_scenario
+from unjam.scenarios.scenario import Scenario
+
+Part = Literal["seen", "combination", "axis"]
+
+GROWING, GROWN = 750, 6000
+"""all-human simulation steps before the CAVs take over: a wave begins, or is there"""
+HURRIED = {"time_headway": 0.9, "max_acceleration": 1.3, "comfortable_deceleration": 2.0}
+"""people who follow closer and accelerate harder than the paper's"""
+MEASURED = {
+    "desired_speed": 17.49,
+    "time_headway": 1.355,
+    "max_acceleration": 1.243,
+    "comfortable_deceleration": 1.424,
+    "minimum_gap": 2.157,
+}
+"""the IDM that suits the 325 drivers of the NGSIM pairs best together, results/field/ngsim-drivers.json"""
+
+
+@dataclass(frozen=True)
+class FamilyRoad:
+    """One road of the family."""
+
+    scenario: str
+    changes: dict[str, Any] = field(default_factory=dict)
+    part: Part = "seen"
+    """`seen` in training and tuning; held out: a new `combination` of what is seen, or a whole `axis`"""
+
+    def make(self) -> Scenario:
+        """Return the road."""
+        return make_scenario(self.scenario, self.changes)
+
+
+def _ring(
+    vehicles: int, cavs: int, warmup: int, spacing: tuple[float, float] = (10.0, 12.27), **more: Any
+) -> dict[str, Any]:
+    """Return a ring's parameters; `spacing` is the road for each vehicle [m], the paper's by default."""
+    length = [round(vehicles * each) for each in spacing]
+    return {"vehicles": vehicles, "cavs": cavs, "warmup": warmup, "length": length, **more}
+
+
+FAMILY: dict[str, FamilyRoad] = {
+    "ring-22-standing": FamilyRoad("ring", _ring(22, 1, 0)),
+    "ring-22-growing": FamilyRoad("ring", _ring(22, 1, GROWING)),
+    "ring-22-grown": FamilyRoad("ring", _ring(22, 1, GROWN)),
+    "ring-33-growing-3-cavs": FamilyRoad("ring", _ring(33, 3, GROWING)),
+    "ring-44-grown": FamilyRoad("ring", _ring(44, 1, GROWN)),
+    "ring-44-growing-2-cavs": FamilyRoad("ring", _ring(44, 2, GROWING)),
+    "ring-66-grown-4-cavs": FamilyRoad("ring", _ring(66, 4, GROWN)),
+    "ring-22-wide": FamilyRoad("ring", _ring(22, 1, GROWN, (13.0, 16.0))),
+    "ring-22-hurried": FamilyRoad("ring", _ring(22, 1, GROWN, humans=HURRIED)),
+    "ring-22-late": FamilyRoad("ring", _ring(22, 1, GROWING, actuator={"lag": 0.3, "delay": 0.2})),
+    "figure-eight-14": FamilyRoad("figure-eight"),
+    "figure-eight-12": FamilyRoad("figure-eight", {"vehicles": 12}),
+    "on-ramp-5": FamilyRoad("on-ramp", {"cav_share": 0.05}),
+    "on-ramp-20": FamilyRoad("on-ramp", {"cav_share": 0.2}),
+    "on-ramp-10-less-demand": FamilyRoad("on-ramp", {"cav_share": 0.1, "inflow": 2900.0}),
+    "ring-33-grown": FamilyRoad("ring", _ring(33, 1, GROWN), "combination"),
+    "ring-66-growing-2-cavs": FamilyRoad("ring", _ring(66, 2, GROWING), "combination"),
+    "ring-44-late-hurried": FamilyRoad(
+        "ring", _ring(44, 2, GROWN, humans=HURRIED, actuator={"lag": 0.3, "delay": 0.2}), "combination"
+    ),
+    "on-ramp-10": FamilyRoad("on-ramp", {"cav_share": 0.1}, "combination"),
+    "ring-22-dense": FamilyRoad("ring", _ring(22, 1, GROWN, (9.1, 9.8)), "axis"),
+    "ring-88-grown": FamilyRoad("ring", _ring(88, 1, GROWN), "axis"),
+    "ring-44-grown-5-cavs": FamilyRoad("ring", _ring(44, 5, GROWN), "axis"),
+    "ring-22-measured": FamilyRoad("ring", _ring(22, 1, GROWN, humans=MEASURED), "axis"),
+    "figure-eight-wide": FamilyRoad("figure-eight", {"radius": (36, 38)}, "axis"),
+    "on-ramp-10-more-demand": FamilyRoad(
+        "on-ramp", {"cav_share": 0.1, "inflow": 3400.0, "ramp_flow": 600.0}, "axis"
+    ),
+    "one-lane-10": FamilyRoad("on-ramp-1", {"cav_share": 0.1}, "axis"),
+}
+"""every road by name"""
+
+
+GROUPS = {"rings": ("ring",), "figure-eights": ("figure-eight",), "motorways": ("on-ramp", "on-ramp-1")}
+"""roads that one law can be written for, by their scenarios"""
+EVERYWHERE = "everywhere"
+
+
+def is_family(name: str) -> bool:
+    """Return whether a name is that of several roads."""
+    return name == EVERYWHERE or name in GROUPS
+
+
+def roads_of(group: str, *parts: Part) -> dict[str, Scenario]:
+    """Return the roads of some parts of the family, by name; `group` is a key of GROUPS, or `everywhere`."""
+    scenarios = [each for name, kinds in GROUPS.items() for each in kinds if group in (name, EVERYWHERE)]
+    return {
+        name: road.make()
+        for name, road in FAMILY.items()
+        if road.part in parts and road.scenario in scenarios
+    }

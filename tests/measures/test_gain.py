@@ -1,0 +1,79 @@
+"""Are people alone 0, the best that is known 1, and does nothing count that no car could drive?"""
+
+from math import nan
+from typing import Any
+
+import pytest
+
+from unjam.measures.gain import LEAST, MOST, WORST, ceiling, gain, mean_gain, worth
+from unjam.measures.statistics import Estimate
+
+CLOSED: dict[str, Any] = {
+    "status": "completed",
+    "floor": 1.0,
+    "collisions": 0.0,
+    "min_headway": 1.1,
+    "cav_min_ttc": 1.5,
+    "cav_max_braking": 3.0,
+    "overridden": 0.0,
+    "mean_speed": 3.5,
+    "speed_limit_ratio": 0.7,
+    "travel_time": nan,
+    "delay": nan,
+    "throughput_veh_per_h": 1000.0,
+    "people_beyond_4_5": 0.0,
+}
+
+
+def ring(speeds: list[float], **changes: Any) -> list[dict[str, Any]]:
+    """A row for each speed of the second half, with seeds from zero."""
+    return [{**CLOSED, "seed": [7, n], "mean_speed_second_half": v, **changes} for n, v in enumerate(speeds)]
+
+
+PEOPLE = ring([3.0, 3.1, 2.9, 3.0])
+
+
+def test_closed_roads_are_judged_by_speed_and_those_with_ends_by_travel_time() -> None:
+    assert worth(PEOPLE[0]) == 3.0
+    assert ceiling(PEOPLE[0]) == pytest.approx(5.0)
+    motorway = {**PEOPLE[0], "travel_time": 150.0, "delay": 40.0}
+    assert worth(motorway) == -150.0
+    assert ceiling(motorway) == -110.0
+
+
+def test_people_gain_nothing_and_the_best_gains_one() -> None:
+    assert gain(PEOPLE, PEOPLE, 4.0).mean == 0.0
+    best = ring([4.0, 4.1, 3.9, 4.0])
+    assert gain(best, PEOPLE, 4.0).mean == pytest.approx(1.0)
+    half = gain(ring([3.4, 3.6, 3.5, 3.5]), PEOPLE, 4.0)
+    assert half.mean == pytest.approx(0.5)
+    assert half.low < 0.5 < half.high
+
+
+def test_a_gain_is_bounded_on_both_sides() -> None:
+    assert gain(ring([9.0] * 4), PEOPLE, 4.0).mean == MOST
+    assert gain(ring([0.1] * 4), PEOPLE, 4.0).mean == WORST
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"min_headway": 0.3}, {"collisions": 2.0}, {"overridden": 0.01}, {"throughput_veh_per_h": 900.0}],
+)
+def test_what_no_car_could_drive_or_what_lowers_flow_gains_nothing(wrong: dict[str, float]) -> None:
+    fast = ring([4.0] * 4, **wrong)
+    assert gain(fast, PEOPLE, 4.0).mean == 0.0
+    slow = ring([2.5] * 4, **wrong)
+    assert gain(slow, PEOPLE, 4.0).mean == pytest.approx(-0.5)
+
+
+def test_where_nothing_is_to_be_gained_a_loss_is_all_that_counts() -> None:
+    best = 3.0 * (1.0 + LEAST / 2)
+    assert gain(ring([3.05] * 4), PEOPLE, best).mean == 0.0
+    assert gain(ring([2.955] * 4), PEOPLE, best).mean == pytest.approx(-0.5)
+
+
+def test_the_mean_over_roads_is_surer_than_that_of_each() -> None:
+    each = Estimate(0.5, 0.3, 0.7, 10)
+    found = mean_gain({str(number): each for number in range(4)})
+    assert (found.mean, found.count) == (0.5, 4)
+    assert found.high - found.low == pytest.approx(0.2)

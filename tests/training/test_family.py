@@ -1,0 +1,31 @@
+"""Is what is held out never seen, and can each road be driven?"""
+
+import pytest
+
+from unjam.scenarios.ring import Ring
+from unjam.training.family import FAMILY, GROUPS, is_family, roads_of
+
+SEEN, HELD_OUT = roads_of("everywhere", "seen"), roads_of("everywhere", "combination", "axis")
+
+
+def test_no_road_that_is_held_out_is_seen() -> None:
+    assert len(SEEN) + len(HELD_OUT) == len(FAMILY)
+    assert not set(HELD_OUT.values()) & set(SEEN.values())
+
+
+def test_each_held_out_axis_lies_beyond_what_is_seen() -> None:
+    rings = [road for road in SEEN.values() if isinstance(road, Ring)]
+    spacings = [size / road.vehicles for road in rings for size in road.length]
+    dense = HELD_OUT["ring-22-dense"]
+    assert isinstance(dense, Ring)
+    assert dense.length[1] / dense.vehicles < min(spacings)
+    assert all(road.vehicles < 88 for road in rings)
+    assert all(road.cavs < 5 for road in rings)
+
+
+@pytest.mark.parametrize("group", GROUPS)
+def test_every_group_has_roads_of_both_kinds(group: str) -> None:
+    assert is_family(group)
+    assert roads_of(group, "seen")
+    assert roads_of(group, "combination", "axis")
+    assert not is_family("ring")
