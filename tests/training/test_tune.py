@@ -29,7 +29,7 @@ SPACE = {"catch_up_speed": Range(0.5, 3.0), "safe_gap_rule": Choice(("constant",
 def test_a_tuned_expert_is_written_and_no_worse_than_it_was(tmp_path: Path) -> None:
     with Workers(1) as workers:
         lines: list[str] = []
-        found = tune(SMALL, "pi", SPACE, STEPS, tmp_path, workers, on_line=lines.append)
+        found = tune({"ring": SMALL}, "pi", SPACE, STEPS, tmp_path, workers, on_line=lines.append)
     assert found.actual_steps <= STEPS
     assert len(found.settings) == len(lines) == 4
     assert found.best.score is not None
@@ -48,14 +48,14 @@ def test_the_same_seed_tries_the_same_settings_whoever_drives(tmp_path: Path) ->
     for count in (1, 2):
         with Workers(count) as workers:
             (folder := tmp_path / str(count)).mkdir()
-            tried.append(tune(SMALL, "pi", SPACE, STEPS, folder, workers).settings)
+            tried.append(tune({"ring": SMALL}, "pi", SPACE, STEPS, folder, workers).settings)
     assert tried[0] == tried[1]
 
 
 def test_screened_settings_are_judged_as_sumo_judges_them(tmp_path: Path, simulation: Simulation) -> None:
     steps = FINAL + 10 * EPISODES * 60
     with Workers(1) as workers:
-        found = tune(SMALL, "pi", SPACE, steps, tmp_path, workers, screen=True)
+        found = tune({"ring": SMALL}, "pi", SPACE, steps, tmp_path, workers, screen=True)
     assert (found.actual_steps, found.imagined_steps) == (FINAL, 10 * EPISODES * 60)
     assert len(found.settings) == 10
     for setting in (found.settings[1], found.settings[9]):  # of two batches
@@ -72,7 +72,7 @@ def test_screened_settings_are_judged_as_sumo_judges_them(tmp_path: Path, simula
 
 def test_roads_that_cannot_be_stepped_in_a_batch_are_not_screened(tmp_path: Path) -> None:
     with Workers(1) as workers, pytest.raises(InputError, match=r"screen: .*no ring"):
-        tune(FigureEight(), "pi", SPACE, 10**9, tmp_path, workers, screen=True)
+        tune({"eight": FigureEight()}, "pi", SPACE, 10**9, tmp_path, workers, screen=True)
 
 
 def test_too_few_steps_are_refused_before_anything_is_driven(tmp_path: Path) -> None:
@@ -80,7 +80,7 @@ def test_too_few_steps_are_refused_before_anything_is_driven(tmp_path: Path) -> 
         Workers(1) as workers,
         pytest.raises(InputError, match=f"steps: {FINAL} is not allowed; allowed: >= "),
     ):
-        tune(SMALL, "pi", SPACE, FINAL, tmp_path, workers)
+        tune({"ring": SMALL}, "pi", SPACE, FINAL, tmp_path, workers)
 
 
 def test_the_space_around_an_expert_has_its_numbers_words_and_truths() -> None:

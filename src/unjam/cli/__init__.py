@@ -16,7 +16,8 @@ from unjam.cli.machine import bench, doctor
 from unjam.cli.parts import drivers, fit_drivers, scenarios
 from unjam.cli.results import certify, evaluate, export, model, report, verify
 from unjam.cli.runs import runs
-from unjam.cli.train import reproduce, search, train, tune
+from unjam.cli.train import reproduce, search, train
+from unjam.cli.tune import tune
 from unjam.errors import DISK_ERRNOS, UnjamError, disk_error
 from unjam.processes import end_with_parent
 

@@ -14,14 +14,9 @@ from unjam.cli.options import (
     ExecutorOption,
     JsonOption,
     OutOption,
-    RewardOption,
-    ScenarioArgument,
-    ScenarioSettingsOption,
-    SeedOption,
     TrainingsOption,
     WorkersOption,
     asked_run,
-    assignments,
     executor_named,
     new_folder,
     scenario_changes,
@@ -201,76 +196,6 @@ def search(
     untrained = sum(one.gain is not None and one.gain <= 0 for one in found)
     console.print(f"{untrained} of {len(found)} trainings kept the untrained network")
     console.print(f"train with the best: unjam train --config {best}", soft_wrap=True)
-
-
-@with_options(road=scenario_changes)
-def tune(
-    *,
-    scenario: ScenarioArgument,
-    expert: Annotated[str, typer.Option("--expert", help="Name of the expert, as in unjam drivers.")] = "pi",
-    steps: Annotated[int, typer.Option(min=1, help="Steps in all: as many as a training.")] = 2_000_000,
-    vary: Annotated[
-        list[str] | None,
-        typer.Option(help="What is varied, as in search; without it, all parameters, four times each way."),
-    ] = None,
-    road: dict[str, Any],
-    settings: ScenarioSettingsOption = None,
-    reward: RewardOption = "",
-    seed: SeedOption = 0,
-    screen: Annotated[
-        bool | None,
-        typer.Option(
-            help="Try settings on batches of imagined rings, equal to SUMO's, and only finalists in SUMO "
-            "itself; without it, where the road is such a ring."
-        ),
-    ] = None,
-    workers: WorkersOption = DEFAULT_WORKERS,
-    out: OutOption = None,
-    json: JsonOption = False,
-) -> None:
-    """Tune an expert's parameters: what needs no learning, with the steps that learning has.
-
-    Settings are judged on seeds of their own, under the road's limits and filter; those that no car could
-    drive do not count. The tuned expert is a controller that every verb takes.
-
-    Examples:
-
-      unjam tune ring --expert pi
-
-      unjam tune figure-eight --expert pacer --vary gathering_speed=1..3 --steps 300000
-    """
-    from unjam.scenarios import make_scenario
-    from unjam.training.folder import make_new_folder
-    from unjam.training.search import space_of
-    from unjam.training.tune import space_around
-    from unjam.training.tune import tune as run
-    from unjam.worlds.batch.world import why_not
-    from unjam.worlds.reward import make_reward
-    from unjam.worlds.workers import Workers
-
-    made = make_scenario(scenario, road | assignments(settings))
-    make_reward(reward or made.reward)
-    around = space_around(expert, made.decision_step)
-    space = space_of(vary) if vary else around
-    folder = new_folder(out, f"tune-{Path(scenario).stem}")
-    make_new_folder(folder)
-    with Workers(workers) as pool:
-        found = run(
-            *(made, expert, space, steps, folder, pool, reward, seed),
-            (lambda line: None) if json else aside.print,
-            not why_not(made) if screen is None else screen,
-        )
-    best, default = found.best, found.default
-    steps_of = {"actual_steps": found.actual_steps, "imagined_steps": found.imagined_steps}
-    if json:
-        print_json({"file": str(found.file), "best": asdict(best), "default": asdict(default), **steps_of})
-        return
-    console.print(f"{found.actual_steps:,} actual steps, {found.imagined_steps:,} imagined")
-    before = default.verdict if default.score is None else f"{default.score:.1f}"
-    console.print(
-        f"{best.driver}: {best.score:.1f} on tuning seeds; {default.driver}: {before}", soft_wrap=True
-    )
-    console.print(f"drive with it: unjam drive {scenario} --driver {found.file} --held-out", soft_wrap=True)
 
 
 def reproduce(

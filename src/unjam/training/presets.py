@@ -1,8 +1,10 @@
 """Named starting points of a training run: what differs from the defaults, and why."""
 
-from typing import Any
+from typing import Any, cast
 
 from unjam.errors import wrong, wrong_name
+from unjam.scenarios.ring import Ring
+from unjam.training.family import FAMILY, GROUPS, FamilyRoad
 
 PRESETS: dict[str, dict[str, Any]] = {
     # What the paper says, where it says something: Tables B2 to B5, section 4.1.
@@ -41,6 +43,36 @@ PRESETS: dict[str, dict[str, Any]] = {
     },
     # Ends within about five minutes on two cores, evaluation included.
     "demo": {"steps": 300_000, "evaluation": {"every": 2}},
+}
+
+RINGS_TUNED = "unjam:rings-tuned"
+"""the expert that gets furthest on all rings of the family together"""
+BRAKING_COST = 0.0075
+"""weight of the acceleration's term where the speed's is such that the limit earns 1"""
+
+
+def _task(name: str, road: FamilyRoad) -> dict[str, Any]:
+    """Return a ring of the family as a task; returns are alike: a share of what its people could drive."""
+    ring = cast(Ring, road.make())
+    limits = [ring.limit(size) for size in ring.length]
+    speed = round(5.0 * len(limits) / sum(limits), 4)
+    reward = f"released:speed={speed},acceleration={BRAKING_COST}"
+    return {"scenario": road.scenario, "road": road.changes, "reward": reward, "name": name}
+
+
+# One residual for all rings of the family that may be seen. An iteration is large, for the roads differ.
+PRESETS["rings"] = {
+    "expert": RINGS_TUNED,
+    "steps": 12_000_000,
+    "policy": {"remember": True},
+    "trpo": {"batch_steps": 240_000, "target_kl": 0.02},
+    "virtual": {"virtual_ratio": 0.0},
+    "evaluation": {"validation_episodes": 4, "episodes": 10, "baselines": ["human", "pi"]},
+    "tasks": [
+        _task(name, road)
+        for name, road in FAMILY.items()
+        if road.part == "seen" and road.scenario in GROUPS["rings"]
+    ],
 }
 
 CLOSING_ABSORBER = "jam-absorber:gap_gain=0,push=0.9,speed_gain=0.8"

@@ -4,8 +4,9 @@ What a training gains is judged beside this: `unjam tune`, with Optuna, on seeds
 limits and filter. Settings that no car could drive do not count.
 """
 
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, fields
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields, replace
+from functools import partial
 from math import inf
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin, get_type_hints
@@ -13,13 +14,14 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 import numpy as np
 
 from unjam.controller.file import SUFFIX, controller_bytes
-from unjam.drivers.driver import Driver, labelled
+from unjam.drivers.driver import labelled
 from unjam.drivers.registry import DRIVERS, named_driver
 from unjam.drivers.wrappers import Mixed
 from unjam.errors import InputError, UnjamError, wrong_name
 from unjam.files import to_json, write_whole
 from unjam.manifest import manifest
 from unjam.measures.drivable import DRIVABLE, drivable_in_all
+from unjam.measures.gain import Rows, ceiling, gain, mean_gain
 from unjam.measures.metrics import measure
 from unjam.scenarios import scenario_recipe
 from unjam.scenarios.scenario import Scenario
@@ -35,6 +37,8 @@ from unjam.worlds.workers import EpisodeTask, Workers
 TUNED = "tuned.json"
 EPISODES = 8
 """of each setting that is tried"""
+OF_EACH = 2
+"""of these on each road, where there are several"""
 FINALISTS = 5
 """settings that are driven again, on twice as many other seeds: else the luckiest would win"""
 SCREENED = 8
@@ -43,6 +47,9 @@ WIDTH = 4.0
 """a parameter is varied from its default over this to its default times this"""
 TO_ONE = 1.0
 """upper end for a parameter that is zero by default"""
+
+Run = Callable[[list[list[EpisodeTask]]], list[list[Episode]]]
+"""runs the tasks of each driver on one road, in SUMO or in a batch"""
 
 
 @dataclass(frozen=True)
@@ -53,7 +60,7 @@ class Setting:
     """as `--driver` takes it"""
     values: dict[str, Any]
     score: float | None
-    """mean return; None where no car could drive so"""
+    """mean return, on several roads the mean gain; None where no car could drive so"""
     verdict: str
 
 
@@ -112,7 +119,7 @@ def _around(value: Any, hint: Any) -> Range | Choice | None:
 
 
 def tune(
-    scenario: Scenario,
+    roads: Mapping[str, Scenario],
     expert: str,
     space: Space,
     steps: int,
@@ -125,57 +132,52 @@ def tune(
 ) -> Tuned:
     """Search an expert's parameters, and write `tuned.json` and the expert as `EXPERT.unjam` into a folder.
 
+    On one road the return is maximised. On several it is the mean over the roads of the share that is gained
+    of what people alone leave to be gained; who could not be driven on a road gains nothing there.
+
     Args:
-        scenario: road, limits and filter.
+        roads: by name; limits and filter are theirs.
         expert: its name.
         space: what is varied, of `space_around` or `search.space_of`.
         steps: that may be driven in all.
         folder: exists and is empty.
         workers: drive; the result does not depend on how many.
-        reward: what is maximised; empty: the scenario's own.
+        reward: what is maximised on one road; empty: the scenario's own.
         seed: of the proposals.
         on_line: gets a line for each setting.
         screen: whether settings are tried in batches of rings, which are SUMO's but for rounding, and only
             the finalists, and the expert as it is, in SUMO.
 
     Raises:
-        InputError: the steps are too few, a parameter is wrong, or the road cannot be stepped in a batch.
+        InputError: the steps are too few, a parameter is wrong, or a road cannot be stepped in a batch.
         UnjamError: no car could drive any of the settings.
         MissingPartError: Optuna is not installed.
     """
-    each = EPISODES * scenario.horizon
-    final = (FINALISTS + 1) * 2 * each
+    episodes = EPISODES if len(roads) == 1 else OF_EACH
+    each = episodes * sum(scenario.horizon for scenario in roads.values())
+    # People, who are the measure on several roads, drive as often as a setting and a finalist.
+    final = (FINALISTS + 1) * 2 * each + (3 * each if len(roads) > 1 else 0)
     trials = (steps - final) // each
     if trials < 2:
         raise InputError(f"steps: {steps} is not allowed; allowed: >= {final + 2 * each} for two settings")
+    why = [why_not(scenario) for scenario in roads.values() if screen and why_not(scenario)]
+    if why:
+        raise InputError(f"screen: {why[0]}")
+    run = partial(_in_sumo, workers)
+    alone = {
+        first: _driven(roads, ["human"], first, count, reward, run)[0] if len(roads) > 1 else {}
+        for first, count in ((0, episodes), (episodes, 2 * episodes))
+    }
 
-    if screen and (why := why_not(scenario)):
-        raise InputError(f"screen: {why}")
-
-    def made(values: dict[str, Any]) -> Driver | Setting:
-        try:
-            return named_driver(labelled(expert, values), scenario.decision_step)
-        except InputError as error:  # parameters that do not go together
-            return Setting(labelled(expert, values), values, None, str(error))
-
-    def driven(values: dict[str, Any], first: int, episodes: int) -> Setting:
-        driver = made(values)
-        if isinstance(driver, Setting):
-            return driver
-        tasks = [
-            EpisodeTask(scenario.part(part, episodes), driver, number, reward)
-            for part, number in enumerate(tuning_seeds(episodes, first))
-        ]
-        return _judged(labelled(expert, values), values, workers.run(tasks))
-
-    def tried(all_values: list[dict[str, Any]]) -> list[Setting]:
-        if not screen:
-            return [driven(values, 0, EPISODES) for values in all_values]
-        drivers = [made(values) for values in all_values]
-        episodes = iter(_screened(scenario, [one for one in drivers if isinstance(one, Driver)], reward))
+    def judged(all_values: list[dict[str, Any]], first: int, count: int, run: Run) -> list[Setting]:
+        texts = [labelled(expert, values) for values in all_values]
+        wrong = {text: why for text in texts if (why := _not_made(text))}
+        found = iter(_driven(roads, [each for each in texts if each not in wrong], first, count, reward, run))
         return [
-            one if isinstance(one, Setting) else _judged(labelled(expert, values), values, next(episodes))
-            for values, one in zip(all_values, drivers, strict=True)
+            Setting(
+                text, values, *((None, wrong[text]) if text in wrong else _score(next(found), alone[first]))
+            )
+            for text, values in zip(texts, all_values, strict=True)
         ]
 
     optuna, settings = quiet_optuna("tune"), list[Setting]()
@@ -187,51 +189,85 @@ def tune(
         for trial in asked:
             for key, values in space.items():
                 values.suggest(trial, key)
-        found = tried([{key: _rounded(value) for key, value in trial.params.items()} for trial in asked])
+        proposed = [{key: _rounded(value) for key, value in trial.params.items()} for trial in asked]
+        found = judged(proposed, 0, episodes, _in_batch if screen else run)
         for trial, setting in zip(asked, found, strict=True):
             failed = None if setting.score is not None else optuna.trial.TrialState.FAIL
             study.tell(trial, setting.score, state=failed)
             settings.append(setting)
-            said = setting.verdict if setting.score is None else f"{setting.score:.0f}"
+            said = setting.verdict if setting.score is None else f"{setting.score:.4g}"
             on_line(f"{len(settings)} of {trials}: {setting.driver}: {said}")
     ranked = sorted(settings, key=lambda one: -inf if one.score is None else one.score, reverse=True)
-    again = [driven(one.values, EPISODES, 2 * EPISODES) for one in ranked[:FINALISTS]]
-    default = driven({}, EPISODES, 2 * EPISODES)
+    best_values = [one.values for one in ranked[:FINALISTS]]
+    *again, default = judged([*best_values, {}], episodes, 2 * episodes, run)
     finalists = [one for one in (*again, default) if one.score is not None]
     if not finalists:
         raise UnjamError(f"no car could drive any of {trials} settings of {expert}: {default.verdict}")
-    best = max(finalists, key=lambda one: one.score or 0.0)
+    best = max(finalists, key=lambda one: -inf if one.score is None else one.score)
     file = folder / f"{expert}{SUFFIX}"
     actual, imagined = (final, trials * each) if screen else (trials * each + final, 0)
     tuned = Tuned(best, default, settings, actual, imagined, file)
-    _write(scenario, expert, tuned, folder, reward, seed)
+    _write(roads, expert, tuned, folder, reward, seed)
     return tuned
 
 
-def _judged(driver: str, values: dict[str, Any], episodes: Sequence[Episode]) -> Setting:
-    """Return a setting with its score and its verdict."""
-    rows = [measure(episode) for episode in episodes]
-    raise_failure(rows)
-    verdict = drivable_in_all([{**row, "people_beyond_4_5": 0.0} for row in rows])
-    score = float(np.mean([row["return"] for row in rows])) if verdict == DRIVABLE else None
-    return Setting(driver, values, score, verdict)
+def _not_made(driver: str) -> str:
+    """Return why there is no such driver, as of parameters that do not go together; empty where there is."""
+    try:
+        named_driver(driver, 1.0)
+    except InputError as error:
+        return str(error)
+    return ""
 
 
-def _screened(scenario: Scenario, drivers: list[Driver], reward: str) -> list[list[Episode]]:
-    """Return the episodes of each driver, all driven in one batch."""
-    if not drivers:
-        return []
+def _driven(
+    roads: Mapping[str, Scenario], drivers: Sequence[str], first: int, count: int, reward: str, run: Run
+) -> list[dict[str, Rows]]:
+    """Return the rows of each driver, road by road, on tuning seeds from number `first` on."""
+    found: list[dict[str, Rows]] = [{} for _ in drivers]
+    seeds = tuning_seeds(count, first)
+    for road, scenario in roads.items() if drivers else ():
+        tasks = [
+            [
+                EpisodeTask(scenario.part(part, count), made, number, reward)
+                for part, number in enumerate(seeds)
+            ]
+            for made in (named_driver(driver, scenario.decision_step) for driver in drivers)
+        ]
+        for rows, episodes in zip(found, run(tasks), strict=True):
+            rows[road] = [measure(episode) for episode in episodes]
+            raise_failure(rows[road])
+    return found
+
+
+def _in_sumo(workers: Workers, tasks: list[list[EpisodeTask]]) -> list[list[Episode]]:
+    episodes = iter(workers.run([task for each in tasks for task in each]))
+    return [[next(episodes) for _ in each] for each in tasks]
+
+
+def _in_batch(tasks: list[list[EpisodeTask]]) -> list[list[Episode]]:
     import torch
 
     # Rings go round the drivers as CAVs do in a mixture: a ring's CAVs all have the same one.
+    drivers = [each[0].driver for each in tasks]
     together = drivers[0] if len(drivers) == 1 else Mixed(tuple(drivers))
-    tasks = [
-        EpisodeTask(scenario.part(part, EPISODES), together, number, reward)
-        for part, number in enumerate(tuning_seeds(EPISODES))
-        for _ in drivers
-    ]
-    episodes = run_batch(tasks, torch.as_tensor if together.tensors else np.asarray)
+    mixed = [replace(task, driver=together) for part in zip(*tasks, strict=True) for task in part]
+    episodes = run_batch(mixed, torch.as_tensor if together.tensors else np.asarray)
     return [episodes[number :: len(drivers)] for number in range(len(drivers))]
+
+
+def _score(found: Mapping[str, Rows], people: Mapping[str, Rows]) -> tuple[float | None, str]:
+    """Return the score of what was driven, road by road, and the verdict."""
+    if people:
+        gains = {
+            road: gain(rows, people[road], float(np.mean([ceiling(row) for row in people[road]])))
+            for road, rows in found.items()
+        }
+        worst = min(gains, key=lambda road: gains[road].mean)
+        return mean_gain(gains).mean, f"worst on {worst}: {gains[worst].mean:+.2f}"
+    (rows,) = found.values()
+    verdict = drivable_in_all([{**row, "people_beyond_4_5": 0.0} for row in rows])
+    return float(np.mean([row["return"] for row in rows])) if verdict == DRIVABLE else None, verdict
 
 
 def _rounded(value: Any) -> Any:
@@ -239,11 +275,15 @@ def _rounded(value: Any) -> Any:
     return float(f"{value:.4g}") if isinstance(value, float) else value
 
 
-def _write(scenario: Scenario, expert: str, found: Tuned, folder: Path, reward: str, seed: int) -> None:
+def _write(
+    roads: Mapping[str, Scenario], expert: str, found: Tuned, folder: Path, reward: str, seed: int
+) -> None:
+    recipes = {road: scenario_recipe(scenario) for road, scenario in roads.items()}
+    scenario = next(iter(roads.values()))
     about = {
-        "scenario": scenario_recipe(scenario),
+        "scenario": recipes if len(roads) > 1 else scenario_recipe(scenario),
         "expert": expert,
-        "reward": reward or scenario.reward,
+        "reward": reward or (scenario.reward if len(roads) == 1 else "mean gain"),
         "seed": seed,
         "actual_steps": found.actual_steps,
         "imagined_steps": found.imagined_steps,
