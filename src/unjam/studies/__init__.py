@@ -2,6 +2,7 @@
 
 from unjam.studies.comparison import FIGURE_5, comparison_of
 from unjam.studies.drivable import DRIVABLE_STUDY
+from unjam.studies.everywhere import EVERYWHERE_STUDY
 from unjam.studies.figure_6 import FIGURE_6
 from unjam.studies.robustness import FIGURE_10, ROBUSTNESS
 from unjam.studies.study import PAPERS_ROADS, Study
@@ -46,6 +47,7 @@ STUDIES: dict[str, Study] = {
     ),
     "robustness": ROBUSTNESS,
     "drivable": DRIVABLE_STUDY,
+    "everywhere": EVERYWHERE_STUDY,
 }
 """every study by name"""
 

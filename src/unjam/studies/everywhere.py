@@ -1,0 +1,144 @@
+"""What drivers gain on every road of the family, seen and held out: one controller beside experts.
+
+On each road 0 is people alone, and 1 the best tuned expert that is known there; which that is, other seeds
+decide than those that judge.
+"""
+
+import json
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+
+from unjam.controller import make_driver
+from unjam.files import to_json, write_whole
+from unjam.measures.drivable import drivable_in_all
+from unjam.measures.gain import MOST, WORST, Rows, gain, mean_gain, worth
+from unjam.measures.metrics import measure
+from unjam.measures.statistics import Estimate, signed
+from unjam.reports.figures import INK, new_figure
+from unjam.scenarios.scenario import Scenario
+from unjam.studies.study import Study, StudyFolder
+from unjam.training.family import FAMILY, GROUPS
+from unjam.training.seeds import held_out_seeds, tuning_seeds
+from unjam.worlds.workers import EpisodeTask, Workers
+
+EPISODES = 10
+"""of each driver on each road"""
+PEOPLE = "human"
+TUNED: dict[str, tuple[str, ...]] = {
+    "rings": ("pi", "unjam:ring-tuned", "unjam:rings-tuned", "follower-stopper"),
+    "figure-eights": ("unjam:figure-eight-tuned", "pacer:varying=true"),
+    "motorways": ("jam-ahead", "unjam:on-ramp-tuned", "cruise"),
+}
+"""experts of which the best on a road is its 1"""
+JUDGED: dict[str, str] = {
+    "unjam:best": "unjam:best",
+    "PI, tuned on the rings": "unjam:rings-tuned",
+    "PI": "pi",
+    "FollowerStopper": "follower-stopper",
+    "jam-ahead": "jam-ahead",
+    "unjam:ring-best": "unjam:ring-best",
+}
+"""who is judged on every road, by label"""
+KEPT = (
+    *("seed", "status", "travel_time", "delay", "mean_speed", "mean_speed_second_half", "speed_limit_ratio"),
+    *("throughput_veh_per_h", "fuel_ml_per_km", "floor", "lanes", "collisions", "min_headway", "cav_min_ttc"),
+    *("cav_max_braking", "cut_in_max_braking", "share_short_headway", "overridden", "people_beyond_4_5"),
+)
+"""of each episode"""
+
+
+def _driven(
+    scenario: Scenario, drivers: dict[str, str], seeds: list[tuple[int, ...]], workers: Workers
+) -> dict[str, Rows]:
+    tasks = [
+        EpisodeTask(scenario.part(index, len(seeds)), make_driver(name, scenario.decision_step), seed)
+        for name in drivers.values()
+        for index, seed in enumerate(seeds)
+    ]
+    rows = [{key: row[key] for key in KEPT} for row in map(measure, workers.run(tasks))]
+    count = len(seeds)
+    return {label: rows[n * count : (n + 1) * count] for n, label in enumerate(drivers)}
+
+
+def _write(studies: StudyFolder, seeds: int, folder: Path, workers: int) -> None:
+    with Workers(workers) as pool:
+        for number, (name, road) in enumerate(FAMILY.items()):
+            file = folder / f"{number:02d}.json"
+            if file.is_file():
+                continue
+            scenario = road.make()
+            group = next(group for group, kinds in GROUPS.items() if road.scenario in kinds)
+            tuned = {expert: expert for expert in TUNED[group]}
+            tried = _driven(scenario, tuned, tuning_seeds(EPISODES, 1000), pool)
+            best = max(tried, key=lambda expert: float(np.nanmean([worth(row) for row in tried[expert]])))
+            found = _driven(scenario, {PEOPLE: PEOPLE, best: best, **JUDGED}, held_out_seeds(EPISODES), pool)
+            write_whole(file, to_json({"road": name, "part": road.part, "best": best, "rows": found}))
+
+
+def gains_of(folder: Path) -> dict[str, dict[str, Any]]:
+    """Return of each road its part, its best expert, and each driver's gain and verdict, by label."""
+    roads: dict[str, dict[str, Any]] = {}
+    for file in sorted(folder.glob("[0-9]*.json")):
+        found = json.loads(file.read_text())
+        rows: dict[str, Rows] = {
+            label: [{key: np.nan if value is None else value for key, value in row.items()} for row in of]
+            for label, of in found["rows"].items()
+        }
+        people, best = rows.pop(PEOPLE), float(np.mean([worth(row) for row in rows[found["best"]]]))
+        roads[found["road"]] = {
+            **{key: found[key] for key in ("part", "best")},
+            "people": float(np.mean([worth(row) for row in people])),
+            "gains": {label: gain(of, people, best) for label, of in rows.items()},
+            "verdicts": {label: drivable_in_all(of, people) for label, of in rows.items()},
+        }
+    return roads
+
+
+def table(parts: tuple[str, ...], folder: Path) -> pd.DataFrame:
+    """Return what each driver gains on each road of some parts of the family, with the mean and the worst."""
+    roads = {name: road for name, road in gains_of(folder).items() if road["part"] in parts}
+    rows = [{"road": name, **_cells(road)} for name, road in roads.items()]
+    means: dict[str, Estimate] = {
+        label: mean_gain({name: road["gains"][label] for name, road in roads.items()}) for label in JUDGED
+    }
+    worst = {label: min(road["gains"][label].mean for road in roads.values()) for label in JUDGED}
+    rows.append({"road": "mean", **{label: signed(found, 2) for label, found in means.items()}})
+    rows.append({"road": "worst", **{label: f"{found:+.2f}" for label, found in worst.items()}})
+    return pd.DataFrame(rows).fillna("")
+
+
+def _cells(road: dict[str, Any]) -> dict[str, str]:
+    cells = {label: signed(road["gains"][label], 2) for label in JUDGED}
+    return {"best expert there": road["best"].removeprefix("unjam:"), **cells}
+
+
+def picture(folder: Path) -> Figure:
+    """Return roads by drivers: what each gains, people alone being 0 and the best tuned expert 1."""
+    roads = gains_of(folder)
+    values = np.array([[road["gains"][label].mean for label in JUDGED] for road in roads.values()])
+    figure = new_figure(0.3 * len(roads) + 1.0)
+    axes = figure.subplots()
+    shown = axes.imshow(values, cmap="RdYlGn", vmin=WORST, vmax=-WORST, aspect="auto")
+    for (row, column), value in np.ndenumerate(values):
+        axes.text(column, row, f"{value:+.2f}", ha="center", va="center", color=INK, fontsize=8)
+    axes.set_xticks(range(len(JUDGED)), list(JUDGED), rotation=20, ha="right")
+    marks = {"seen": "", "combination": " (new combination)", "axis": " (new)"}
+    axes.set_yticks(range(len(roads)), [f"{name}{marks[road['part']]}" for name, road in roads.items()])
+    axes.grid(visible=False)
+    figure.colorbar(shown, ax=axes, label=f"gain, from {WORST:g} to {MOST:g}", shrink=0.5)
+    return figure
+
+
+HELD_OUT = ("combination", "axis")
+EVERYWHERE_STUDY = Study(
+    title="what one controller gains on every road of the family, seen and held out",
+    runs=lambda seeds: [],
+    write=_write,
+    minutes=60.0,
+    tables={"seen": partial(table, ("seen",)), "held out": partial(table, HELD_OUT)},
+)
