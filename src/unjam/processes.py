@@ -2,12 +2,16 @@
 
 import ctypes
 import os
+import signal
+import socket
 import sys
-from collections.abc import Iterator, Mapping
+import tempfile
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from unjam.errors import InputError
+from unjam.sandbox import confine, limit
 
 PARENT = "UNJAM_PARENT"
 """the variable that tells a process by whose side it ends"""
@@ -15,6 +19,10 @@ LOCK = ".lock"
 """the file that holds a folder for who writes it"""
 SIGNAL_OF_PARENTS_DEATH = 1
 """Linux's PR_SET_PDEATHSIG"""
+LARGEST_MEMORY = 8 * 2**30
+"""bytes that reading a file of others may take"""
+LONGEST_TIME = 600
+"""seconds that it may take"""
 
 
 def bound(environment: Mapping[str, str]) -> dict[str, str]:
@@ -36,6 +44,64 @@ def end_with_parent(signum: int) -> None:
         os.kill(int(parent), 0)
     except ProcessLookupError:  # it was gone before
         os.kill(os.getpid(), signum)
+
+
+def go_on_limited(what: str, *writable: Path) -> None:
+    """Go on in a child that reads `what` of others under limits; this process waits, and ends as that does.
+
+    It may write under `writable` alone, and has no network, where the kernel sees to it. On Windows nothing
+    changes.
+
+    Raises:
+        SystemExit: in this process, with the child's exit code.
+        InputError: in this process: the child took too much memory or time, or crashed.
+    """
+    if not hasattr(os, "fork"):
+        return
+    sys.stdout.flush()
+    sys.stderr.flush()
+    here = str(os.getpid())
+    child = os.fork()
+    if child == 0:
+        os.environ[PARENT] = here
+        end_with_parent(signal.SIGKILL)
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # this process is told too, and ends it
+        limit(LARGEST_MEMORY, LONGEST_TIME)
+        confine(*writable)
+        return
+    try:
+        code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+    except BaseException:
+        os.kill(child, signal.SIGKILL)
+        os.waitpid(child, 0)
+        raise
+    if code < 0:
+        how = f"{LARGEST_MEMORY / 2**30:g} GiB and {LONGEST_TIME:g} s: signal {-code}"
+        raise InputError(f"{what}: cannot be read within {how}")
+    sys.exit(code)
+
+
+def protections() -> list[str]:
+    """Return what the kernel does here for a process that reads files of others; tried in a child."""
+    if sys.platform != "linux":
+        return []
+    with tempfile.TemporaryDirectory() as folder:
+        child = os.fork()
+        if child == 0:
+            confine()
+            refused = [_refused(act) for act in (Path(folder, "file").touch, socket.socket)]
+            os._exit(sum(2**number for number, each in enumerate(refused) if each))
+        found = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+    names = ("disk read-only (Landlock)", "no network (seccomp)")
+    return [name for number, name in enumerate(names) if found >= 0 and found & 2**number]
+
+
+def _refused(act: Callable[[], object]) -> bool:
+    try:
+        act()
+    except PermissionError:
+        return True
+    return False
 
 
 def has_display() -> bool:

@@ -17,7 +17,7 @@ from unjam.cli.parts import drivers, fit_drivers, scenarios
 from unjam.cli.results import certify, evaluate, export, model, report, verify
 from unjam.cli.runs import runs
 from unjam.cli.train import reproduce, search, train, tune
-from unjam.errors import DISK_ERRNOS, UnjamError, disk_error
+from unjam.errors import DISK_ERRNOS, InputError, UnjamError, disk_error
 from unjam.processes import end_with_parent
 
 INTERRUPTED, TERMINATED = 130, 143
@@ -79,6 +79,8 @@ def _run() -> int:
         if error.errno in DISK_ERRNOS:
             return _say(str(disk_error(error, error.filename or "output")), 74)
         raise
+    except MemoryError:
+        return _say("memory: there is not enough for this", InputError.exit_code)
     except (KeyboardInterrupt, typer.Abort):
         return _say("interrupted", INTERRUPTED)
     except _Terminated:

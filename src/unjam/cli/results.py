@@ -9,6 +9,7 @@ import typer
 from unjam.cli.options import DEFAULT_WORKERS, HumansOption, JsonOption, WorkersOption, scenario_changes
 from unjam.cli.output import aside, console, counting_steps, metrics_table, new_table, print_json
 from unjam.errors import InputError
+from unjam.processes import go_on_limited
 
 
 def evaluate(
@@ -120,9 +121,12 @@ def report(
 
       unjam report runs/ring-001 runs/ring-002 --out compared.html
     """
-    from unjam.reports.html import write_report
+    from matplotlib import get_cachedir
 
     target = out or (folders[0] / "report.html" if len(folders) == 1 else Path("comparison.html"))
+    go_on_limited(f"report: {', '.join(map(str, folders))}", target.absolute().parent, Path(get_cachedir()))
+    from unjam.reports.html import write_report
+
     written = write_report(folders, target)
     if json:
         print_json({"report": str(written), "folders": [str(folder) for folder in folders]})
@@ -226,6 +230,7 @@ def verify(
     """
     from rich.markup import escape
 
+    go_on_limited(f"controller: {str(file)!r}")
     from unjam.controller.verify import verify_controller
 
     verified = verify_controller(file, trust_code)
