@@ -115,7 +115,7 @@ class ClosedTraffic(Traffic[ClosedRoad]):
             return loop_state(self.speeds, near, self._near_single, self.road.loop_length)
         positions = np.full(len(self.speeds), np.nan)
         positions[list(near)] = list(near.values())
-        return loop_state(np.array(self.speeds), positions, self._near, self.road.loop_length)
+        return loop_state(np.array(self.speeds), positions, self._near, self.road.loop_length).read_only()
 
     def advance(self, command: Command | None) -> None:
         """Simulate one decision, held over its simulation steps; None: the CAVs stay human."""
