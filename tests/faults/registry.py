@@ -1,6 +1,6 @@
 """All faults that are injected, by name."""
 
-from tests.faults.files import checkpoints, configurations, controllers, full_disks
+from tests.faults.files import checkpoints, configurations, controllers, full_disks, results
 from tests.faults.outcome import Fault
 from tests.faults.processes import killed_runs, lost_workers, networks, resets
 
@@ -16,6 +16,9 @@ FAULTS: dict[str, Fault] = {
     ),
     "configurations": Fault(
         "configuration with a nonsensical value, an unknown name, a line twice, torn", configurations, 40, 200
+    ),
+    "results": Fault(
+        "folder of results damaged: torn, empty, missing, nested, a value gone or another", results, 20, 300
     ),
     "full disk": Fault("disk full after some bytes of a checkpoint", full_disks, quick=20, long=200),
     "networks": Fault("network, demand or configuration of SUMO broken", networks, quick=12, long=500),

@@ -17,7 +17,7 @@ from unjam.cli.parts import drivers, fit_drivers, scenarios
 from unjam.cli.results import certify, evaluate, export, model, report, verify
 from unjam.cli.runs import runs
 from unjam.cli.train import reproduce, search, train, tune
-from unjam.errors import DISK_ERRNOS, InputError, UnjamError, disk_error
+from unjam.errors import DISK_ERRNOS, InputError, UnjamError, disk_error, wrong
 from unjam.processes import end_with_parent
 
 INTERRUPTED, TERMINATED = 130, 143
@@ -72,13 +72,18 @@ def main() -> None:
 
 def _run() -> int:
     try:
+        for text in sys.argv[1:]:
+            if any("\ud800" <= letter <= "\udfff" for letter in text):  # bytes that are no letters
+                raise wrong("arguments", text, "text in UTF-8")
         return app(standalone_mode=False) or 0
     except UnjamError as error:
         return _say(str(error), error.exit_code)
     except OSError as error:
         if error.errno in DISK_ERRNOS:
             return _say(str(disk_error(error, error.filename or "output")), 74)
-        raise
+        return _say(f"{error.filename or 'system'}: {error.strerror or error}", InputError.exit_code)
+    except RecursionError:
+        return _say("input: it is nested too deep", InputError.exit_code)
     except MemoryError:
         return _say("memory: there is not enough for this", InputError.exit_code)
     except (KeyboardInterrupt, typer.Abort):

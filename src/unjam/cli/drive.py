@@ -89,7 +89,7 @@ def drive(
     if json:
         print_json(result.document())
     elif any(row["status"] != "failed" for rows in result.rows.values() for row in rows):
-        console.print(metrics_table(result.rows))
+        console.print(metrics_table(result.rows), markup=True)
         for label, effect in beside_people(result.rows).items():
             console.print(f"{label} beside people alone, {effect.flow.count} paired seeds: {effect.words}")
         for note in result.notes:

@@ -10,6 +10,7 @@ from importlib.metadata import PackageNotFoundError, version
 from typing import Annotated
 
 import typer
+from rich.markup import escape
 
 from unjam.cli.options import JsonOption
 from unjam.cli.output import aside, console, new_table, print_json
@@ -39,7 +40,7 @@ def doctor(json: JsonOption = False) -> None:
         for check in checks:
             wanting = "[red]missing[/red]" if check.needed else "[yellow]no[/yellow]     "
             mark = "[green]ok[/green]     " if check.ok else wanting
-            console.print(f"{mark} {check.name}: {check.found}")
+            console.print(f"{mark} {check.name}: {escape(check.found)}", markup=True)
             if not check.ok:
                 console.print(f"        {check.remedy}")
     if missing:

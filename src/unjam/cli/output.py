@@ -1,5 +1,6 @@
 """What the command line prints: tables for people, one JSON document for programs, progress on the side."""
 
+import os
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -7,6 +8,7 @@ from contextlib import contextmanager
 from typing import Any, Self
 
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
@@ -18,9 +20,13 @@ LINE_SECONDS = 5.0
 PIPE_WIDTH = 160
 """columns of a table where there is no terminal"""
 
-console = Console(highlight=False, width=None if sys.stdout.isatty() else PIPE_WIDTH)
-aside = Console(stderr=True, highlight=False, width=None if sys.stderr.isatty() else PIPE_WIDTH)
-"""progress and messages: standard output is for results"""
+for name, way in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+    if getattr(sys, name) is None:  # it was closed: what goes there goes nowhere, not into the next file
+        setattr(sys, name, open(os.devnull, way))  # noqa: SIM115
+
+console = Console(highlight=False, markup=False, width=None if sys.stdout.isatty() else PIPE_WIDTH)
+aside = Console(stderr=True, highlight=False, markup=False, width=None if sys.stderr.isatty() else PIPE_WIDTH)
+"""progress and messages: standard output is for results; names with brackets stay as they are in both"""
 
 
 def print_json(document: Any) -> None:
@@ -44,7 +50,7 @@ def metrics_table(rows_by_driver: dict[str, list[dict[str, Any]]]) -> Table:
     from unjam.measures.metrics import METRICS
     from unjam.measures.statistics import digits_of, estimate
 
-    table = new_table(("metric", "unit"), list(rows_by_driver))
+    table = new_table(("metric", "unit"), list(map(escape, rows_by_driver)))
     table.add_row("could a car drive so?", "", *(said or "–" for said in verdicts(rows_by_driver).values()))
     for name, metric in METRICS.items():
         cells = []

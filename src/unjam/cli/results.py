@@ -63,7 +63,7 @@ def evaluate(
         drivers = [{"driver": one, "episodes": rows, "mean": means[one]} for one, rows in found.rows.items()]
         print_json({"run": str(run), "scenario": config.scenario, "gain": gain, "drivers": drivers})
         return
-    console.print(metrics_table(found.rows))
+    console.print(metrics_table(found.rows), markup=True)
     if result.gain is not None:
         console.print(f"return beyond the expert, 95 % interval: {signed(result.gain)}")
     aside.print(f"report: {result.report}")
@@ -238,4 +238,4 @@ def verify(
         print_json({"file": str(file), "ok": True, "verified": {each.name: each.found for each in verified}})
         return
     for each in verified:
-        console.print(f"[green]ok[/green] {each.name}: {escape(each.found)}")
+        console.print(f"[green]ok[/green] {each.name}: {escape(each.found)}", markup=True)

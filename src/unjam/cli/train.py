@@ -111,7 +111,7 @@ def train(
     for name, of in (result.roads or {"": result}).items():
         if name:
             console.print(f"{name}:")
-        console.print(metrics_table(of.rows))
+        console.print(metrics_table(of.rows), markup=True)
         if of.gain is not None:
             console.print(f"return beyond the expert, held-out seeds, 95 % interval: {signed(of.gain)}")
         aside.print(f"controller: {of.controller}")

@@ -5,6 +5,7 @@ remembers, how its driver is made), weights in safetensors and, where it was exp
 and an ONNX graph. Nothing in it is ever executed.
 """
 
+import os
 import re
 from importlib.resources import files
 from pathlib import Path
@@ -46,15 +47,14 @@ def make_driver(text: str, time_step: float) -> Driver:
     Raises:
         InputError: there is no such driver, or a parameter is wrong.
     """
-    path = Path(text)
-    parts = [] if path.exists() else _SEVERAL.split(text)
+    parts = [] if os.path.exists(text) else _SEVERAL.split(text)
     if len(parts) > 1:
         return Mixed(tuple(make_driver(part, time_step) for part in parts))
     if text.startswith(SHIPPED):
         return load_controller(shipped_file(text.removeprefix(SHIPPED)))
     named = text.partition(":")[0] in DRIVERS or is_file_reference(text)
-    if not named and (text.endswith(SUFFIX) or path.is_dir()):
-        return load_controller(path)
+    if not named and (text.endswith(SUFFIX) or os.path.isdir(text)):
+        return load_controller(text)
     return named_driver(text, time_step)
 
 

@@ -103,12 +103,16 @@ def cav_mean_speed(episode: Episode) -> float:
 
 def speed_limit_ratio(episode: Episode) -> float:
     """Mean speed over the scenario's own limit; on the ring the IDM equilibrium speed of its length."""
-    return mean_speed(episode) / episode.limit_speed
+    return _over_limit(mean_speed(episode), episode)
 
 
 def speed_limit_ratio_steady(episode: Episode) -> float:
     """Mean speed in the steady state over the scenario's own limit."""
-    return mean_speed_steady(episode) / episode.limit_speed
+    return _over_limit(mean_speed_steady(episode), episode)
+
+
+def _over_limit(speed: float, episode: Episode) -> float:
+    return speed / episode.limit_speed if episode.limit_speed else float("nan")
 
 
 def episode_return(episode: Episode) -> float:

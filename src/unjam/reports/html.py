@@ -27,7 +27,7 @@ from unjam.reports.figures import (
 )
 from unjam.reports.film import split_lines
 from unjam.reports.model import errors, examples, model_section, trust
-from unjam.reports.results import Results, Shown, command_to_repeat, read_results
+from unjam.reports.results import DAMAGED, Results, Shown, command_to_repeat, damaged, read_results
 from unjam.reports.story import cards_of, columns_of, lead_of, names_of, notes_of, table_of, title_of
 from unjam.scenarios.scenario import VEHICLE_LENGTH
 
@@ -46,7 +46,12 @@ def write_report(folders: Sequence[Path], target: Path) -> Path:
         DiskError: the page cannot be written, or there is no folder for it.
     """
     check_folder(target)
-    write_whole(target, render([read_results(folder) for folder in folders]))
+    results = [read_results(folder) for folder in folders]
+    try:
+        page = render(results)
+    except DAMAGED as error:
+        raise damaged(folders[0], error) from error
+    write_whole(target, page)
     return target
 
 
