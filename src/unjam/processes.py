@@ -2,12 +2,17 @@
 
 import ctypes
 import os
+import platform
+import shutil
 import signal
 import socket
 import sys
 import tempfile
+import threading
+import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from functools import cache
 from pathlib import Path
 
 from unjam.errors import InputError
@@ -17,6 +22,10 @@ PARENT = "UNJAM_PARENT"
 """the variable that tells a process by whose side it ends"""
 LOCK = ".lock"
 """the file that holds a folder for who writes it"""
+HEARTBEAT, MISSED = 10.0, 6
+"""seconds between two signs of life of a folder's owner, and how many it may miss"""
+PREFIX, HELD = "unjam-", ".temporary"
+"""what the names of private temporary folders begin with, and the file by which a process holds its own"""
 SIGNAL_OF_PARENTS_DEATH = 1
 """Linux's PR_SET_PDEATHSIG"""
 LARGEST_MEMORY = 8 * 2**30
@@ -113,7 +122,8 @@ def has_display() -> bool:
 def owned(folder: Path) -> Iterator[None]:
     """Hold a folder that is there for this process alone; it is free again when the process ends, however.
 
-    On Windows, and where the file system has no locks, nothing is held.
+    Where machines share a folder but not its locks, the lock's age tells that an owner elsewhere still lives.
+    On Windows nothing is held.
 
     Raises:
         InputError: another process holds it.
@@ -123,12 +133,67 @@ def owned(folder: Path) -> Iterator[None]:
     while descriptor is not None and not _is_file(path, descriptor):  # its owner removed it just now
         os.close(descriptor)
         descriptor = _locked(path)
-    try:
+    if descriptor is None:
         yield
-    finally:
-        if descriptor is not None:
+        return
+    ended = threading.Event()
+    try:
+        _refuse_other_machine(path, descriptor)
+        os.pwrite(descriptor, f"{platform.node()} {os.getpid()}\n".ljust(300).encode(), 0)
+        beats = threading.Thread(target=_beat, args=(descriptor, ended), daemon=True)
+        beats.start()
+        try:
+            yield
+        finally:
+            ended.set()
+            beats.join()
             path.unlink(missing_ok=True)
-            os.close(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _beat(descriptor: int, ended: threading.Event) -> None:
+    while not ended.wait(HEARTBEAT):
+        with suppress(OSError):  # a disk that is away for a while
+            os.utime(descriptor)
+
+
+def _refuse_other_machine(path: Path, descriptor: int) -> None:
+    """Raise `InputError` where a process of another machine has held a lock until just now."""
+    owner = os.pread(descriptor, 300, 0).decode(errors="replace").split()
+    age = time.time() - os.fstat(descriptor).st_mtime
+    if owner and owner[0] != platform.node() and age < MISSED * HEARTBEAT:
+        held = f"run: {str(path.parent)!r} is being written on {owner[0]}"
+        raise InputError(f"{held}; allowed: one at a time, or {MISSED * HEARTBEAT:g} s after its end")
+
+
+class PrivateFolder(tempfile.TemporaryDirectory[str]):
+    """A temporary folder that a later process removes where this one was killed."""
+
+    def __init__(self) -> None:
+        """Make it, and hold it."""
+        super().__init__(prefix=PREFIX)
+        self._held = _locked(Path(self.name, HELD))
+
+    def cleanup(self) -> None:
+        """Remove it."""
+        super().cleanup()
+        if self._held is not None:
+            os.close(self._held)
+            self._held = None
+
+
+@cache
+def sweep_private_folders() -> None:
+    """Remove this user's private folders whose processes were killed, once in a process."""
+    for folder in Path(tempfile.gettempdir()).glob(f"{PREFIX}*"):
+        with suppress(OSError, AttributeError, InputError):  # Windows has no users; somebody holds it
+            found = folder.lstat()
+            if found.st_uid != os.getuid() or time.time() - found.st_mtime < MISSED * HEARTBEAT:
+                continue
+            if (folder / HELD).is_file() and (descriptor := _locked(folder / HELD)) is not None:
+                shutil.rmtree(folder, ignore_errors=True)
+                os.close(descriptor)
 
 
 def is_owned(folder: Path) -> bool:
@@ -157,9 +222,8 @@ def _locked(path: Path) -> int | None:
         os.close(descriptor)
         held = f"run: {str(path.parent)!r} is being written by another process"
         raise InputError(f"{held}; allowed: one at a time") from None
-    except OSError:
-        os.close(descriptor)
-        return None
+    except OSError:  # a file system without locks
+        pass
     return descriptor
 
 

@@ -8,6 +8,7 @@ import pytest
 from tests.controller.test_verify import content_of
 from tests.system.conftest import Run
 from tests.system.test_wrong_inputs import one_line
+from tests.test_processes import holder
 from unjam.controller.file import GRAPH
 from unjam.drivers import Constant
 
@@ -35,3 +36,18 @@ def test_a_graph_that_wants_all_memory_is_refused_in_one_line(unjam: Run, tmp_pa
     assert (ran.returncode, ran.stdout) == (2, "")
     assert one_line(ran.stderr), ran.stderr
     assert "graph: cannot be run" in ran.stderr
+
+
+def test_a_folder_that_another_process_writes_is_left_alone(unjam: Run, tmp_path: Path) -> None:
+    made = ["drive", "ring", "--driver", "pi", "--episodes", "1", "--set", "horizon=20", "--out", "run"]
+    assert unjam(*made, pictures=False).returncode == 0
+    before = (tmp_path / "run" / "report.html").read_bytes()
+    process = holder(tmp_path / "run")
+    for arguments in (["report", "run"], ["report", "run", "--out", "run/other.html"]):
+        ran = unjam(*arguments, pictures=False)
+        assert (ran.returncode, one_line(ran.stderr)) == (2, True), ran.stderr
+        assert "is being written by another process" in ran.stderr
+    assert unjam("report", "run", "--out", "page.html", pictures=False).returncode == 0
+    process.communicate("")
+    assert (tmp_path / "run" / "report.html").read_bytes() == before
+    assert not (tmp_path / "run" / "other.html").exists()

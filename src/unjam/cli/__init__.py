@@ -20,7 +20,7 @@ from unjam.cli.train import reproduce, search, train, tune
 from unjam.errors import DISK_ERRNOS, InputError, UnjamError, disk_error, wrong
 from unjam.processes import end_with_parent
 
-INTERRUPTED, TERMINATED = 130, 143
+INTERRUPTED = 130
 
 app = typer.Typer(
     name="unjam",
@@ -28,7 +28,7 @@ app = typer.Typer(
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     rich_markup_mode="markdown",
-    epilog="Exit codes: 0 done, 2 wrong input, 3 missing part, 74 disk, 130/143 stopped.",
+    epilog="Exit codes: 0 done, 2 wrong input, 3 missing part, 74 disk, 129/130/143 stopped.",
 )
 
 
@@ -56,16 +56,19 @@ app.add_typer(runs)
 
 
 class _Terminated(BaseException):
-    """The process was asked to end (SIGTERM)."""
+    """The process was asked to end (SIGTERM), or its terminal is gone (SIGHUP)."""
 
 
 def _terminate(signum: int, frame: FrameType | None) -> None:
-    raise _Terminated
+    raise _Terminated(signum)
 
 
 def main() -> None:
     """Run the command line; every error that a user can mend is one line and an exit code."""
-    signal.signal(signal.SIGTERM, _terminate)
+    for name in ("SIGTERM", "SIGHUP"):  # Windows has no SIGHUP, and under nohup nobody wants to be told
+        signum = getattr(signal, name, None)
+        if signum is not None and signal.getsignal(signum) != signal.SIG_IGN:
+            signal.signal(signum, _terminate)
     end_with_parent(signal.SIGTERM)
     sys.exit(_run())
 
@@ -88,8 +91,8 @@ def _run() -> int:
         return _say("memory: there is not enough for this", InputError.exit_code)
     except (KeyboardInterrupt, typer.Abort):
         return _say("interrupted", INTERRUPTED)
-    except _Terminated:
-        return _say("terminated", TERMINATED)
+    except _Terminated as ended:
+        return _say("terminated", 128 + ended.args[0])
     except Exception as error:
         if hasattr(error, "format_message"):  # what typer says of a wrong command line
             return _say(f"{error.format_message()}{_given(error)}", 2)  # pyright: ignore[reportAttributeAccessIssue]

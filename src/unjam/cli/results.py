@@ -1,5 +1,6 @@
 """What a run is worth: `unjam evaluate`, `unjam model`, `unjam report`; and shipped: `export`, `verify`."""
 
+from contextlib import nullcontext
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated
@@ -9,7 +10,8 @@ import typer
 from unjam.cli.options import DEFAULT_WORKERS, HumansOption, JsonOption, WorkersOption, scenario_changes
 from unjam.cli.output import aside, console, counting_steps, metrics_table, new_table, print_json
 from unjam.errors import InputError
-from unjam.processes import go_on_limited
+from unjam.files import make_folder
+from unjam.processes import go_on_limited, owned
 
 
 def evaluate(
@@ -54,10 +56,13 @@ def evaluate(
     if not (run / "controller.unjam").is_file():
         raise InputError(f"run: {str(run)!r} has no controller yet; go on with: unjam train --resume {run}")
     total = len(comparison(config, run, list(DRIVERS))) * episodes * config.make_scenario().horizon
-    with counting_steps("evaluating", total) as steps, Workers(workers) as pool:
-        found = judge(run, config, pool, list(DRIVERS), episodes, steps, out)
-    result = TrainResult(out or run, found.rows, gain_of(config, found.rows))
-    write_report([result.folder], result.report)
+    target = out or run
+    make_folder(target)
+    with owned(target):
+        with counting_steps("evaluating", total) as steps, Workers(workers) as pool:
+            found = judge(run, config, pool, list(DRIVERS), episodes, steps, out)
+        result = TrainResult(target, found.rows, gain_of(config, found.rows))
+        write_report([target], result.report)
     if json:
         gain, means = asdict(result.gain) if result.gain else None, found.means()
         drivers = [{"driver": one, "episodes": rows, "mean": means[one]} for one, rows in found.rows.items()]
@@ -127,7 +132,8 @@ def report(
     go_on_limited(f"report: {', '.join(map(str, folders))}", target.absolute().parent, Path(get_cachedir()))
     from unjam.reports.html import write_report
 
-    written = write_report(folders, target)
+    with owned(target.absolute().parent) if target.parent in folders else nullcontext():
+        written = write_report(folders, target)
     if json:
         print_json({"report": str(written), "folders": [str(folder) for folder in folders]})
     else:

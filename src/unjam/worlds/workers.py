@@ -14,7 +14,7 @@ from typing import Any, Self, TypeVar
 from unjam.drivers.driver import Driver
 from unjam.drivers.registry import recipe_of
 from unjam.errors import EpisodeError
-from unjam.processes import bound
+from unjam.processes import PrivateFolder, bound, sweep_private_folders
 from unjam.scenarios import scenario_recipe
 from unjam.scenarios.own_network import OwnNetwork
 from unjam.scenarios.scenario import Scenario
@@ -60,7 +60,8 @@ class Workers:
         """Prepare `count` workers; nothing is started yet."""
         self.count, self._attempts = count, attempts
         # Of all workers, so that nothing stays behind of one that was killed.
-        self._temporary = tempfile.TemporaryDirectory(prefix="unjam-")
+        sweep_private_folders()
+        self._temporary = PrivateFolder()
         self._idle: queue.SimpleQueue[_Worker] = queue.SimpleQueue()
         self._all = [_Worker(silence, self._temporary.name) for _ in range(count)]
         self._threads = ThreadPoolExecutor(count, thread_name_prefix="unjam-worker")
