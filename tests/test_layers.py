@@ -18,7 +18,7 @@ ORDER = (
     *("training", "studies", "cli"),
 )
 """each may import those before it, and none after it"""
-EVERYWHERE = {"", "errors", "files", "kernels", "manifest", "parameters", "processes", "tree"}
+EVERYWHERE = {"", "errors", "files", "kernels", "manifest", "parameters", "processes", "sandbox", "tree"}
 """what has no place in the order: it imports none of the layers"""
 ALLOWED = {
     "controller": {"physics", "drivers", "worlds"},

@@ -1,6 +1,7 @@
 """Who writes a folder, and who ends with whom."""
 
 import os
+import platform
 import signal
 import subprocess
 import sys
@@ -12,7 +13,16 @@ import pytest
 from tests.training.test_run import small_config
 from tests.worlds.test_workers import has_ended
 from unjam.errors import InputError
-from unjam.processes import LOCK, PARENT, bound, end_with_parent, owned
+from unjam.processes import (
+    HEARTBEAT,
+    LOCK,
+    MISSED,
+    PARENT,
+    bound,
+    end_with_parent,
+    owned,
+    sweep_private_folders,
+)
 from unjam.training.folder import start_folder
 from unjam.training.train import train
 
@@ -129,3 +139,57 @@ def test_a_training_that_was_started_for_another_ends_with_it(tmp_path: Path) ->
     )
     assert parent.returncode == -signal.SIGKILL
     assert soon(int(parent.stdout))
+
+
+def test_an_owner_on_another_machine_holds_a_folder_while_its_heart_beats(tmp_path: Path) -> None:
+    (tmp_path / LOCK).write_text("elsewhere 12\n")  # a file system whose locks end at the machine
+    with pytest.raises(InputError, match="is being written on elsewhere; allowed: "), owned(tmp_path):
+        pass
+    assert (tmp_path / LOCK).is_file()
+    long_ago = time.time() - 2 * MISSED * HEARTBEAT
+    os.utime(tmp_path / LOCK, (long_ago, long_ago))
+    with owned(tmp_path):
+        assert (tmp_path / LOCK).read_text().split() == [platform.node(), str(os.getpid())]
+
+
+def test_the_heart_of_an_owner_beats(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("unjam.processes.HEARTBEAT", 0.01)
+    with owned(tmp_path):
+        os.utime(tmp_path / LOCK, (1, 1))
+        patience = time.monotonic() + 5
+        while (tmp_path / LOCK).stat().st_mtime == 1 and time.monotonic() < patience:
+            time.sleep(0.01)
+        assert (tmp_path / LOCK).stat().st_mtime > 1
+
+
+def test_what_killed_processes_left_in_the_temporary_folder_is_swept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    code = (
+        "import sys, tempfile\ntempfile.tempdir = sys.argv[1]\nfrom unjam.processes import PrivateFolder\n"
+        "folder = PrivateFolder()\nprint(folder.name, flush=True)\nsys.stdin.read()\n"
+    )
+    started = [
+        subprocess.Popen(
+            [sys.executable, "-c", code, str(tmp_path)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        for _ in range(2)
+    ]
+    killed, alive = (Path(process.stdout.readline().strip()) for process in started if process.stdout)
+    mine = tmp_path / "unjam-results"  # of somebody who keeps results here
+    mine.mkdir()
+    (mine / LOCK).touch()
+    started[0].kill()
+    started[0].wait()
+    sweep_private_folders.__wrapped__()
+    assert killed.exists()  # it may be so new that nobody has had the time to hold it
+    for folder in (killed, alive, mine):
+        os.utime(folder, (1, 1))
+    sweep_private_folders.__wrapped__()
+    assert (killed.exists(), alive.exists(), mine.exists()) == (False, True, True)
+    started[1].communicate("")
+    assert not alive.exists()

@@ -20,6 +20,8 @@ def write_whole(path: Path, content: bytes | str) -> None:
     """
     data = content.encode() if isinstance(content, str) else content
     temporary = path.with_name(f".{path.name}.part")
+    if path.exists() and not path.is_file():
+        raise DiskError(f"cannot write {path}: it is no file")
     try:
         with open(temporary, "wb") as file:
             file.write(data)

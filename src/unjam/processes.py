@@ -2,19 +2,36 @@
 
 import ctypes
 import os
+import platform
+import shutil
+import signal
+import socket
 import sys
-from collections.abc import Iterator, Mapping
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from functools import cache
 from pathlib import Path
 
 from unjam.errors import InputError
+from unjam.sandbox import confine, limit
 
 PARENT = "UNJAM_PARENT"
 """the variable that tells a process by whose side it ends"""
 LOCK = ".lock"
 """the file that holds a folder for who writes it"""
+HEARTBEAT, MISSED = 10.0, 6
+"""seconds between two signs of life of a folder's owner, and how many it may miss"""
+PREFIX, HELD = "unjam-", ".temporary"
+"""what the names of private temporary folders begin with, and the file by which a process holds its own"""
 SIGNAL_OF_PARENTS_DEATH = 1
 """Linux's PR_SET_PDEATHSIG"""
+LARGEST_MEMORY = 8 * 2**30
+"""bytes that reading a file of others may take"""
+LONGEST_TIME = 600
+"""seconds that it may take"""
 
 
 def bound(environment: Mapping[str, str]) -> dict[str, str]:
@@ -38,6 +55,64 @@ def end_with_parent(signum: int) -> None:
         os.kill(os.getpid(), signum)
 
 
+def go_on_limited(what: str, *writable: Path) -> None:
+    """Go on in a child that reads `what` of others under limits; this process waits, and ends as that does.
+
+    It may write under `writable` alone, and has no network, where the kernel sees to it. On Windows nothing
+    changes.
+
+    Raises:
+        SystemExit: in this process, with the child's exit code.
+        InputError: in this process: the child took too much memory or time, or crashed.
+    """
+    if not hasattr(os, "fork"):
+        return
+    sys.stdout.flush()
+    sys.stderr.flush()
+    here = str(os.getpid())
+    child = os.fork()
+    if child == 0:
+        os.environ[PARENT] = here
+        end_with_parent(signal.SIGKILL)
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # this process is told too, and ends it
+        limit(LARGEST_MEMORY, LONGEST_TIME)
+        confine(*writable)
+        return
+    try:
+        code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+    except BaseException:
+        os.kill(child, signal.SIGKILL)
+        os.waitpid(child, 0)
+        raise
+    if code < 0:
+        how = f"{LARGEST_MEMORY / 2**30:g} GiB and {LONGEST_TIME:g} s: signal {-code}"
+        raise InputError(f"{what}: cannot be read within {how}")
+    sys.exit(code)
+
+
+def protections() -> list[str]:
+    """Return what the kernel does here for a process that reads files of others; tried in a child."""
+    if sys.platform != "linux":
+        return []
+    with tempfile.TemporaryDirectory() as folder:
+        child = os.fork()
+        if child == 0:
+            confine()
+            refused = [_refused(act) for act in (Path(folder, "file").touch, socket.socket)]
+            os._exit(sum(2**number for number, each in enumerate(refused) if each))
+        found = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+    names = ("disk read-only (Landlock)", "no network (seccomp)")
+    return [name for number, name in enumerate(names) if found >= 0 and found & 2**number]
+
+
+def _refused(act: Callable[[], object]) -> bool:
+    try:
+        act()
+    except PermissionError:
+        return True
+    return False
+
+
 def has_display() -> bool:
     """Return whether a process can open a window here."""
     return sys.platform in ("win32", "darwin") or bool(os.environ.get("DISPLAY"))
@@ -47,7 +122,8 @@ def has_display() -> bool:
 def owned(folder: Path) -> Iterator[None]:
     """Hold a folder that is there for this process alone; it is free again when the process ends, however.
 
-    On Windows, and where the file system has no locks, nothing is held.
+    Where machines share a folder but not its locks, the lock's age tells that an owner elsewhere still lives.
+    On Windows nothing is held.
 
     Raises:
         InputError: another process holds it.
@@ -57,12 +133,67 @@ def owned(folder: Path) -> Iterator[None]:
     while descriptor is not None and not _is_file(path, descriptor):  # its owner removed it just now
         os.close(descriptor)
         descriptor = _locked(path)
-    try:
+    if descriptor is None:
         yield
-    finally:
-        if descriptor is not None:
+        return
+    ended = threading.Event()
+    try:
+        _refuse_other_machine(path, descriptor)
+        os.pwrite(descriptor, f"{platform.node()} {os.getpid()}\n".ljust(300).encode(), 0)
+        beats = threading.Thread(target=_beat, args=(descriptor, ended), daemon=True)
+        beats.start()
+        try:
+            yield
+        finally:
+            ended.set()
+            beats.join()
             path.unlink(missing_ok=True)
-            os.close(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _beat(descriptor: int, ended: threading.Event) -> None:
+    while not ended.wait(HEARTBEAT):
+        with suppress(OSError):  # a disk that is away for a while
+            os.utime(descriptor)
+
+
+def _refuse_other_machine(path: Path, descriptor: int) -> None:
+    """Raise `InputError` where a process of another machine has held a lock until just now."""
+    owner = os.pread(descriptor, 300, 0).decode(errors="replace").split()
+    age = time.time() - os.fstat(descriptor).st_mtime
+    if owner and owner[0] != platform.node() and age < MISSED * HEARTBEAT:
+        held = f"run: {str(path.parent)!r} is being written on {owner[0]}"
+        raise InputError(f"{held}; allowed: one at a time, or {MISSED * HEARTBEAT:g} s after its end")
+
+
+class PrivateFolder(tempfile.TemporaryDirectory[str]):
+    """A temporary folder that a later process removes where this one was killed."""
+
+    def __init__(self) -> None:
+        """Make it, and hold it."""
+        super().__init__(prefix=PREFIX)
+        self._held = _locked(Path(self.name, HELD))
+
+    def cleanup(self) -> None:
+        """Remove it."""
+        super().cleanup()
+        if self._held is not None:
+            os.close(self._held)
+            self._held = None
+
+
+@cache
+def sweep_private_folders() -> None:
+    """Remove this user's private folders whose processes were killed, once in a process."""
+    for folder in Path(tempfile.gettempdir()).glob(f"{PREFIX}*"):
+        with suppress(OSError, AttributeError, InputError):  # Windows has no users; somebody holds it
+            found = folder.lstat()
+            if found.st_uid != os.getuid() or time.time() - found.st_mtime < MISSED * HEARTBEAT:
+                continue
+            if (folder / HELD).is_file() and (descriptor := _locked(folder / HELD)) is not None:
+                shutil.rmtree(folder, ignore_errors=True)
+                os.close(descriptor)
 
 
 def is_owned(folder: Path) -> bool:
@@ -91,9 +222,8 @@ def _locked(path: Path) -> int | None:
         os.close(descriptor)
         held = f"run: {str(path.parent)!r} is being written by another process"
         raise InputError(f"{held}; allowed: one at a time") from None
-    except OSError:
-        os.close(descriptor)
-        return None
+    except OSError:  # a file system without locks
+        pass
     return descriptor
 
 

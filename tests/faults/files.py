@@ -1,19 +1,26 @@
 """Faults in what is read and written: checkpoints, controllers, configurations, the disk."""
 
+import json
 import resource
+import shutil
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 
 from tests.controller.test_verify import HELD, content_of, mutated
 from tests.faults.outcome import Outcome, one_line
+from tests.pictures import empty_pictures
 from unjam.controller import controller_bytes, load_controller
 from unjam.controller.verify import verify_controller
 from unjam.errors import DiskError, InputError
+from unjam.reports.html import write_report
 from unjam.training.config import load_config, to_toml
+from unjam.training.evaluate import drive
 from unjam.training.folder import STATE, TENSORS, load_checkpoint, save_checkpoint
+from unjam.training.runs import list_runs
 
 MUTATIONS = ("change", "cut", "insert", "double", "swap")
 LONGEST = 2.0
@@ -125,6 +132,61 @@ def configurations(count: int, folder: Path, generator: np.random.Generator) -> 
     assert slowest < LONGEST
     outcome.facts["slowest [s]"] = round(slowest, 3)
     return outcome
+
+
+def results(count: int, folder: Path, generator: np.random.Generator) -> Outcome:
+    """Damage a folder of results, and ask for its report and for all runs."""
+    outcome, whole = Outcome(), folder / "whole"
+    drive("ring", "pi", 1, road={"horizon": 20, "warmup": 0}, workers=1, out=whole)
+    (whole / "config.toml").write_text(to_toml(load_config()))
+    (whole / "progress.jsonl").write_text('{"iteration": 1, "actual_steps": 5}\n')
+    (whole / "manifest.json").write_text("{}")
+    for number in range(count):
+        place = folder / str(number)
+        shutil.copytree(whole, place)
+        files = sorted(path for path in place.iterdir() if path.is_file())
+        part = files[int(generator.integers(len(files)))]
+        kind = generator.choice(
+            ["bytes", "value", "value", "value", "empty", "missing", "a folder", "nested"]
+        )
+        if kind == "value" and part.suffix == ".json":
+            part.write_text(with_junk(json.loads(part.read_text()), generator))
+        elif kind in ("bytes", "value"):
+            part.write_bytes(any_mutation(part.read_bytes(), generator))
+        elif kind == "nested":
+            part.write_text("[" * 100_000)
+        else:
+            part.unlink()
+            if kind != "missing":
+                part.mkdir() if kind == "a folder" else part.touch()
+        happened = "the report was written"
+        for ask in (lambda at: write_report([at], at / "page.html"), list_runs):
+            try:
+                with empty_pictures():
+                    ask(place)
+            except InputError as error:
+                one_line(error)
+                happened = "refused in one line"
+        outcome.happened[happened] += 1
+        shutil.rmtree(place)
+    return outcome
+
+
+def with_junk(document: Any, generator: np.random.Generator) -> str:
+    """Return JSON in which something is gone, or is something else."""
+    place = document
+    while isinstance(place, dict | list) and place:
+        keys = list(place) if isinstance(place, dict) else range(len(place))
+        key = keys[int(generator.integers(len(keys)))]
+        if generator.random() < 0.4 or not isinstance(place[key], dict | list) or not place[key]:
+            if generator.random() < 0.3:
+                del place[key]
+            else:
+                junk = (None, {}, [], 5, "x", True, -1, 1e308, [[]])
+                place[key] = junk[int(generator.integers(len(junk)))]
+            break
+        place = place[key]
+    return json.dumps(document)
 
 
 def full_disks(count: int, folder: Path, generator: np.random.Generator) -> Outcome:

@@ -126,6 +126,13 @@ def test_a_line_of_progress_cut_short_is_left_out(tmp_path: Path) -> None:
     assert [row["iteration"] for row in read_progress(tmp_path)] == [1, 2]
 
 
+def test_a_damaged_line_of_progress_drops_no_other(tmp_path: Path) -> None:
+    lines = [json.dumps({"iteration": number}).encode() for number in (1, 2, 3, 4, 5)]
+    lines[1:4] = [b'{"iteration": 2', b"\xff\xfe", b"[4]"]
+    (tmp_path / "progress.jsonl").write_bytes(b"\n".join(lines))
+    assert [row["iteration"] for row in read_progress(tmp_path)] == [1, 5]
+
+
 def test_no_progress_is_no_rows(tmp_path: Path) -> None:
     assert read_progress(tmp_path) == []
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from tests.sumo_files.test_sumo_files import NETWORK, ROUTES, configuration
-from unjam import sumo_files
+from unjam import sandbox, sumo_files
 from unjam.errors import InputError
 from unjam.sumo_files import program as reader
 from unjam.sumo_files import read_lanes, read_sumo_files
@@ -68,9 +68,9 @@ def test_a_reader_that_is_lost_is_told(tmp_path: Path, monkeypatch: pytest.Monke
 
 
 def test_it_needs_pythons_own_library_alone(tmp_path: Path) -> None:
-    program = [sys.executable, "-I", "-S", str(sumo_files.PROGRAM), "configuration"]
+    program = [sys.executable, "-I", "-S", sandbox.__file__, str(2**30), "60", "", str(sumo_files.PROGRAM)]
     ran = subprocess.run(
-        [*program, str(2**30), "60", str(configuration(tmp_path))], capture_output=True, check=True
+        [*program, "configuration", str(configuration(tmp_path))], capture_output=True, check=True
     )
     assert json.loads(ran.stdout)["found"]["used_types"] == ["car"]
 
@@ -90,12 +90,9 @@ def test_lanes_that_are_none_are_refused(lane: str, tmp_path: Path) -> None:
         read_lanes(path)
 
 
-def test_in_this_process_it_answers_the_same(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(sys.modules, "resource", None)  # where there are no limits
+def test_in_this_process_it_answers_the_same(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = configuration(tmp_path, routes=ROUTES)
-    reader.main("configuration", "0", "0", str(path))
+    reader.main("configuration", str(path))
     assert json.loads(capsys.readouterr().out)["found"]["network"] == str(tmp_path / "road.net.xml")
-    reader.main("lanes", "0", "0", str(tmp_path / "none"))
+    reader.main("lanes", str(tmp_path / "none"))
     assert "cannot be read" in json.loads(capsys.readouterr().out)["broken"]

@@ -328,7 +328,9 @@ def test_version(unjam: Run) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("sign", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+@pytest.mark.parametrize(
+    ("sign", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)]
+)
 @pytest.mark.parametrize("road", ["ring", "figure-eight", "merge", "own-network"])
 def test_a_stopped_run_leaves_no_process_and_can_go_on(
     sign: signal.Signals, code: int, road: str, unjam: Run, tmp_path: Path

@@ -1,12 +1,19 @@
 """Wrong input: one clear line, the right exit code, and nothing half-written."""
 
+import os
 import resource
 import shutil
+import subprocess
 from pathlib import Path
 
+import numpy as np
 import pytest
+from safetensors.numpy import save
 
-from tests.system.conftest import Run
+from tests.controller.test_verify import HELD
+from tests.system.conftest import UNJAM, Run
+from unjam.controller import controller_bytes
+from unjam.controller.file import WEIGHTS
 
 SMALL = ["--length", "60", "--vehicles", "5", "--set", "horizon=60"]
 
@@ -121,6 +128,14 @@ WRONG: dict[str, tuple[str, list[str]]] = {
     "exporting Python code": ("is Python code", ["export mine.py:gentle --to mine.unjam"]),
     "verifying what is not there": ("does not exist", ["verify none.unjam"]),
     "verifying what is no controller": ("not a controller", ["verify torn.unjam"]),
+    "driver of a long name": ("is not a file", [f"drive ring --driver {'a' * 300}.py:x"]),
+    "configuration nested without end": ("not TOML", ["train ring --config nested.toml"]),
+    "configuration with a number too long": ("not TOML", ["train ring --config number.toml"]),
+    "number too long": ("steps: '999", [f"train ring --set steps={'9' * 5000}"]),
+    "expert with a NUL in its path": (r"'a\x00.py:x' is not allowed", ["train ring --config nul.toml"]),
+    "text that is not UTF-8": ("allowed: text in UTF-8", ["drive ring --driver pi --out a\udcff"]),
+    "weights that are complex": ("complex64", ["verify complex.unjam"]),
+    "weights that are booleans": ("bool", ["verify boolean.unjam"]),
     "film of an unknown kind": (".gif, .webp, .mp4", ["watch ring --driver pi --video film.avi"]),
 }
 
@@ -140,6 +155,11 @@ def files(tmp_path: Path, my_drivers: Path) -> None:
             f'<configuration><net-file value="{name}.net.xml"/><route-files value="{name}.rou.xml"/>'
             "</configuration>"
         )
+    (tmp_path / "nested.toml").write_text("a = " + "[" * 100_000)
+    (tmp_path / "number.toml").write_text("steps = " + "9" * 5000)
+    (tmp_path / "nul.toml").write_text('expert = "a\\u0000.py:x"')
+    for name, kind in {"complex": np.complex64, "boolean": np.bool_}.items():
+        (tmp_path / f"{name}.unjam").write_bytes(with_weights_of(kind))
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "precious.txt").write_text("keep me")
     (tmp_path / "model-free").mkdir()
@@ -159,6 +179,52 @@ def test_wrong_input_gets_one_line_and_exit_code_2(name: str, unjam: Run, tmp_pa
     assert ran.stdout == ""
     assert (tmp_path / "full" / "precious.txt").read_text() == "keep me"
     assert not list(tmp_path.rglob("*.part"))
+
+
+def with_weights_of(kind: type) -> bytes:
+    parts = {WEIGHTS: save({name: array.astype(kind) for name, array in HELD.arrays().items()})}
+    return controller_bytes(HELD, {}, parts)
+
+
+def test_special_files_are_not_written_to(unjam: Run, tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe.html")
+    assert unjam("drive", "ring", "--driver", "pi", *SMALL, "--out", "new", pictures=False).returncode == 0
+    ran = unjam("report", "new", "--out", "pipe.html", pictures=False)
+    assert ran.returncode == 74
+    assert one_line(ran.stderr)
+    assert (tmp_path / "pipe.html").is_fifo()
+
+
+def test_names_with_brackets_and_dollars_are_shown_as_they_are(unjam: Run) -> None:
+    out = "x$HOME[b][bold]"
+    ran = unjam("drive", "ring", "--driver", "pi", *SMALL, "--out", out, pictures=False)
+    assert (ran.returncode, f"report: {out}/report.html" in ran.stderr) == (0, True), ran.stderr
+    train = ["train", "ring", "--config", f"{out}.toml"]
+    assert f"config file {out}.toml" in unjam(*train).stderr
+    assert out in unjam("runs", "--under", out).stderr
+
+
+def test_the_densest_ring_is_driven(unjam: Run) -> None:
+    dense = ["--vehicles", "22", "--length", "154", "--set", "horizon=5", "--no-report"]
+    ran = unjam("drive", "ring", "--driver", "pi", *dense, "--json")
+    assert ran.returncode == 0, ran.stderr
+
+
+def test_a_closed_standard_output_is_no_error(unjam: Run, tmp_path: Path) -> None:
+    script = tmp_path / "closed.sh"
+    script.write_text(f"{UNJAM} scenarios >&-\n")
+    ran = subprocess.run(["sh", script], capture_output=True, text=True, cwd=tmp_path, check=False)
+    assert (ran.returncode, ran.stderr) == (0, "")
+
+
+def test_few_file_descriptors_are_told_in_one_line(unjam: Run) -> None:
+    def few() -> None:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (16, 16))
+
+    ran = unjam("drive", "ring", "--driver", "pi", *SMALL, "--workers", "4", "-n", "4", preexec_fn=few)
+    assert ran.returncode == 2
+    assert one_line(ran.stderr), ran.stderr
+    assert "Too many open files" in ran.stderr
 
 
 def one_line(stderr: str) -> bool:

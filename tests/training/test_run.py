@@ -239,8 +239,9 @@ def test_validating_at_the_end_of_a_smaller_budget_does_not_change_what_is_learn
     learn(folder, replace(longer, steps=3 * STEPS))
     learn(folder, longer, resume=True)
     learn(tmp_path / "one go", longer)
-    ((_, found, *_), (_, expected, *_)) = outcome(folder), outcome(tmp_path / "one go")
+    (_, found, controller, _), (_, expected, other, _) = outcome(folder), outcome(tmp_path / "one go")
     assert found == expected
+    assert controller == other
 
 
 def test_a_run_killed_before_its_first_checkpoint_starts_again(

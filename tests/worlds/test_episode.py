@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from tests.conftest import random_network
+from tests.worlds.sumo.own_roads import straight
 from tests.worlds.test_record import fingerprint
 from unjam.drivers import (
     IDM,
@@ -22,7 +23,7 @@ from unjam.drivers.from_file import FileDriver
 from unjam.drivers.observation import local_vector
 from unjam.drivers.safety import SafetyFilter
 from unjam.errors import EpisodeError, InputError
-from unjam.scenarios import Ring
+from unjam.scenarios import Ring, make_scenario
 from unjam.worlds.episode import run_episode
 from unjam.worlds.sumo.simulation import Simulation
 
@@ -366,3 +367,31 @@ def test_a_trajectory_begins_with_what_its_expert_remembered_of_the_warmup(simul
         seen = trajectory.states.at(slice(step, step + 1))
         expert, memory = driver.expert.act(seen, memory)
         assert np.clip(expert[0], -1.0, 1.0) == pytest.approx(trajectory.expert[step], abs=1e-12)
+
+
+def insists(state: LocalState) -> np.ndarray:
+    """Drives as it would, and takes two from all that it is shown, by force where it must."""
+    wanted = np.clip(0.5 * np.subtract(state.leader_speed, state.speed), -1, 1)
+    for values in filter(lambda each: each is not None, state):
+        with pytest.raises(ValueError, match="read-only"):
+            values -= 2.0
+        values.flags.writeable = True
+        values -= 2.0
+    return wanted
+
+
+@pytest.mark.parametrize("road", ["ring", "figure-eight", "merge", "on-ramp", "own"])
+def test_a_driver_cannot_change_how_it_is_measured(road: str, simulation: Simulation, tmp_path: Path) -> None:
+    if road == "own":
+        flow = '<flow id="f" type="car" route="along" begin="0" end="60" period="3"/>'
+        road = str(straight(tmp_path, flow, length=300.0))
+    closed = road in ("ring", "figure-eight")
+    share = {"cavs": 2, "warmup": 0} if closed else {"cav_share": 0.5}
+    scenario = make_scenario(road, {**share, "horizon": 30})
+
+    def honest(state: LocalState) -> np.ndarray:
+        return np.clip(0.5 * np.subtract(state.leader_speed, state.speed), -1, 1)
+
+    driven = [run_episode(scenario, driver, (0,), simulation=simulation) for driver in (honest, insists)]
+    assert driven[0].trajectories
+    assert fingerprint(driven[0]) == fingerprint(driven[1])

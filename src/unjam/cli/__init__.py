@@ -18,10 +18,10 @@ from unjam.cli.results import certify, evaluate, export, model, report, verify
 from unjam.cli.runs import runs
 from unjam.cli.train import reproduce, search, train
 from unjam.cli.tune import tune
-from unjam.errors import DISK_ERRNOS, UnjamError, disk_error
+from unjam.errors import DISK_ERRNOS, InputError, UnjamError, disk_error, wrong
 from unjam.processes import end_with_parent
 
-INTERRUPTED, TERMINATED = 130, 143
+INTERRUPTED = 130
 
 app = typer.Typer(
     name="unjam",
@@ -29,7 +29,7 @@ app = typer.Typer(
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     rich_markup_mode="markdown",
-    epilog="Exit codes: 0 done, 2 wrong input, 3 missing part, 74 disk, 130/143 stopped.",
+    epilog="Exit codes: 0 done, 2 wrong input, 3 missing part, 74 disk, 129/130/143 stopped.",
 )
 
 
@@ -57,33 +57,43 @@ app.add_typer(runs)
 
 
 class _Terminated(BaseException):
-    """The process was asked to end (SIGTERM)."""
+    """The process was asked to end (SIGTERM), or its terminal is gone (SIGHUP)."""
 
 
 def _terminate(signum: int, frame: FrameType | None) -> None:
-    raise _Terminated
+    raise _Terminated(signum)
 
 
 def main() -> None:
     """Run the command line; every error that a user can mend is one line and an exit code."""
-    signal.signal(signal.SIGTERM, _terminate)
+    for name in ("SIGTERM", "SIGHUP"):  # Windows has no SIGHUP, and under nohup nobody wants to be told
+        signum = getattr(signal, name, None)
+        if signum is not None and signal.getsignal(signum) != signal.SIG_IGN:
+            signal.signal(signum, _terminate)
     end_with_parent(signal.SIGTERM)
     sys.exit(_run())
 
 
 def _run() -> int:
     try:
+        for text in sys.argv[1:]:
+            if any("\ud800" <= letter <= "\udfff" for letter in text):  # bytes that are no letters
+                raise wrong("arguments", text, "text in UTF-8")
         return app(standalone_mode=False) or 0
     except UnjamError as error:
         return _say(str(error), error.exit_code)
     except OSError as error:
         if error.errno in DISK_ERRNOS:
             return _say(str(disk_error(error, error.filename or "output")), 74)
-        raise
+        return _say(f"{error.filename or 'system'}: {error.strerror or error}", InputError.exit_code)
+    except RecursionError:
+        return _say("input: it is nested too deep", InputError.exit_code)
+    except MemoryError:
+        return _say("memory: there is not enough for this", InputError.exit_code)
     except (KeyboardInterrupt, typer.Abort):
         return _say("interrupted", INTERRUPTED)
-    except _Terminated:
-        return _say("terminated", TERMINATED)
+    except _Terminated as ended:
+        return _say("terminated", 128 + ended.args[0])
     except Exception as error:
         if hasattr(error, "format_message"):  # what typer says of a wrong command line
             return _say(f"{error.format_message()}{_given(error)}", 2)  # pyright: ignore[reportAttributeAccessIssue]

@@ -10,11 +10,12 @@ from importlib.metadata import PackageNotFoundError, version
 from typing import Annotated
 
 import typer
+from rich.markup import escape
 
 from unjam.cli.options import JsonOption
 from unjam.cli.output import aside, console, new_table, print_json
 from unjam.errors import MissingPartError, UnjamError
-from unjam.processes import has_display
+from unjam.processes import has_display, protections
 
 RESULTS_SUMO = "1.28.0"
 """version of SUMO that all results of the documentation were made with"""
@@ -39,7 +40,7 @@ def doctor(json: JsonOption = False) -> None:
         for check in checks:
             wanting = "[red]missing[/red]" if check.needed else "[yellow]no[/yellow]     "
             mark = "[green]ok[/green]     " if check.ok else wanting
-            console.print(f"{mark} {check.name}: {check.found}")
+            console.print(f"{mark} {check.name}: {escape(check.found)}", markup=True)
             if not check.ok:
                 console.print(f"        {check.remedy}")
     if missing:
@@ -73,6 +74,7 @@ def check_health() -> list[Check]:
         _try("netconvert", lambda: sumo_program("netconvert"), sumo),
         *map(_package, ("torch", "stable-baselines3", "sb3-contrib")),
         _cache(),
+        _files_of_others(),
         Check("display", display, "there" if display else "none", no_display, needed=False),
         _video(),
         _try("an episode in a worker", _episode, "see the message; unjam drive ring --driver pi tells more"),
@@ -120,6 +122,13 @@ def _cache() -> Check:
         return Check("cache folder", False, found, "set UNJAM_CACHE to a folder of yours")
     found, ok = f"{folder}, {free:.0f} GiB free", os.access(folder, os.W_OK) and free > 0.1
     return Check("cache folder", ok, found, "free some space, or set UNJAM_CACHE")
+
+
+def _files_of_others() -> Check:
+    found = protections()
+    remedy = "Linux 5.13 or newer keeps them from writing and from the network, where no container forbids it"
+    words = ", ".join(["limits on memory and time" if os.name == "posix" else "no limits", *found])
+    return Check("reading files of others", len(found) == 2, words, remedy, needed=False)
 
 
 def _video() -> Check:

@@ -1,5 +1,6 @@
 """What the command line prints: tables for people, one JSON document for programs, progress on the side."""
 
+import os
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -28,9 +29,13 @@ NARROW = 18, 7
 WORDS_WIDTH = 22
 """columns of headings and verdicts: as wide as most numbers with their intervals"""
 
-console = Console(highlight=False, width=None if sys.stdout.isatty() else PIPE_WIDTH)
-aside = Console(stderr=True, highlight=False, width=None if sys.stderr.isatty() else PIPE_WIDTH)
-"""progress and messages: standard output is for results"""
+for name, way in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+    if getattr(sys, name) is None:  # it was closed: what goes there goes nowhere, not into the next file
+        setattr(sys, name, open(os.devnull, way))  # noqa: SIM115
+
+console = Console(highlight=False, markup=False, width=None if sys.stdout.isatty() else PIPE_WIDTH)
+aside = Console(stderr=True, highlight=False, markup=False, width=None if sys.stderr.isatty() else PIPE_WIDTH)
+"""progress and messages: standard output is for results; names with brackets stay as they are in both"""
 
 
 def print_json(document: Any) -> None:
@@ -64,7 +69,9 @@ def print_metrics(rows_by_driver: dict[str, list[dict[str, Any]]]) -> None:
         columns[label].append(number)  # nobody is compared without a baseline
 
     def of(chosen: Sequence[int], separator: str) -> Table:
-        table = new_table(("metric", "unit"), [fill(headings[number], WORDS_WIDTH) for number in chosen])
+        table = new_table(
+            ("metric", "unit"), [fill(escape(headings[number]), WORDS_WIDTH) for number in chosen]
+        )
         for column in table.columns[2:]:
             column.no_wrap = True
         if separator != " ":
@@ -86,7 +93,7 @@ def print_metrics(rows_by_driver: dict[str, list[dict[str, Any]]]) -> None:
         else:
             blocks[-1] = together
     for block in blocks:
-        console.print(of(block, separator))
+        console.print(of(block, separator), markup=True)
 
 
 def _marked(cell: "Cell", separator: str) -> str:

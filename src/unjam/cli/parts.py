@@ -34,8 +34,6 @@ def scenarios(
 
       unjam scenarios figure-eight --picture eight.png
     """
-    from rich.markup import escape
-
     from unjam.scenarios import SCENARIOS, make_scenario, scenario_recipe
 
     if picture is not None and (name is None or picture.suffix.lower() != ".png"):
@@ -60,10 +58,10 @@ def scenarios(
     if json:
         print_json({"name": name, "facts": dict(facts), "parameters": scenario_recipe(scenario)})
         return
-    console.print(f"[bold]{name}[/bold]")
+    console.print(name, style="bold")
     table = new_table()
     for fact in facts:
-        table.add_row(*map(escape, fact))
+        table.add_row(*fact)
     console.print(table)
     console.print(_parameter_table(parameter_rows(scenario), "parameter (--set key=value)"))
 
@@ -125,7 +123,7 @@ def drivers(json: JsonOption = False) -> None:
         print_json(listed)
         return
     for name, entry in listed.items():
-        console.print(f"[bold]{name}[/bold]  {entry['about']}")
+        console.print(f"[bold]{name}[/bold]  {entry['about']}", markup=True)
         rows = [row for row in entry["parameters"] if row["name"] != "time_step"]
         if rows:
             console.print(_parameter_table(rows, "parameter"))
@@ -168,8 +166,6 @@ def parameter_rows(instance: Any) -> list[dict[str, Any]]:
 
 
 def _parameter_table(rows: list[dict[str, Any]], title: str) -> Any:
-    from rich.markup import escape
-
     table = new_table((title, "default", "meaning"), style="dim")
     for row in rows:
         value = row["default"]
@@ -177,7 +173,7 @@ def _parameter_table(rows: list[dict[str, Any]], title: str) -> Any:
             value = ", ".join(
                 f"{key}={entry if isinstance(entry, bool) else f'{entry:g}'}" for key, entry in value.items()
             )
-        table.add_row(f"  {row['name']}", escape(str(value)), escape(" ".join(row["about"].split())))
+        table.add_row(f"  {row['name']}", str(value), " ".join(row["about"].split()))
     return table
 
 

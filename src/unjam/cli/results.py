@@ -1,5 +1,6 @@
 """What a run is worth: `unjam evaluate`, `unjam model`, `unjam report`; and shipped: `export`, `verify`."""
 
+from contextlib import nullcontext
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated
@@ -9,6 +10,8 @@ import typer
 from unjam.cli.options import DEFAULT_WORKERS, HumansOption, JsonOption, WorkersOption, scenario_changes
 from unjam.cli.output import aside, console, counting_steps, new_table, print_json, print_metrics
 from unjam.errors import InputError
+from unjam.files import make_folder
+from unjam.processes import go_on_limited, owned
 
 
 def evaluate(
@@ -53,10 +56,13 @@ def evaluate(
     if not (run / "controller.unjam").is_file():
         raise InputError(f"run: {str(run)!r} has no controller yet; go on with: unjam train --resume {run}")
     total = len(comparison(config, run, list(DRIVERS))) * episodes * config.make_scenario().horizon
-    with counting_steps("evaluating", total) as steps, Workers(workers) as pool:
-        found = judge(run, config, pool, list(DRIVERS), episodes, steps, out)
-    result = TrainResult(out or run, found.rows, gain_of(config, found.rows))
-    write_report([result.folder], result.report)
+    target = out or run
+    make_folder(target)
+    with owned(target):
+        with counting_steps("evaluating", total) as steps, Workers(workers) as pool:
+            found = judge(run, config, pool, list(DRIVERS), episodes, steps, out)
+        result = TrainResult(target, found.rows, gain_of(config, found.rows))
+        write_report([target], result.report)
     if json:
         gain, means = asdict(result.gain) if result.gain else None, found.means()
         drivers = [{"driver": one, "episodes": rows, "mean": means[one]} for one, rows in found.rows.items()]
@@ -120,10 +126,14 @@ def report(
 
       unjam report runs/ring-001 runs/ring-002 --out compared.html
     """
-    from unjam.reports.html import write_report
+    from matplotlib import get_cachedir
 
     target = out or (folders[0] / "report.html" if len(folders) == 1 else Path("comparison.html"))
-    written = write_report(folders, target)
+    go_on_limited(f"report: {', '.join(map(str, folders))}", target.absolute().parent, Path(get_cachedir()))
+    from unjam.reports.html import write_report
+
+    with owned(target.absolute().parent) if target.parent in folders else nullcontext():
+        written = write_report(folders, target)
     if json:
         print_json({"report": str(written), "folders": [str(folder) for folder in folders]})
     else:
@@ -226,6 +236,7 @@ def verify(
     """
     from rich.markup import escape
 
+    go_on_limited(f"controller: {str(file)!r}")
     from unjam.controller.verify import verify_controller
 
     verified = verify_controller(file, trust_code)
@@ -233,4 +244,4 @@ def verify(
         print_json({"file": str(file), "ok": True, "verified": {each.name: each.found for each in verified}})
         return
     for each in verified:
-        console.print(f"[green]ok[/green] {each.name}: {escape(each.found)}")
+        console.print(f"[green]ok[/green] {each.name}: {escape(each.found)}", markup=True)

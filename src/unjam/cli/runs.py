@@ -66,7 +66,7 @@ def list_them(
 def _gain_words(gain: Any) -> str:
     from unjam.measures.statistics import signed
 
-    return signed(gain).replace("[", "\\[") if gain else "–"
+    return signed(gain) if gain else "–"
 
 
 @runs.command()
@@ -77,8 +77,6 @@ def compare(names: NamesArgument, under: UnderOption = RUNS, json: JsonOption = 
 
       unjam runs compare ring-001 ring-002
     """
-    from rich.markup import escape
-
     from unjam.training.runs import differences
 
     if len(names) < 2:
@@ -96,7 +94,7 @@ def compare(names: NamesArgument, under: UnderOption = RUNS, json: JsonOption = 
         label = f"beyond the expert, {road}" if road else "beyond the expert"
         table.add_row(label, *(_gain_words(run.gains.get(road)) for run in found))
     for name, values in settings.items():
-        table.add_row(escape(name), *("–" if value is None else escape(str(value)) for value in values))
+        table.add_row(name, *("–" if value is None else str(value) for value in values))
     console.print(table)
     if not settings:
         console.print("their settings are the same")

@@ -5,11 +5,12 @@ remembers, how its driver is made), weights in safetensors and, where it was exp
 and an ONNX graph. Nothing in it is ever executed.
 """
 
+import os
 import re
 from importlib.resources import files
 from pathlib import Path
 
-from unjam.controller.file import SUFFIX, controller_bytes, load_controller
+from unjam.controller.file import SUFFIX, controller_bytes, hash_of, load_controller
 from unjam.drivers.driver import Driver
 from unjam.drivers.from_file import is_file_reference
 from unjam.drivers.registry import DRIVERS, named_driver
@@ -46,16 +47,26 @@ def make_driver(text: str, time_step: float) -> Driver:
     Raises:
         InputError: there is no such driver, or a parameter is wrong.
     """
-    path = Path(text)
-    parts = [] if path.exists() else _SEVERAL.split(text)
+    parts = [] if os.path.exists(text) else _SEVERAL.split(text)
     if len(parts) > 1:
         return Mixed(tuple(make_driver(part, time_step) for part in parts))
     if text.startswith(SHIPPED):
         return load_controller(shipped_file(text.removeprefix(SHIPPED)))
     named = text.partition(":")[0] in DRIVERS or is_file_reference(text)
-    if not named and (text.endswith(SUFFIX) or path.is_dir()):
-        return load_controller(path)
+    if not named and (text.endswith(SUFFIX) or os.path.isdir(text)):
+        return load_controller(text)
     return named_driver(text, time_step)
+
+
+def hash_of_controller(text: str) -> str | None:
+    """Return the SHA-256 of the controller's file that a driver's name stands for; None where it is none."""
+    path = Path(text)
+    if text.startswith(SHIPPED):
+        path = shipped_file(text.removeprefix(SHIPPED))
+    elif os.path.isdir(text):
+        path = path / f"controller{SUFFIX}"
+    is_one = path.suffix == SUFFIX and os.path.isfile(path)
+    return hash_of(path.read_bytes()) if is_one else None
 
 
 def shipped_names() -> list[str]:

@@ -1,6 +1,7 @@
 """What a controller is for: the road that it was trained on, and what it met there."""
 
 import json
+import os
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,7 @@ def controller_of(text: str, file: Path | None) -> Controller | None:
     """Return the controller that a driver's name stands for; None where it is none, or cannot be read."""
     path = file or Path(text)
     try:
-        return read_controller(path) if path.exists() and (file or not text.endswith(".py")) else None
+        return read_controller(path) if os.path.exists(path) and (file or not text.endswith(".py")) else None
     except InputError:
         return None
 

@@ -3,6 +3,7 @@
 import hashlib
 import io
 import json
+import os
 import stat
 import zipfile
 import zlib
@@ -99,7 +100,7 @@ def read_controller(path: Path | str, trust_code: bool = True) -> Controller:
     """
     path = Path(path)
     file = path / f"controller{SUFFIX}" if path.is_dir() else path
-    if not file.is_file():
+    if not os.path.isfile(file):
         raise InputError(f"controller: {str(file)!r} does not exist")
     try:
         parts = unpack_parts(file)

@@ -6,6 +6,7 @@ Such a file is code and is run as such: use only files that you trust.
 import hashlib
 import importlib.util
 import inspect
+import os
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -38,6 +39,8 @@ class FileReference:
     def of(cls, text: str) -> "FileReference":
         """Return what `path.py:name` refers to."""
         path, _, name = text.rpartition(":")
+        if "\0" in text:
+            raise InputError(f"driver file: {text!r} is not allowed; allowed: path.py:name")
         return cls(Path(path).resolve(), name)
 
     def __str__(self) -> str:
@@ -55,7 +58,7 @@ class FileReference:
             InputError: the file is missing or fails when run, or has no such name.
         """
         path = self.path
-        if not path.is_file():
+        if not os.path.isfile(path):
             raise InputError(f"driver file: {str(path)!r} is not a file")
         module_name = f"unjam_user_{path.stem}_{abs(hash(str(path))):x}"
         spec = importlib.util.spec_from_file_location(module_name, path)

@@ -54,6 +54,14 @@ class LocalState(NamedTuple):
         """Return the state of some rows or moments, as an array's `index` says."""
         return self.each(lambda values: values[index])
 
+    def read_only(self) -> "LocalState":
+        """Return a copy of arrays that cannot be changed; by force they can, and this one stays as it is."""
+        copy = self.each(lambda values: values.copy())
+        for values in copy:
+            if values is not None:
+                values.flags.writeable = False
+        return copy
+
 
 LARGEST_GAP = 100.0
 """The gap that stands for `nobody there` [m]."""

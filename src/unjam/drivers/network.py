@@ -131,6 +131,10 @@ def network_from_arrays(arrays: dict[str, Floats], authority: float, exploration
                 f"network layer {index}: {weight.shape[0]} inputs are not allowed; "
                 f"allowed: {layers[-1][0].shape[1]}, the outputs of the layer before"
             )
+        if not (np.issubdtype(weight.dtype, np.floating) and np.issubdtype(bias.dtype, np.floating)):
+            raise InputError(
+                f"network layer {index}: weights are {weight.dtype}, {bias.dtype}; allowed: floats"
+            )
         if not (np.isfinite(weight).all() and np.isfinite(bias).all()):
             raise InputError(f"network layer {index}: a weight is not finite")
         layers.append((np.asarray(weight, np.float64), np.asarray(bias, np.float64)))

@@ -112,12 +112,12 @@ def cav_mean_speed(episode: Episode) -> float:
 
 def speed_limit_ratio(episode: Episode) -> float:
     """Mean speed over the scenario's own limit; on the ring the IDM equilibrium speed of its length."""
-    return mean_speed(episode) / episode.limit_speed
+    return mean_speed(episode) / (episode.limit_speed or np.nan)
 
 
 def speed_limit_ratio_steady(episode: Episode) -> float:
     """Mean speed in the steady state over the scenario's own limit."""
-    return mean_speed_steady(episode) / episode.limit_speed
+    return mean_speed_steady(episode) / (episode.limit_speed or np.nan)
 
 
 def episode_return(episode: Episode) -> float:

@@ -28,7 +28,7 @@ from unjam.reports.figures import (
 )
 from unjam.reports.film import split_lines
 from unjam.reports.model import errors, examples, model_section, trust
-from unjam.reports.results import Results, Shown, command_to_repeat, read_results
+from unjam.reports.results import DAMAGED, Results, Shown, command_to_repeat, damaged, read_results
 from unjam.reports.story import (
     baseline_of_columns,
     cards_of,
@@ -55,7 +55,12 @@ def write_report(folders: Sequence[Path], target: Path) -> Path:
         DiskError: the page cannot be written, or there is no folder for it.
     """
     check_folder(target)
-    write_whole(target, render([read_results(folder) for folder in folders]))
+    results = [read_results(folder) for folder in folders]
+    try:
+        page = render(results)
+    except DAMAGED as error:
+        raise damaged(folders[0], error) from error
+    write_whole(target, page)
     return target
 
 

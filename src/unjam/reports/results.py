@@ -3,6 +3,7 @@
 import json
 import shlex
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -108,6 +109,13 @@ def unpacked(arrays: dict[str, Any]) -> dict[str, Any]:
     return {**arrays, **whole}
 
 
+DAMAGED = (
+    *(OSError, ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RecursionError),
+    SafetensorError,
+)
+"""what reading results can raise where they are not what unjam writes"""
+
+
 @dataclass(frozen=True)
 class Results:
     """The content of a run folder, or of one that `unjam drive` wrote."""
@@ -153,8 +161,13 @@ def read_results(folder: Path) -> Results:
             shown[entry["driver"]] = Shown(**_with_nan(entry), **pictured)
         config = _text(folder / "config.toml")
         return Results(folder, about, rows, shown, read_progress(folder), config, read_model(folder))
-    except (OSError, ValueError, LookupError, TypeError, AttributeError, SafetensorError) as error:
-        raise InputError(f"report: {str(folder)!r} cannot be read: {type(error).__name__}: {error}") from None
+    except DAMAGED as error:
+        raise damaged(folder, error) from None
+
+
+def damaged(folder: Path, error: Exception) -> InputError:
+    """Return the error for results that are not what unjam writes."""
+    return InputError(f"report: {str(folder)!r} cannot be read: {type(error).__name__}: {error}")
 
 
 def rows_by_driver(rows: list[dict[str, Any]]) -> dict[str, list[dict[str, Any]]]:
@@ -168,8 +181,11 @@ def rows_by_driver(rows: list[dict[str, Any]]) -> dict[str, list[dict[str, Any]]
 
 def read_about(folder: Path) -> tuple[dict[str, Any], dict[str, list[dict[str, Any]]]]:
     """Return what a folder of results is about, and its rows of metrics by driver."""
-    about = json.loads((folder / EVALUATION_FILE).read_text())
-    return about, rows_by_driver(about.pop("rows"))
+    try:
+        about = json.loads((folder / EVALUATION_FILE).read_text())
+        return about, rows_by_driver(about.pop("rows"))
+    except DAMAGED as error:
+        raise damaged(folder, error) from None
 
 
 def read_rows(folder: Path) -> dict[str, list[dict[str, Any]]]:
@@ -178,13 +194,12 @@ def read_rows(folder: Path) -> dict[str, list[dict[str, Any]]]:
 
 
 def read_progress(folder: Path) -> list[dict[str, Any]]:
-    """Return the rows of a run's progress; a last line cut short by a crash is left out."""
+    """Return the rows of a run's progress; one that is damaged, or cut short by a crash, is left out."""
     rows = []
     for line in _text(folder / "progress.jsonl").splitlines():
-        try:
-            rows.append(json.loads(line))
-        except ValueError:
-            break
+        with suppress(ValueError, RecursionError):
+            if isinstance(row := json.loads(line), dict) and "iteration" in row:
+                rows.append(row)
     return rows
 
 
@@ -208,7 +223,7 @@ def read_model(folder: Path) -> dict[str, Any] | None:
     """Return what a run's `model.json` says; None where there is none, or none that can be read."""
     try:
         found = json.loads(_text(folder / MODEL_FILE))
-    except ValueError:
+    except (ValueError, RecursionError):
         return None
     return found if isinstance(found, dict) else None
 
@@ -220,7 +235,7 @@ def command_to_repeat(results: Results) -> str:
 
 
 def _text(path: Path) -> str:
-    return path.read_text() if path.exists() else ""
+    return path.read_text(errors="replace") if path.is_file() else ""
 
 
 def _with_nan(entry: dict[str, Any]) -> dict[str, Any]:

@@ -1,7 +1,7 @@
 """What the user's own SUMO files say, read before SUMO starts: SUMO crashes on some that are broken.
 
 Such files may come from anywhere. So that none can harm who asks, `program.py` reads them in a process of its
-own with limits on memory and time, and answers one JSON document. What SUMO would write, and where it would
+own that `unjam.sandbox` limits, and answers one JSON document. What SUMO would write, and where it would
 listen, is never passed on to it: see `copy_harmless`.
 """
 
@@ -11,6 +11,7 @@ import sys
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
+from unjam import sandbox
 from unjam.errors import InputError
 from unjam.sumo_files.options import is_missed, is_passed
 
@@ -105,7 +106,8 @@ def stamp_of(file: Path) -> tuple[int, int]:
 
 def _ask(command: Literal["configuration", "lanes", "copy"], path: Path, *more: Path) -> Any:
     """Return what the program answers; raise `InputError` where it says what is wrong, or is lost."""
-    program = [sys.executable, "-I", "-S", str(PROGRAM), command, str(LARGEST_MEMORY), str(LONGEST_TIME)]
+    limits = [str(LARGEST_MEMORY), str(LONGEST_TIME), str(more[0].parent) if more else ""]
+    program = [sys.executable, "-I", "-S", sandbox.__file__, *limits, str(PROGRAM), command]
     try:
         done = subprocess.run(
             [*program, str(path), *map(str, more)], capture_output=True, timeout=LONGEST_TIME, check=False

@@ -1,4 +1,4 @@
-"""The program that reads users' own SUMO files: in a process of its own, with limits on memory and time.
+"""The program that reads users' own SUMO files: in a process of its own, limited by `unjam.sandbox`.
 
 It answers one JSON document, uses Python's own library alone, and starts in a twentieth of a second.
 """
@@ -307,13 +307,8 @@ def _open(path: Path) -> IO[bytes]:
 COMMANDS: dict[str, Callable[..., Any]] = {"configuration": _configuration, "lanes": _lanes, "copy": _copy}
 
 
-def main(command: str, memory: str, seconds: str, *paths: str) -> None:
-    """Print what a file says, or what is wrong with it, under limits on memory [bytes] and time [s]."""
-    with suppress(ImportError):  # not on Windows
-        import resource
-
-        resource.setrlimit(resource.RLIMIT_AS, (int(memory), int(memory)))
-        resource.setrlimit(resource.RLIMIT_CPU, (int(seconds), int(seconds)))
+def main(command: str, *paths: str) -> None:
+    """Print what a file says, or what is wrong with it."""
     try:
         found = {"found": COMMANDS[command](*map(Path, paths))}
     except Broken as error:

@@ -24,6 +24,7 @@ from unjam.processes import LOCK
 from unjam.reports.results import read_progress
 from unjam.scenarios import scenario_recipe
 from unjam.scenarios.scenario import Scenario
+from unjam.training.belonging import check_belongs
 from unjam.training.config import RunConfig, load_config, to_toml
 from unjam.worlds.reward import make_reward
 
@@ -109,6 +110,17 @@ def continue_folder(folder: Path, config: RunConfig) -> None:
         write_whole(folder / MANIFEST, to_json(manifest(), indent=1))
 
 
+def note_lineage(folder: Path, iteration: int) -> None:
+    """Add to a run's manifest by what it goes on, and after which iteration."""
+    path = folder / MANIFEST
+    try:
+        made = json.loads(path.read_text())
+        lineage = [*made.get("lineage", []), {"iteration": iteration, **manifest()}]
+    except (ValueError, AttributeError, TypeError) as error:
+        raise InputError(f"run: {path} cannot be read: {error}") from None
+    write_whole(path, to_json({**made, "lineage": lineage}, indent=1))
+
+
 def origin(scenario: Scenario, expert: Driver) -> dict[str, Any]:
     """Return where a controller comes from, for its own manifest: the same for the same run."""
     return {
@@ -133,13 +145,20 @@ def save_checkpoint(folder: Path, state: dict[str, Any], tensors: "Tensors") -> 
     _sweep(folder)
 
 
-def last_state(folder: Path, places: Iterable[Path]) -> "tuple[dict[str, Any], Tensors] | None":
+def last_state(
+    folder: Path, places: Iterable[Path], belongs: dict[str, Any] | None = None
+) -> "tuple[dict[str, Any], Tensors] | None":
     """Return the newest checkpoint of a run; None where it begins, or begins anew.
 
     What the checkpoint does not know is removed: rows of progress in any of `places`, which will be made
     again, and files that were not written to their end.
+
+    Raises:
+        InputError: none is whole, or it does not belong to what would go on with it, `belongs`.
     """
     found = load_checkpoint(folder / "checkpoint")
+    if found and belongs and "belongs" in found[0]:
+        check_belongs(found[0]["belongs"], belongs)
     _sweep(folder / "checkpoint")
     for left in [path for place in places for path in place.glob(".*") if is_leftover(path)]:
         left.unlink()

@@ -75,7 +75,8 @@ def measure_model(folder: Path, config: RunConfig) -> dict[str, Any]:
         InputError: the run has no checkpoint yet.
     """
     checkpoint = load_checkpoint(folder / "checkpoint")
-    if checkpoint is None:
+    progress = read_progress(folder)
+    if checkpoint is None or not progress:
         raise InputError(
             f"run: {str(folder)!r} has no checkpoint yet; go on with: unjam train --resume {folder}"
         )
@@ -87,7 +88,7 @@ def measure_model(folder: Path, config: RunConfig) -> dict[str, Any]:
     imagination.restore(state[imagination.name], under(f"{imagination.name}/", tensors))
     scenario = imagination.scenario
     generator = np.random.default_rng(config.seed)
-    newest = read_progress(folder)[-1]
+    newest = progress[-1]
     actual = imagination.data.transitions(settings.holdout)
     held_out = actual.chosen(generator.permutation(np.flatnonzero(actual.held_out))[:ROWS])
     errors = one_step_errors(imagination.model, held_out, scenario, config.reward)

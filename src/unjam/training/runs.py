@@ -11,7 +11,7 @@ from unjam.errors import InputError, UnjamError
 from unjam.measures.statistics import Estimate, paired_difference
 from unjam.parameters import flat
 from unjam.processes import is_owned, owned
-from unjam.reports.results import EVALUATION_FILE, read_about, read_progress
+from unjam.reports.results import DAMAGED, EVALUATION_FILE, damaged, read_about, read_progress
 from unjam.training.config import RunConfig
 from unjam.training.folder import MANIFEST, read_config
 
@@ -77,8 +77,11 @@ def read_run(folder: Path, name: str = "") -> Run:
     config, progress = read_config(folder), read_progress(folder)
     if not (folder / MANIFEST).is_file():
         raise InputError(f"run: {str(folder)!r} is not a run folder: it has no {MANIFEST}")
-    steps = progress[-1]["actual_steps"] if progress else 0
-    gains = {road: _gain(folder / road) for road in config.roads()}
+    try:
+        steps = int(progress[-1]["actual_steps"]) if progress else 0
+        gains = {road: _gain(folder / road) for road in config.roads()}
+    except DAMAGED as error:
+        raise damaged(folder, error) from None
     judged = all((folder / road / EVALUATION_FILE).is_file() for road in gains)
     done: State = "finished" if judged and steps >= config.steps else "stopped"
     return Run(name or str(folder), folder, config, "running" if is_owned(folder) else done, steps, gains)

@@ -21,7 +21,9 @@ from unjam.measures.metrics import measure
 from unjam.measures.statistics import Estimate, paired_difference
 from unjam.processes import owned
 from unjam.reports.html import write_report
+from unjam.training.belonging import belonging
 from unjam.training.config import RunConfig, to_toml
+from unjam.training.controllers import KeptControllers
 from unjam.training.evaluate import TRAINED, Progress, Rows, judge, raise_failure
 from unjam.training.executors import OnIteration, train_apart
 from unjam.training.folder import (
@@ -30,6 +32,7 @@ from unjam.training.folder import (
     continue_folder,
     last_state,
     make_new_folder,
+    note_lineage,
     origin,
     read_config,
     save_checkpoint,
@@ -194,12 +197,16 @@ class Trainer:
         self._shares = [task.weight / total for task in self.tasks]
         self._validation_best = -np.inf
         self._expert_returns = [float("nan")] * len(self.tasks)
-        checkpoint = last_state(folder, {folder, *self.folders})
+        self._controllers = KeptControllers(self.folders)
+        self._belongs = belonging(config)
+        checkpoint = last_state(folder, {folder, *self.folders}, self._belongs)
         if checkpoint is not None:
             state, tensors = checkpoint
+            self._controllers.restore(tensors, state["actual_steps"] >= config.steps)
             self.training.restore(state, tensors)
             self._validation_best = state["validation_best"]
             self._expert_returns = state["expert_returns"]
+            note_lineage(folder, state["iteration"])
 
     def train(self) -> None:
         """Learn until the configured number of actual steps; a stop loses at most the running iteration."""
@@ -209,7 +216,7 @@ class Trainer:
                 write_whole(place / "config.toml", to_toml(road))
         if self.training.iteration == 0:
             self._expert_returns = self.returns_of([task.expert for task in self.tasks])
-            self._keep_controllers(self.training.learner.network())
+            self._keep_controllers(self.training.learner.network(), best=True)
             self._validation_best = self._mean(self._expert_returns)
         algorithm_1(self.training, self.config.steps, self.collect, self.validate, self.write)
 
@@ -227,13 +234,15 @@ class Trainer:
         started, found = time.perf_counter(), None
         network, every = self.training.learner.network(), self.config.evaluation.every
         last = iteration.actual_steps >= self.config.steps
-        if every and (iteration.number % every == 0 or last):
+        scheduled = every > 0 and iteration.number % every == 0
+        if scheduled or (every and last):
             found = self.returns_of(self.drivers(network))
             if self._mean(found) > self._validation_best:
-                self._validation_best = self._mean(found)
-                self._keep_controllers(network)
-        elif not every and last:
-            self._keep_controllers(network)
+                self._keep_controllers(network, scheduled)
+                if scheduled:  # a longer run would not have looked here, and may go on from this checkpoint
+                    self._validation_best = self._mean(found)
+        elif last:
+            self._keep_controllers(network, best=False)
         iteration.seconds["validation"] = time.perf_counter() - started
         return found
 
@@ -259,10 +268,11 @@ class Trainer:
         counters, tensors = self.training.state()
         state = {
             **counters,
+            "belongs": self._belongs,
             "validation_best": self._validation_best,
             "expert_returns": self._expert_returns,
         }
-        save_checkpoint(self.folder / "checkpoint", state, tensors)
+        save_checkpoint(self.folder / "checkpoint", state, {**tensors, **self._controllers.tensors()})
         self._on_iteration(whole)
 
     def returns_of(self, drivers: Sequence[Driver]) -> list[float]:
@@ -310,8 +320,10 @@ class Trainer:
             "seconds": iteration.seconds,
         }
 
-    def _keep_controllers(self, network: Network) -> None:
+    def _keep_controllers(self, network: Network, best: bool) -> None:
         done = {"iteration": self.training.iteration, "actual_steps": self.training.actual_steps}
-        for place, task, driver in zip(self.folders, self.tasks, self.drivers(network), strict=True):
-            about = {**origin(task.scenario, task.expert), **done}
-            write_whole(place / "controller.unjam", controller_bytes(driver, about))
+        contents = [
+            controller_bytes(driver, {**origin(task.scenario, task.expert), **done})
+            for task, driver in zip(self.tasks, self.drivers(network), strict=True)
+        ]
+        self._controllers.keep(contents, best)

@@ -11,8 +11,10 @@ import os
 import signal
 import struct
 import sys
+import tempfile
 import time
-from contextlib import suppress
+from functools import cache
+from pathlib import Path
 from typing import IO, Any, BinaryIO
 
 import numpy as np
@@ -21,6 +23,7 @@ from safetensors.numpy import load, save
 from unjam.drivers.registry import driver_from_recipe
 from unjam.errors import DISK_ERRNOS, UnjamError, disk_error
 from unjam.processes import end_with_parent
+from unjam.sandbox import confine, limit
 from unjam.scenarios import scenario_from_recipe
 from unjam.scenarios.own_network import OwnNetwork
 from unjam.tree import Arrays, pack
@@ -88,13 +91,11 @@ def main() -> None:
             simulation.close()
 
 
-def _limit_memory() -> None:
-    """Make a file that would fill the machine's memory end this process alone; not possible on Windows."""
-    with suppress(ImportError):
-        import resource
-
-        _, most = resource.getrlimit(resource.RLIMIT_AS)
-        resource.setrlimit(resource.RLIMIT_AS, (NETWORK_MEMORY, most))
+@cache
+def _confine() -> None:
+    """Let a file that would fill the memory end this process alone, which writes only into its own folder."""
+    limit(NETWORK_MEMORY)
+    confine(Path(tempfile.gettempdir()))
 
 
 def _known(error: Exception) -> Exception:
@@ -118,7 +119,7 @@ def _run(facts: dict[str, Any], arrays: Arrays, simulation: Simulation, answers:
 
     scenario = scenario_from_recipe(facts["scenario"])
     if isinstance(scenario, OwnNetwork):
-        _limit_memory()
+        _confine()
     driver = driver_from_recipe(facts["driver"], arrays)
     how = {name: facts[name] for name in ("seed", "reward", "explore", "full")}
     return run_episode(scenario, driver, **how, simulation=simulation, progress=progress)

@@ -14,8 +14,9 @@ from typing import Any, Self, TypeVar
 from unjam.drivers.driver import Driver
 from unjam.drivers.registry import recipe_of
 from unjam.errors import EpisodeError
-from unjam.processes import bound
+from unjam.processes import PrivateFolder, bound, sweep_private_folders
 from unjam.scenarios import scenario_recipe
+from unjam.scenarios.own_network import OwnNetwork
 from unjam.scenarios.scenario import Scenario
 from unjam.tree import Arrays, unpack
 from unjam.worlds.record import Episode, failed_episode
@@ -59,7 +60,8 @@ class Workers:
         """Prepare `count` workers; nothing is started yet."""
         self.count, self._attempts = count, attempts
         # Of all workers, so that nothing stays behind of one that was killed.
-        self._temporary = tempfile.TemporaryDirectory(prefix="unjam-")
+        sweep_private_folders()
+        self._temporary = PrivateFolder()
         self._idle: queue.SimpleQueue[_Worker] = queue.SimpleQueue()
         self._all = [_Worker(silence, self._temporary.name) for _ in range(count)]
         self._threads = ThreadPoolExecutor(count, thread_name_prefix="unjam-worker")
@@ -104,6 +106,7 @@ class Workers:
         try:
             for _ in range(self._attempts):
                 try:
+                    worker.confine(isinstance(task.scenario, OwnNetwork))
                     episode = worker.run(task.message(), lambda steps: progress and progress(index, steps))
                     if progress is not None:
                         progress(index, episode.steps)
@@ -139,7 +142,7 @@ class _Worker:
     def __init__(self, silence: float, temporary: str) -> None:
         self._silence, self._temporary = silence, temporary
         self._process: subprocess.Popen[bytes] | None = None
-        self._stopped = False
+        self._stopped = self._confined = False
         self._starting = threading.Lock()
 
     def _start(self) -> subprocess.Popen[bytes]:
@@ -158,6 +161,12 @@ class _Worker:
         self._messages: queue.SimpleQueue[Message | None] = queue.SimpleQueue()
         threading.Thread(target=_read_all, args=(process, self._messages), daemon=True).start()
         return process
+
+    def confine(self, confined: bool) -> None:
+        """Note whether the next episode is one that takes the process its rights; it never has them again."""
+        if self._confined and not confined:
+            self._kill()
+        self._confined = confined
 
     def run(self, task: Message, progress: Callable[[int], object]) -> Episode:
         """Return the episode of a task; raise `_WorkerLost` where the process dies or falls silent."""

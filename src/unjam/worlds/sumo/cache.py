@@ -6,6 +6,7 @@ from pathlib import Path
 
 import platformdirs
 
+from unjam.errors import wrong
 from unjam.sumo_files import stamp_of
 
 _whole: dict[Path, tuple[int, int]] = {}
@@ -13,9 +14,15 @@ _whole: dict[Path, tuple[int, int]] = {}
 
 
 def cache_folder() -> Path:
-    """Return where networks are kept: `$UNJAM_CACHE`, or the user's cache folder."""
-    chosen = os.environ.get("UNJAM_CACHE")
-    return Path(chosen) if chosen else Path(platformdirs.user_cache_dir("unjam"))
+    """Return where networks are kept: `$UNJAM_CACHE`, or the user's cache folder.
+
+    Raises:
+        InputError: SUMO would take its name for a list, or for a variable.
+    """
+    chosen = os.environ.get("UNJAM_CACHE") or platformdirs.user_cache_dir("unjam")
+    if any(sign in chosen for sign in ",;$%"):
+        raise wrong("UNJAM_CACHE", chosen, "a folder without , ; $ % in its name")
+    return Path(chosen)
 
 
 def seal(content: bytes) -> bytes:

@@ -109,7 +109,7 @@ class ClosedTraffic(Traffic[ClosedRoad]):
             return loop_state(self.speeds, near, self._near_single, *self._loop)
         positions = np.full(len(self.speeds), np.nan)
         positions[list(near)] = list(near.values())
-        return loop_state(np.array(self.speeds), positions, self._near, *self._loop)
+        return loop_state(np.array(self.speeds), positions, self._near, *self._loop).read_only()
 
     def advance(self, command: Command | None) -> None:
         """Simulate one decision, held over its simulation steps; None: the CAVs stay human."""

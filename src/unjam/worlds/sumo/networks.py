@@ -6,6 +6,7 @@ import os
 import shutil
 import subprocess
 import tempfile
+import time
 from collections.abc import Iterable
 from contextlib import suppress
 from functools import cache
@@ -22,6 +23,8 @@ from unjam.sumo_files import read_lanes
 from unjam.worlds.record import Floats
 from unjam.worlds.sumo.cache import cache_folder, is_as_made, seal
 
+LONG_AGO = 3600.0
+"""seconds after which nobody makes a network any more"""
 Attributes = dict[str, Any]
 """of an XML element"""
 
@@ -82,6 +85,9 @@ def network_file(network: RoadNetwork) -> Path:
         return target
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
+        for left in target.parent.glob("tmp*"):  # by processes that were killed meanwhile
+            if time.time() - left.stat().st_mtime > LONG_AGO:
+                shutil.rmtree(left, ignore_errors=True)
         with tempfile.TemporaryDirectory(dir=target.parent) as folder:
             made = _netconvert(files, options, Path(folder))
             with made.open("ab") as file:

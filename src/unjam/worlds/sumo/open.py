@@ -130,7 +130,7 @@ class OpenTraffic(Traffic[RoadKind]):
 
     def perceive(self) -> LocalState:
         """Return what the CAVs perceive now: arrays of shape (CAVs,)."""
-        return self._log_states[-1]
+        return self._log_states[-1].read_only()
 
     def advance(self, command: Command | None) -> None:
         """Simulate one decision, held over its simulation steps; None: the CAVs stay human."""

@@ -2,7 +2,6 @@
 
 import importlib
 import io
-import tempfile
 import warnings
 import weakref
 from collections import deque
@@ -18,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from unjam.errors import EpisodeError, MissingPartError, UnjamError
+from unjam.processes import PrivateFolder
 from unjam.scenarios.scenario import Actuation
 from unjam.sumo_files import copy_harmless, stamp_of
 from unjam.worlds.sumo.files import Files
@@ -64,7 +64,7 @@ class Simulation:
         self.backend = backend
         self._gui_options = gui_options
         self._sumo: Any = _import(backend)
-        self._folder = tempfile.TemporaryDirectory(prefix="unjam-")
+        self._folder = PrivateFolder()
         self._error_log = Path(self._folder.name) / "error.log"
         self._copies: dict[Path, tuple[tuple[int, int] | None, Path]] = {}
         """of users' own files, with the stamps of those"""

@@ -1,0 +1,124 @@
+"""What a process may still do that reads files of others: little memory and time, no writing, no network.
+
+The kernel sees to it, for children too, and for good: Landlock keeps the disk as it is, and a filter of
+system calls (seccomp) leaves no sockets. Run as a program, this file runs another one so; it needs Python's
+own library alone.
+"""
+
+import ctypes
+import os
+import platform
+import runpy
+import sys
+from collections.abc import Iterable
+from contextlib import suppress
+from pathlib import Path
+
+CREATE_RULESET, ADD_RULE, RESTRICT_SELF = 444, 445, 446
+"""Landlock's system calls, the same on all processors"""
+WRITE_FILE, TRUNCATE = 1 << 1, 1 << 14
+REMOVE_AND_MAKE = 0b1_1111_1111 << 4
+"""folders, files, devices, sockets, pipes, links"""
+REFER = 1 << 13
+"""moving to another folder"""
+NO_NEW_PRIVILEGES, SET_SECCOMP, FILTER = 38, 22, 2
+"""of `prctl`"""
+SOCKET = {"x86_64": (0xC000003E, 41), "aarch64": (0xC00000B7, 198), "riscv64": (0xC00000F3, 198)}
+"""what the kernel calls a processor, and the number of `socket` there"""
+IO_URING = 425
+"""`io_uring_setup`, by which sockets can be had too"""
+OTHER_NUMBERS = 0x40000000
+"""the same calls by other numbers (x32)"""
+EPERM = 1
+
+
+class _Rule(ctypes.Structure):
+    _pack_ = 1
+    _layout_ = "ms"
+    _fields_ = (("allowed", ctypes.c_uint64), ("folder", ctypes.c_int32))
+
+
+class _Instruction(ctypes.Structure):
+    _fields_ = (
+        ("code", ctypes.c_uint16),
+        ("yes", ctypes.c_uint8),
+        ("no", ctypes.c_uint8),
+        ("k", ctypes.c_uint32),
+    )
+
+
+class _Program(ctypes.Structure):
+    _fields_ = (("length", ctypes.c_uint16), ("instructions", ctypes.POINTER(_Instruction)))
+
+
+def limit(memory: int, seconds: int = 0) -> None:
+    """Let this process end where it takes more memory [bytes] or time [s] than that; not on Windows."""
+    with suppress(ImportError):
+        import resource
+        import signal
+
+        for what, wanted in ((resource.RLIMIT_AS, memory), (resource.RLIMIT_CPU, seconds)):
+            limits = [each for each in resource.getrlimit(what) if each != resource.RLIM_INFINITY]
+            if wanted:  # somebody may have set less already (ulimit -v)
+                resource.setrlimit(what, (least := min([wanted, *limits]), least))
+        if seconds:
+            signal.alarm(seconds)  # also where it only waits
+
+
+def confine(*writable: Path) -> None:
+    """Leave this thread and its children no sockets, and no writing but under these folders; for good.
+
+    Where the kernel offers one of both, that holds; where none, nothing changes.
+    """
+    if sys.platform != "linux":
+        return
+    libc = ctypes.CDLL(None)
+    libc.prctl(NO_NEW_PRIVILEGES, 1, 0, 0, 0)
+    _keep_disk(libc, writable)
+    _close_network(libc)
+
+
+def _keep_disk(libc: ctypes.CDLL, writable: Iterable[Path]) -> None:
+    version = libc.syscall(CREATE_RULESET, None, ctypes.c_size_t(0), 1)
+    if version < 1:
+        return
+    files = WRITE_FILE | (TRUNCATE if version > 2 else 0)
+    handled = files | REMOVE_AND_MAKE | (REFER if version > 1 else 0)
+    ruleset = libc.syscall(CREATE_RULESET, ctypes.byref(ctypes.c_uint64(handled)), ctypes.c_size_t(8), 0)
+    folders = filter(Path.is_dir, writable)
+    for path, allowed in {**dict.fromkeys(folders, handled), Path(os.devnull): files}.items():
+        folder = os.open(path, os.O_PATH | os.O_CLOEXEC)
+        libc.syscall(ADD_RULE, ruleset, 1, ctypes.byref(_Rule(allowed, folder)), 0)
+        os.close(folder)
+    libc.syscall(RESTRICT_SELF, ruleset, 0)
+    os.close(ruleset)
+
+
+def _close_network(libc: ctypes.CDLL) -> None:
+    if platform.machine() not in SOCKET or sys.maxsize < 2**32:
+        return
+    processor, socket = SOCKET[platform.machine()]
+    load, equal, at_least, answer = 0x20, 0x15, 0x35, 0x06
+    instructions = (_Instruction * 8)(
+        (load, 0, 0, 4),
+        (equal, 0, 5, processor),
+        (load, 0, 0, 0),
+        (at_least, 3, 0, OTHER_NUMBERS),
+        (equal, 2, 0, socket),
+        (equal, 1, 0, IO_URING),
+        (answer, 0, 0, 0x7FFF0000),  # yes
+        (answer, 0, 0, 0x00050000 | EPERM),
+    )
+    libc.prctl(SET_SECCOMP, FILTER, ctypes.byref(_Program(len(instructions), instructions)), 0, 0)
+
+
+def main(memory: str, seconds: str, writable: str, program: str, *arguments: str) -> None:
+    """Run a Python program with its arguments so, where `writable` is a folder or empty."""
+    limit(int(memory), int(seconds))
+    confine(*map(Path, filter(None, [writable])))
+    sys.argv = [program, *arguments]
+    runpy.run_path(program, run_name="__main__")
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

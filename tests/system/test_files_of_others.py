@@ -1,0 +1,53 @@
+"""Files of others on the command line: what is in them harms nobody who looks at them."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.controller.test_verify import content_of
+from tests.system.conftest import Run
+from tests.system.test_wrong_inputs import one_line
+from tests.test_processes import holder
+from unjam.controller.file import GRAPH
+from unjam.drivers import Constant
+
+
+def test_a_graph_that_wants_all_memory_is_refused_in_one_line(unjam: Run, tmp_path: Path) -> None:
+    helper, graph = (
+        pytest.importorskip("onnx").helper,
+        pytest.importorskip("tests.controller.test_graph").graph,
+    )
+    pytest.importorskip("onnxruntime")
+
+    def bomb(model: Any) -> None:
+        huge = helper.make_tensor("huge", 7, [1], [3 * 2**29])
+        model.graph.initializer.append(huge)
+        nodes = [
+            helper.make_node("Expand", ["speed", "huge"], ["much"]),
+            helper.make_node("ReduceMean", ["much"], ["mean"]),
+            helper.make_node("Mul", ["mean", "leader_speed"], ["acceleration"]),
+        ]
+        del model.graph.node[:]
+        model.graph.node.extend(nodes)
+
+    (tmp_path / "bomb.unjam").write_bytes(content_of(Constant(), 1.0, {GRAPH: graph(bomb)}))
+    ran = unjam("verify", "bomb.unjam")
+    assert (ran.returncode, ran.stdout) == (2, "")
+    assert one_line(ran.stderr), ran.stderr
+    assert "graph: cannot be run" in ran.stderr
+
+
+def test_a_folder_that_another_process_writes_is_left_alone(unjam: Run, tmp_path: Path) -> None:
+    made = ["drive", "ring", "--driver", "pi", "--episodes", "1", "--set", "horizon=20", "--out", "run"]
+    assert unjam(*made, pictures=False).returncode == 0
+    before = (tmp_path / "run" / "report.html").read_bytes()
+    process = holder(tmp_path / "run")
+    for arguments in (["report", "run"], ["report", "run", "--out", "run/other.html"]):
+        ran = unjam(*arguments, pictures=False)
+        assert (ran.returncode, one_line(ran.stderr)) == (2, True), ran.stderr
+        assert "is being written by another process" in ran.stderr
+    assert unjam("report", "run", "--out", "page.html", pictures=False).returncode == 0
+    process.communicate("")
+    assert (tmp_path / "run" / "report.html").read_bytes() == before
+    assert not (tmp_path / "run" / "other.html").exists()

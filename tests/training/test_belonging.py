@@ -1,0 +1,118 @@
+"""A checkpoint goes on with the training that made it, and with no other."""
+
+import json
+import logging
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from tests.training.test_run import small_config
+from tests.worlds.sumo.own_roads import straight
+from unjam.errors import InputError
+from unjam.training.belonging import belonging, check_belongs
+from unjam.training.config import RunConfig, load_config, to_toml
+from unjam.training.controllers import KeptControllers
+from unjam.training.folder import MANIFEST, last_state, note_lineage, save_checkpoint, start_folder
+
+EXPERT = "def gentle(state):\n    return 0.1 * (state.leader_speed - state.speed)\n"
+
+
+def with_checkpoint(folder: Path, config: RunConfig) -> None:
+    start_folder(folder, config)
+    (folder / "progress.jsonl").write_text('{"iteration": 1}\n{"iteration": 2}\n')
+    save_checkpoint(folder / "checkpoint", {"iteration": 1, "belongs": belonging(config)}, {})
+
+
+def refused(folder: Path, config: RunConfig) -> str:
+    before = (folder / "progress.jsonl").read_bytes()
+    with pytest.raises(InputError, match=r"^resume: ") as caught:
+        last_state(folder, {folder}, belonging(config))
+    assert (folder / "progress.jsonl").read_bytes() == before
+    return str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"seed": 5}, "seed: 5 is not allowed; allowed: 0, as in the checkpoint"),
+        ({"trpo__gamma": 0.5}, "trpo.gamma: 0.5 is not allowed"),
+        ({"road__vehicles": 9}, "road.vehicles: 9 is not allowed"),
+    ],
+)
+def test_a_checkpoint_of_another_configuration_is_refused_and_nothing_changed(
+    changes: dict[str, Any], words: str, tmp_path: Path
+) -> None:
+    with_checkpoint(tmp_path, small_config())
+    (tmp_path / "config.toml").write_text(to_toml(small_config(**changes)))
+    assert words in refused(tmp_path, small_config(**changes))
+
+
+def test_more_steps_and_other_workers_are_the_same_training(tmp_path: Path) -> None:
+    with_checkpoint(tmp_path, small_config())
+    assert last_state(tmp_path, {tmp_path}, belonging(small_config(steps=9000, workers=2))) is not None
+
+
+def of_expert(folder: Path) -> RunConfig:
+    (folder / "mine.py").write_text(EXPERT)
+    return small_config(expert=f"{folder}/mine.py:gentle")
+
+
+def of_reward(folder: Path) -> RunConfig:
+    (folder / "mine.py").write_text("def gold(outcome):\n    return {'speed': outcome.speeds.mean(1)}\n")
+    return small_config(reward=f"{folder}/mine.py:gold")
+
+
+def of_network(folder: Path) -> RunConfig:
+    path = straight(folder, '<flow id="f" type="car" route="along" begin="0" end="60" period="3"/>')
+    road = {"cav_share": 0.5, "horizon": 100}
+    return load_config(changes={"scenario": str(path), "road": road, "steps": 100})
+
+
+@pytest.mark.parametrize(
+    ("make", "file"), [(of_expert, "mine.py"), (of_reward, "mine.py"), (of_network, "demand.rou.xml")]
+)
+def test_what_a_training_is_made_of_cannot_change(
+    make: Callable[[Path], RunConfig], file: str, tmp_path: Path
+) -> None:
+    config, run = make(tmp_path), tmp_path / "run"
+    with_checkpoint(run, config)
+    assert last_state(run, {run}, belonging(config)) is not None
+    (run / "progress.jsonl").write_text('{"iteration": 1}\n{"iteration": 2}\n')
+    (tmp_path / file).write_text((tmp_path / file).read_text() + " ")
+    assert "has changed since the checkpoint" in refused(run, config)
+
+
+def test_other_packages_and_kernels_are_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    now = belonging(small_config())
+    check_belongs(now, now)
+    assert not caplog.records
+    with caplog.at_level(logging.WARNING):
+        check_belongs({**now, "packages": {"numpy": "0"}, "kernels": {}}, now)
+    assert ["packages" in caplog.messages[0], "kernels" in caplog.messages[1]] == [True, True]
+
+
+def test_a_manifest_says_by_what_a_run_went_on(tmp_path: Path) -> None:
+    start_folder(tmp_path, small_config())
+    for iteration in (3, 7):
+        note_lineage(tmp_path, iteration)
+    lineage = json.loads((tmp_path / MANIFEST).read_text())["lineage"]
+    assert [each["iteration"] for each in lineage] == [3, 7]
+    assert {"packages", "kernels", "command", "started"} <= lineage[0].keys()
+
+
+@pytest.mark.parametrize(("ended", "content"), [(True, b"last"), (False, b"best")])
+def test_a_longer_run_goes_on_from_the_controller_that_it_would_have_had(
+    ended: bool, content: bytes, tmp_path: Path
+) -> None:
+    controllers = KeptControllers([tmp_path])
+    controllers.keep([b"best"], best=True)
+    controllers.keep([b"last"], best=False)
+    assert (tmp_path / "controller.unjam").read_bytes() == b"last"
+    (tmp_path / "controller.unjam").write_bytes(b"somebody else's")
+    tensors = {**controllers.tensors(), "weight": torch.zeros(1)}
+    KeptControllers([tmp_path]).restore(tensors, ended)
+    assert (tmp_path / "controller.unjam").read_bytes() == content
+    assert tensors.keys() == {"weight"}
