@@ -16,8 +16,9 @@ from unjam.files import check_folder, write_whole
 from unjam.measures.effect import FLOW_LOST, LEAST_JUDGED
 from unjam.measures.recommendation import percent
 from unjam.measures.statistics import Estimate, signed
-from unjam.reports.figures import INK, LINES, STYLE, data_uri, new_figure, space_time
-from unjam.reports.html import filled
+from unjam.reports.figures import INK, LINES, STYLE, data_uri, new_figure
+from unjam.reports.html import filled, page_part
+from unjam.reports.lanes import drawn_by_lane, space_time_of
 from unjam.reports.results import command_to_repeat, read_results
 from unjam.reports.story import cell_of
 
@@ -63,8 +64,10 @@ def render_assessment(folder: Path) -> str:
         table=_table(found),
         tried=[_tried(each) for each in tried],
         effects=data_uri(effects(found)),
-        space_time=data_uri(space_time(panels)) if panels else "",
+        space_time=data_uri(space_time_of(panels)) if panels else "",
         panels=[panel.driver for panel in panels],
+        by_lane=drawn_by_lane(panels),
+        downloads=Markup(page_part("downloads.js")),
         percent=percent,
         named=breakable,
         most_lost=FLOW_LOST,

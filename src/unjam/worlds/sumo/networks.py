@@ -6,6 +6,7 @@ import os
 import shutil
 import subprocess
 import tempfile
+from collections import Counter
 from collections.abc import Iterable
 from contextlib import suppress
 from functools import cache
@@ -109,6 +110,12 @@ def network_lines(path: Path) -> Floats:
 def edge_lengths(path: Path) -> dict[str, float]:
     """Return the length of each edge [m]."""
     return {edge: length for edge, length, _ in read_lanes(path)}
+
+
+@cache
+def lane_counts(path: Path) -> dict[str, int]:
+    """Return how many lanes each edge has."""
+    return dict(Counter(edge for edge, _, _ in read_lanes(path)))
 
 
 def _node(node: Node) -> Attributes:
