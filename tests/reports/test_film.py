@@ -64,7 +64,7 @@ def test_a_film_has_frames_that_differ(tmp_path: Path, suffix: str) -> None:
 
 
 def test_a_film_can_be_an_mp4(tmp_path: Path) -> None:
-    ffmpeg = pytest.importorskip("imageio_ffmpeg", reason="pip install 'unjam[video]'")
+    ffmpeg = pytest.importorskip("imageio_ffmpeg", reason="pip install imageio-ffmpeg")
     path = tmp_path / "wave.MP4"
     write_video(driven(), path, "pi", pace=40.0)
     reader: Iterator = ffmpeg.read_frames(str(path))

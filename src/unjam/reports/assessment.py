@@ -172,7 +172,7 @@ def effects(found: dict[str, Any]) -> Figure:
             for each in found[group]:
                 number, effect = drivers.index(each["driver"]), each["effect"]
                 place = shares.index(each["share"]) + 0.7 * ((number + 0.5) / len(drivers) - 0.5)
-                scale = 100.0 / effect[people]
+                scale = 100.0 / effect[people] if effect[people] else nan  # nobody left in so short a time
                 place += 0.06 if group == "judged" else 0.0
                 look = {"color": LINES[(number + 1) % len(LINES)], "alpha": alpha}
                 axes.plot(

@@ -116,7 +116,7 @@ def write_video(episode: Episode, path: Path, title: str, pace: float = 10.0) ->
     Raises:
         InputError: another kind of file.
         DiskError: there is no folder for it.
-        MissingPartError: .mp4 without the extra `video`.
+        MissingPartError: .mp4 without imageio-ffmpeg.
     """
     check_format(path)
     check_folder(path)
@@ -144,7 +144,7 @@ def _write_mp4(frames: Iterator[Image.Image], path: Path, rate: float) -> None:
     try:
         import imageio_ffmpeg
     except ImportError:
-        raise MissingPartError("video: .mp4 needs imageio-ffmpeg: pip install 'unjam[video]'") from None
+        raise MissingPartError("video: .mp4 needs imageio-ffmpeg: pip install imageio-ffmpeg") from None
     writer = imageio_ffmpeg.write_frames(
         str(path),
         (SIZE, SIZE),

@@ -225,7 +225,7 @@ def test_lanes_count_from_the_left_and_are_those_that_sumo_says(
 ) -> None:
     traffic = own(simulation, game(tmp_path, "ramp"))
     for _ in range(60):
-        traffic.advance(None)
+        traffic.advance(Command(np.zeros(len(traffic.cavs))))
     here = {
         name: (libsumo.vehicle.getRoadID(name), libsumo.vehicle.getLaneIndex(name))
         for name in libsumo.vehicle.getIDList()
