@@ -37,6 +37,8 @@ class EvaluationSettings:
 
     every: CountOrNone = 5
     """iterations between two validations; 0: none, and the last policy becomes the controller"""
+    patience: CountOrNone = 0
+    """validations in a row without a new best after which training ends; 0: it goes on to `steps`"""
     validation_episodes: Count = 4
     """episodes of a validation, the same seeds each time: they choose the controller"""
     episodes: Count = 20

@@ -21,6 +21,7 @@ from unjam.measures.metrics import measure
 from unjam.measures.statistics import Estimate, paired_difference
 from unjam.processes import owned
 from unjam.reports.html import write_report
+from unjam.reports.results import read_progress
 from unjam.training.config import RunConfig, to_toml
 from unjam.training.evaluate import TRAINED, Progress, Rows, judge, raise_failure
 from unjam.training.executors import OnIteration, train_apart
@@ -28,6 +29,7 @@ from unjam.training.folder import (
     PROGRESS,
     check_possible,
     continue_folder,
+    gave_up,
     last_state,
     make_new_folder,
     origin,
@@ -237,8 +239,11 @@ class Trainer:
         iteration.seconds["validation"] = time.perf_counter() - started
         return found
 
-    def write(self, iteration: Iteration, validated: Validated) -> None:
-        """Write a row of progress, of the whole run and of each road, and a checkpoint."""
+    def write(self, iteration: Iteration, validated: Validated) -> bool:
+        """Write a row of progress, of the whole run and of each road, and a checkpoint.
+
+        Return whether it is time to stop: `evaluation.patience` is over.
+        """
         rows = [self._row(iteration, validated, index) for index in range(len(self.tasks))]
         whole = rows[0]
         if self.config.tasks:
@@ -264,6 +269,7 @@ class Trainer:
         }
         save_checkpoint(self.folder / "checkpoint", state, tensors)
         self._on_iteration(whole)
+        return gave_up(self.config, read_progress(self.folder))
 
     def returns_of(self, drivers: Sequence[Driver]) -> list[float]:
         """Return the mean return on the validation seeds, by road, each driven by its own of `drivers`."""

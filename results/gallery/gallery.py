@@ -1,0 +1,64 @@
+"""Drives each shipped controller on its road beside people alone: pictures and cards of docs/gallery.md.
+
+Ten held-out seeds, four on the on-ramp; ten minutes on two cores. `python results/gallery/gallery.py`.
+"""
+
+import json
+from pathlib import Path
+
+import unjam
+from unjam.controller import shipped_file
+from unjam.controller.domain import road_of
+from unjam.controller.file import CERTIFICATE, read_controller
+from unjam.files import to_json
+from unjam.manifest import manifest
+from unjam.measures.drivable import verdicts
+from unjam.measures.effect import beside_people
+from unjam.measures.statistics import estimate_of
+from unjam.reports.figures import png_bytes
+from unjam.reports.lanes import space_time_of
+from unjam.reports.results import shown_of
+
+ROADS = {
+    "ring-best": ("ring", {}),
+    "ring-tuned": ("ring-jammed", {}),
+    "ring-jammed-best": ("ring-jammed", {}),
+    "figure-eight-tuned": ("figure-eight", {}),
+    "figure-eight-best": ("figure-eight", {}),
+    "merge-best": ("merge", {}),
+    "on-ramp-tuned": ("on-ramp", {"cav_share": 0.05}),
+}
+"""where each controller is shown, and what is changed of the road"""
+HERE = Path(__file__).parent
+PICTURES = HERE.parents[1] / "docs" / "pictures"
+
+
+def main() -> None:
+    """Drive, draw and write the cards."""
+    cards = {}
+    for name, (road, changes) in ROADS.items():
+        label = f"unjam:{name}"
+        count = 4 if road == "on-ramp" else 10
+        result = unjam.drive(road, ["human", label], episodes=count, road=changes, workers=2, held_out=True)
+        named = (("human", "people alone"), (label, label))
+        figure = space_time_of([shown_of(title, result.shown[driver]) for driver, title in named])
+        (PICTURES / f"gallery-{name}.png").write_bytes(png_bytes(figure, dpi=90))
+        driven, controller = result.rows[label], read_controller(shipped_file(name))
+        certified = controller.parts.get(CERTIFICATE)
+        cards[name] = {
+            "road": road,
+            "changes": changes,
+            "made_for": road_of(controller.manifest),
+            "beside people alone": beside_people(result.rows)[label].words,
+            "seeds": len(driven),
+            "headway": estimate_of(driven, "min_headway").mean,
+            "braking": estimate_of(driven, "cav_max_braking").mean,
+            "drivable": verdicts(result.rows)[label],
+            "domain": json.loads(certified)["domain"] if certified else None,
+        }
+        print(name, cards[name]["beside people alone"], flush=True)
+    (HERE / "gallery.json").write_text(to_json({"manifest": manifest(), "cards": cards}, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
