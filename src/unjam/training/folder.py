@@ -135,12 +135,12 @@ def save_checkpoint(folder: Path, state: dict[str, Any], tensors: "Tensors") -> 
 
 def gave_up(config: RunConfig, progress: Sequence[dict[str, Any]]) -> bool:
     """Return whether so many validations in a row found nothing better that `evaluation.patience` is over."""
-    found = [row["return_validation"] for row in progress if row["return_validation"] is not None]
-    if not found:
+    found = [value for row in progress if (value := row.get("return_validation")) is not None]
+    if not config.evaluation.patience or not found:
         return False
     best = max(range(len(found)), key=found.__getitem__)
     since = len(found) - 1 - best if found[best] > progress[0]["return_expert"] else len(found)
-    return 0 < config.evaluation.patience <= since
+    return since >= config.evaluation.patience
 
 
 def last_state(folder: Path, places: Iterable[Path]) -> "tuple[dict[str, Any], Tensors] | None":
