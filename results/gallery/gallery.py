@@ -1,4 +1,4 @@
-"""Drives each shipped controller on its road beside people alone: pictures and cards of docs/gallery.md.
+"""Drives each shipped controller on its road beside people alone: what docs/gallery.md shows, and a film.
 
 Ten held-out seeds, four on the on-ramp; ten minutes on two cores. `python results/gallery/gallery.py`.
 """
@@ -6,8 +6,10 @@ Ten held-out seeds, four on the on-ramp; ten minutes on two cores. `python resul
 import json
 from pathlib import Path
 
+from PIL import Image, ImageSequence
+
 import unjam
-from unjam.controller import shipped_file
+from unjam.controller import make_driver, shipped_file
 from unjam.controller.domain import road_of
 from unjam.controller.file import CERTIFICATE, read_controller
 from unjam.files import to_json
@@ -16,8 +18,11 @@ from unjam.measures.drivable import verdicts
 from unjam.measures.effect import beside_people
 from unjam.measures.statistics import estimate_of
 from unjam.reports.figures import png_bytes
+from unjam.reports.film import write_video
 from unjam.reports.lanes import space_time_of
 from unjam.reports.results import shown_of
+from unjam.scenarios import make_scenario
+from unjam.worlds.episode import run_episode
 
 ROADS = {
     "ring-best": ("ring", {}),
@@ -33,8 +38,20 @@ HERE = Path(__file__).parent
 PICTURES = HERE.parents[1] / "docs" / "pictures"
 
 
+def film(road: str, name: str) -> None:
+    """Write the film of the documentation's front page: half of the size that `unjam watch` gives it."""
+    scenario = make_scenario(road, {"horizon": 1500})
+    driver = make_driver(f"unjam:{name}", scenario.decision_step)
+    target = PICTURES / "film.webp"
+    write_video(run_episode(scenario, driver, (0,), full=True), target, f"unjam:{name}", pace=30.0)
+    with Image.open(target) as whole:
+        frames = [each.convert("RGB").resize((420, 420)) for each in ImageSequence.Iterator(whole)]
+    frames[0].save(target, save_all=True, append_images=frames[1:], duration=50, loop=0, quality=55)
+
+
 def main() -> None:
     """Drive, draw and write the cards."""
+    film("ring-jammed", "ring-tuned")
     cards = {}
     for name, (road, changes) in ROADS.items():
         label = f"unjam:{name}"

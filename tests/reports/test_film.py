@@ -128,6 +128,13 @@ def test_another_kind_of_file_is_refused(tmp_path: Path, name: str) -> None:
     assert not (tmp_path / name).exists()
 
 
+def test_a_long_title_stays_in_the_picture(tmp_path: Path) -> None:
+    write_video(driven(1.0), tmp_path / "film.gif", "pi:" + ",".join(f"parameter_{n}={n}" for n in range(12)))
+    frame = np.asarray(Image.open(tmp_path / "film.gif").convert("L"))
+    assert frame[:, :4].min() == frame[:, -4:].min() == 255
+    assert frame.min() < 100
+
+
 @pytest.mark.parametrize("suffix", [".gif", ".webp", ".mp4"])
 def test_a_film_that_cannot_be_written_gets_one_clear_line(tmp_path: Path, suffix: str) -> None:
     with pytest.raises(DiskError, match="cannot write"):

@@ -110,7 +110,8 @@ class OwnTraffic(LaneTraffic[OwnRoad]):
         most = max(counts[edge] for edge in route)
         if most == 1:
             return replace(found, positions=positions)
-        named = ("left lane", *(f"lane {number} from left" for number in range(2, most + 1)))
+        further = ("2nd", "3rd", *(f"{number}th" for number in range(4, most + 1)))
+        named = ("left lane", *(f"{ordinal} lane" for ordinal in further[: most - 1]))
         return replace(found, positions=positions, lanes=lanes, lane_names=named)
 
     def _lines(self) -> Floats:
