@@ -63,7 +63,7 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 	@echo "setting up $(VENV): a few minutes, once"
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	@$(PIP) $(TORCH_INDEX) torch
-	@$(PIP) -e .
+	@$(PIP) -e ".[train]"
 	@touch $@
 
 $(VENV)/.installed-dev: $(VENV)/.installed

@@ -33,8 +33,8 @@ ALLOWED = {
 """what else a part may import"""
 LAZY = {
     "__init__": {
-        *("controller", "drivers", "environments", "kernels", "measures", "reports", "scenarios", "training"),
-        "worlds",
+        *("controller", "drivers", "environments", "errors", "kernels", "measures", "reports", "scenarios"),
+        *("training", "worlds"),
     },
     "__main__": {"cli"},
 }

@@ -16,8 +16,9 @@ from unjam.kernels import pin
 pin()  # before anything imports NumPy
 
 from unjam.environments import register_all  # noqa: E402
+from unjam.errors import without_train  # noqa: E402
 
-__version__ = "0.1.0.dev0"
+__version__ = "0.1.0"
 
 if TYPE_CHECKING:
     from unjam.controller import load_controller, make_driver
@@ -79,7 +80,10 @@ __all__ = [
 def __getattr__(name: str) -> Any:
     if name not in _PLACES:
         raise AttributeError(f"module 'unjam' has no attribute {name!r}")
-    return getattr(import_module(_PLACES[name]), name)
+    try:
+        return getattr(import_module(_PLACES[name]), name)
+    except ModuleNotFoundError as error:
+        raise without_train(error) from None
 
 
 def __dir__() -> list[str]:

@@ -26,6 +26,19 @@ class MissingPartError(UnjamError):
     exit_code = 3
 
 
+TRAIN = "torch", "stable_baselines3", "sb3_contrib", "onnx", "onnxscript", "onnxruntime"
+"""packages of the extra `train`: what drives, measures and calibrates needs none of them"""
+
+
+def without_train(error: ModuleNotFoundError) -> MissingPartError:
+    """Return the line for a package of the extra `train`; the error itself is raised for any other."""
+    if error.name is None or error.name.partition(".")[0] not in TRAIN:
+        raise error
+    return MissingPartError(
+        f"{error.name} is not installed; what learns needs it: pip install 'unjam[train]'"
+    )
+
+
 class DiskError(UnjamError):
     """The disk is full or cannot be written."""
 

@@ -39,6 +39,7 @@ def test_what_can_be_missing_is_not_needed(checks: dict[str, Check]) -> None:
     assert {name for name, check in checks.items() if not check.needed} == {
         *("traci", "display", "mp4 video", "reading files of others"),
         "SUMO of the results",
+        *("torch", "stable-baselines3", "sb3-contrib"),
     }
 
 

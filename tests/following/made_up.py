@@ -1,6 +1,9 @@
 """Drivers that are made up: what tests calibrate on."""
 
+from pathlib import Path
+
 import numpy as np
+import pandas as pd
 
 from unjam.following.open_loop import Follow, drive_behind, idm_follow
 from unjam.following.pairs import Pair
@@ -38,3 +41,14 @@ def idm_driver(
     """How an IDM follows, from its own equilibrium gap on."""
     gap = equilibrium_gap(8.0, parameters)
     return follower(idm_follow(parameters), name, seconds, 8.0, gap, seed, split)
+
+
+def write_table(path: Path, drivers: int = 3) -> None:
+    """Write a CSV file of trajectories as a user has them, of drivers who differ in their headway."""
+    parts = []
+    for number in range(drivers):
+        pair = idm_driver(IDMParameters(time_headway=0.9 + 0.1 * number), seed=number, seconds=24.0)
+        times = STEP * np.arange(len(pair.speed))
+        numbers = {"t": times, "v_foll": pair.speed, "v_lead": pair.leader_speed, "gap": pair.gap}
+        parts.append(pd.DataFrame({"pair": number, **numbers}))
+    pd.concat(parts).to_csv(path, index=False)

@@ -8,8 +8,8 @@ from tests.studies.test_field import table
 from unjam.errors import DiskError, InputError
 from unjam.following.calibration import CalibrationSettings
 from unjam.following.fit_drivers import FitDriversSettings, doubts_about_units, fit_drivers, fit_from_files
-from unjam.following.networks import MultiStepSettings
 from unjam.following.pairs import Pair
+from unjam.following.settings import MultiStepSettings
 from unjam.physics.idm import IDMParameters
 
 HEADWAYS = (0.9, 1.1, 1.3, 1.5, 1.7)

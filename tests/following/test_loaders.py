@@ -1,11 +1,15 @@
+import subprocess
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 
+from tests.worlds.sumo.own_roads import straight
 from unjam.errors import InputError
 from unjam.following.loaders import FOOT, Reading, read_pairs
+from unjam.worlds.sumo.networks import sumo_program
 
 SHORT = Reading(shortest=1.0)
 SPEED, LEADER, GAP = 10.0, 12.0, 20.0
@@ -69,6 +73,45 @@ def openacc(path: Path) -> Path:
     above = 'Date,04/07/2019\nVehicle_order,"Audi(A8), Tesla(Model3), BMW(X5)"\n\n'
     path.write_text(above + frame.to_csv(index=False))
     return path
+
+
+def highd(path: Path, sign: int = 1) -> Path:
+    """One behind another as highD has them: the left end of a box, whichever way it drives."""
+    rows = []
+    for vehicle, leader, rear, speed in ((1, 0, 100.0, LEADER), (2, 1, 100.0 - GAP - 5.0, SPEED)):
+        for frame in range(MOMENTS):
+            start = rear + speed * frame / 25.0
+            left = start if sign > 0 else 400.0 - start - 5.0
+            row = {"frame": frame, "id": vehicle, "x": left, "y": 8.0, "width": 5.0, "height": 2.0}
+            rows.append({**row, "xVelocity": sign * speed, "precedingId": leader, "laneId": 2})
+    pd.DataFrame(rows).to_csv(path, index=False)
+    return path
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_highd_is_read_on_both_carriageways(tmp_path: Path, sign: int) -> None:
+    (pair,) = read_pairs(highd(tmp_path / "01_tracks.csv", sign), reading=replace(SHORT, shortest=1.0)).pairs
+    assert pair.step == 0.04
+    np.testing.assert_allclose(pair.speed, SPEED)
+    np.testing.assert_allclose(pair.leader_speed, LEADER)
+    np.testing.assert_allclose(pair.gap, GAP + (LEADER - SPEED) * 0.04 * np.arange(MOMENTS), atol=1e-6)
+
+
+def test_what_sumo_wrote_is_read_with_the_gaps_that_there_were(tmp_path: Path) -> None:
+    flow = '<flow id="f" type="van" route="along" begin="0" end="20" period="4"/>'
+    options = ["--fcd-output", "fcd.csv", "--fcd-output.max-leader-distance", "200"]
+    command = [sumo_program("sumo"), "-c", str(straight(tmp_path, flow)), *options]
+    subprocess.run(command, cwd=tmp_path, capture_output=True, check=True)
+    found = read_pairs(tmp_path / "fcd.csv")
+    assert {pair.driver for pair in found.pairs} == {f"f.{number}" for number in range(1, 5)}
+    for pair in found.pairs:
+        driven = np.cumsum(pair.leader_speed - pair.speed)[1:] * pair.step
+        np.testing.assert_allclose(pair.gap[1:] - pair.gap[0], driven, atol=0.6)
+        assert pair.gap.min() > 20
+    whole = pd.read_csv(tmp_path / "fcd.csv", sep=";")
+    whole.drop(columns="vehicle_leaderSpeed").to_csv(tmp_path / "without.csv", sep=";", index=False)
+    with pytest.raises(InputError, match="no column 'vehicle_leaderSpeed'"):
+        read_pairs(tmp_path / "without.csv")
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".parquet"])
@@ -178,5 +221,5 @@ def test_columns_may_name_the_driver(tmp_path: Path) -> None:
 
 
 def test_an_unknown_format(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="format: 'highd' is not allowed"):
-        read_pairs(table(tmp_path / "t.csv"), "highd")
+    with pytest.raises(InputError, match="format: 'ind' is not allowed"):
+        read_pairs(table(tmp_path / "t.csv"), "ind")

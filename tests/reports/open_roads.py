@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from tests.worlds.sumo.own_roads import game
+from unjam.controller import make_driver
 from unjam.drivers import Human, PISaturation
 from unjam.reports.results import PICTURED, Shown
 from unjam.scenarios import Merge, make_scenario
@@ -25,6 +26,7 @@ def shown_from(episode: Episode, driver: str) -> Shown:
         vehicle_ids=list(episode.vehicle_ids),
         cav_ids=list(episode.cav_ids),
         branches=list(episode.branches),
+        lane_names=list(episode.lane_names),
         **{name: getattr(episode, name).astype(np.float32) for name in PICTURED},
     )
 
@@ -33,6 +35,13 @@ def shown_from(episode: Episode, driver: str) -> Shown:
 def merge_episode(seconds: int = 100, driver: str = "pi") -> Episode:
     found = {"pi": PISaturation(), "human": Human()}[driver]
     return run_episode(Merge(cav_share=0.2, horizon=seconds), found, (1,), full=True)
+
+
+@cache
+def ramp_episode(driver: str = "jam-ahead") -> Episode:
+    """Half of the people on the motorway of two lanes are CAVs."""
+    changes = {"peak": (0.0, 90.0), "cav_share": 0.5, "horizon": 90}
+    return run_episode(make_scenario("on-ramp", changes), make_driver(driver, 1.0), (1,), full=True)
 
 
 def own_episode(folder: Path, seconds: int = 60) -> Episode:

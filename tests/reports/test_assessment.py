@@ -15,7 +15,7 @@ from unjam.manifest import manifest
 from unjam.measures.metrics import METRICS
 from unjam.measures.recommendation import Judged, headline, recommended
 from unjam.measures.statistics import Estimate
-from unjam.reports.assessment import ASSESSMENT_FILE, render_assessment, write_assessment
+from unjam.reports.assessment import ASSESSMENT_FILE, effects, render_assessment, write_assessment
 from unjam.scenarios import Ring, scenario_recipe
 from unjam.training.evaluate import Evaluation, save_evaluation
 from unjam.worlds.record import Episode
@@ -125,6 +125,13 @@ def test_where_nothing_was_judged_there_is_still_a_page(tmp_path: Path) -> None:
     page = render_assessment(folder_of(tmp_path, []))
     assert "Judged on fresh seeds" not in page
     assert "All that was tried" in page
+
+
+def test_where_nobody_reached_the_end_there_is_still_a_picture() -> None:
+    judged = {"share": 0.1, "driver": "acc", "effect": {**vars(GOOD), "people_flow": 0.0}}
+    found = {"drivers": {"acc": {}}, "shares": [0.1], "tried": [], "judged": [judged]}
+    time, flow = effects(found).axes
+    assert len(time.lines) > len([line for line in flow.lines if np.isfinite(line.get_ydata()).any()]) == 1
 
 
 def test_a_folder_without_an_assessment_is_refused(tmp_path: Path) -> None:

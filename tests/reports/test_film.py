@@ -64,7 +64,7 @@ def test_a_film_has_frames_that_differ(tmp_path: Path, suffix: str) -> None:
 
 
 def test_a_film_can_be_an_mp4(tmp_path: Path) -> None:
-    ffmpeg = pytest.importorskip("imageio_ffmpeg", reason="pip install 'unjam[video]'")
+    ffmpeg = pytest.importorskip("imageio_ffmpeg", reason="pip install imageio-ffmpeg")
     path = tmp_path / "wave.MP4"
     write_video(driven(), path, "pi", pace=40.0)
     reader: Iterator = ffmpeg.read_frames(str(path))
@@ -126,6 +126,13 @@ def test_another_kind_of_file_is_refused(tmp_path: Path, name: str) -> None:
     with pytest.raises(InputError, match="video:"):
         write_video(driven(), tmp_path / name, "pi")
     assert not (tmp_path / name).exists()
+
+
+def test_a_long_title_stays_in_the_picture(tmp_path: Path) -> None:
+    write_video(driven(1.0), tmp_path / "film.gif", "pi:" + ",".join(f"parameter_{n}={n}" for n in range(12)))
+    frame = np.asarray(Image.open(tmp_path / "film.gif").convert("L"))
+    assert frame[:, :4].min() == frame[:, -4:].min() == 255
+    assert frame.min() < 100
 
 
 @pytest.mark.parametrize("suffix", [".gif", ".webp", ".mp4"])

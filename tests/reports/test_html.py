@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 
 from tests.measures.test_metrics import LENGTH, episode_of
 from tests.reports.test_model import facts_of, progress_of
+from tests.reports.test_replay import unpacked
 from unjam import __version__
 from unjam.errors import DiskError, InputError
 from unjam.files import to_json
@@ -91,6 +92,13 @@ class Page(HTMLParser):
 
     def of(self, tag: str) -> list[dict[str, str]]:
         return [attributes for name, attributes in self.tags if name == tag]
+
+    @property
+    def drivers(self) -> list[str]:
+        """The columns of the last table, that of all metrics."""
+        heads = self.texts["th"]
+        first = len(heads) - heads[::-1].index("metric")
+        return heads[first : heads.index("could a car drive so?")]
 
     @property
     def replay(self) -> dict[str, Any]:
@@ -190,7 +198,7 @@ def test_the_page_says_who_made_it_and_how_to_repeat_it(written: tuple[str, Page
 
 def test_the_table_holds_the_means_of_the_rows(written: tuple[str, Page], run: Path) -> None:
     _, page = written
-    assert page.texts["th"][1:4] == ["human", "pi", "trained"]
+    assert page.drivers == ["human", "pi", "trained"]
     rows = read_results(run).rows
     for name in ("mean_speed", "speed_std_fleet", "fuel_ml_per_km"):
         metric = METRICS[name]
@@ -209,9 +217,9 @@ def test_names_of_drivers_are_text_whatever_they_hold(tmp_path: Path) -> None:
         "ünïcode",
     ]
     text, page = page_of(results_in(tmp_path / "drive", *names))
-    assert len(page.of("script")) == 2
+    assert len(page.of("script")) == 3
     assert len(page.of("b")) == len(names) * (len(METRICS) + 1)  # and the verdict
-    assert page.texts["th"][1:7] == names
+    assert page.drivers[:6] == names
     assert [driver["name"] for driver in page.replay["drivers"]] == names
     data = text.partition('type="application/json">')[2].partition("</script>")[0]
     assert json.loads(data) == page.replay
@@ -236,8 +244,8 @@ def test_failed_episodes_are_listed_with_their_reason(tmp_path: Path) -> None:
     assert "3 of 5" in text, "a cell says how many episodes it stands for"
 
 
-def numbers(data: str, vehicles: int) -> np.ndarray:
-    return np.frombuffer(base64.b64decode(data), "<f4").reshape(-1, vehicles)
+def numbers(data: list[dict[str, Any]], vehicles: int) -> np.ndarray:
+    return unpacked({"vehicles": vehicles, "positions": data}, "positions")
 
 
 def test_the_replay_holds_the_positions_and_speeds_that_were_driven(
@@ -249,8 +257,8 @@ def test_the_replay_holds_the_positions_and_speeds_that_were_driven(
     assert replay["step"] == pytest.approx(REPLAY_SECONDS)
     for driver in replay["drivers"]:
         episode = shown[driver["name"]]
-        np.testing.assert_array_equal(numbers(driver["positions"], 6), episode.positions[::every])
-        np.testing.assert_array_equal(numbers(driver["speeds"], 6), episode.speeds[::every])
+        np.testing.assert_allclose(numbers(driver["positions"], 6), episode.positions[::every], atol=0.01)
+        np.testing.assert_allclose(numbers(driver["speeds"], 6), episode.speeds[::every], atol=0.001)
         assert replay["frames"] == len(episode.positions[::every])
         assert driver["cavs"] == episode.cavs == [0]
         assert driver["loop_length"] == LENGTH
@@ -279,15 +287,15 @@ def test_the_replay_shows_roads_of_different_steps_at_the_same_times(tmp_path: P
     )
     replay = page_of(save_driven(tmp_path / "a", one=coarse, other=fine))[1].replay
     one, other = (numbers(driver["positions"], 3) for driver in replay["drivers"])
-    np.testing.assert_allclose(one, other, rtol=1e-6)
+    np.testing.assert_allclose(one, other, atol=0.01)
 
 
 def test_several_folders_are_compared_side_by_side(tmp_path: Path) -> None:
     folders = run_in(tmp_path / "ring-001"), run_in(tmp_path / "ring-002")
     text, page = page_of(*folders)
     assert page.texts["h1"] == ["ring: 2 results compared"]
-    assert page.texts["th"][1:5] == ["human", "pi", "ring-001: trained", "ring-002: trained"]
-    assert [driver["name"] for driver in page.replay["drivers"]] == page.texts["th"][1:5]
+    assert page.drivers == ["human", "pi", "ring-001: trained", "ring-002: trained"]
+    assert [driver["name"] for driver in page.replay["drivers"]] == page.drivers
     [lead] = [text for text in page.texts["p"] if "held-out seeds" in text]
     assert "ring-001: On 3" in lead
     assert "ring-002: On 3" in lead

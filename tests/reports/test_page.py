@@ -1,8 +1,10 @@
+import csv
 import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import pytest
 from playwright.sync_api import Browser, ConsoleMessage, Page, Request, Route, sync_playwright
@@ -140,6 +142,7 @@ class Opener:
         visit.page.on("console", listen)
         visit.page.on("pageerror", lambda error: visit.errors.append(str(error)))
         visit.page.goto(report.as_uri())
+        visit.page.wait_for_selector("#replay.ready, body:not(:has(#replay))", state="attached")
         return visit
 
 
@@ -357,7 +360,7 @@ def test_all_controls_can_be_reached_by_tab_and_have_names(open_page: Opener, dr
         reached.append(page.evaluate("document.activeElement.className"))
         page.keyboard.press("Tab")
     assert reached == ["play", "time", "pace"]
-    for name, role in (("Play", "button"), ("Time", "slider"), ("Pace", "combobox")):
+    for name, role in (("Play", "button"), ("Time", "slider"), ("Pace", "combobox"), ("Zoom", "combobox")):
         assert page.get_by_role(role, name=name).count() == 1  # pyright: ignore[reportArgumentType]
 
 
@@ -377,7 +380,8 @@ def test_the_table_has_all_metrics_of_all_drivers(open_page: Opener, trained: Pa
 
 def test_a_metric_shows_its_definition_when_pointed_at(open_page: Opener, driven: Path) -> None:
     page = open_page(driven).page
-    for head, metric in zip(page.locator("tbody th").all()[2:], METRICS.values(), strict=True):
+    heads = page.locator("section:has(h2:text-is('All metrics')) tbody th")
+    for head, metric in zip(heads.all()[2:], METRICS.values(), strict=True):
         assert head.get_attribute("title") == " ".join((metric.function.__doc__ or "").split())
 
 
@@ -412,6 +416,67 @@ def test_the_replay_stays_sharp_when_the_window_changes(open_page: Opener, drive
                  canvas => Math.abs(canvas.width - canvas.clientWidth) <= 1)"""
         )
     assert all(len(picture) > 2000 for picture in open_page.visits[0].canvases())
+
+
+@pytest.mark.parametrize("report", ["driven", "assessed"])
+def test_every_picture_and_table_can_be_taken_away(
+    open_page: Opener, request: pytest.FixtureRequest, report: str, tmp_path: Path
+) -> None:
+    page = open_page(request.getfixturevalue(report)).page
+    assert page.locator(".picture + a.download").count() == page.locator(".picture").count() > 0
+    assert page.locator(".scroll + a.download").count() == page.locator(".scroll").count() > 0
+    for link in page.locator("a.download").all():
+        with page.expect_download() as waiting:
+            link.click()
+        path = tmp_path / waiting.value.suggested_filename
+        waiting.value.save_as(path)
+        text = path.read_text()
+        if path.suffix == ".svg":
+            assert ElementTree.fromstring(text).tag.endswith("svg")
+        else:
+            header, *rows = csv.reader(text.splitlines())
+            assert rows
+            assert {len(row) for row in rows} == {len(header)}
+
+
+def test_zoom_goes_to_the_slowest_vehicle_and_dragging_moves_on(open_page: Opener, merged: Path) -> None:
+    visit = open_page(merged)
+    visit.page.locator(".time").fill("20")
+    whole = visit.canvases()
+    visit.page.locator(".zoom").select_option("16")
+    near = visit.canvases()
+    visit.page.locator("canvas").first.scroll_into_view_if_needed()
+    box = visit.page.locator("canvas").first.bounding_box()
+    assert box is not None
+    visit.page.mouse.move(box["x"] + 200, box["y"] + 20)
+    visit.page.mouse.down()
+    visit.page.mouse.move(box["x"] + 40, box["y"] + 20, steps=4)
+    visit.page.mouse.up()
+    moved = visit.canvases()
+    visit.page.locator(".zoom").select_option("1")
+    for panel in range(2):
+        assert len({whole[panel], near[panel], moved[panel]}) == 3, "both roads move together"
+    assert visit.canvases() == whole
+
+
+def test_a_wide_table_says_that_there_is_more_of_it(open_page: Opener, trained: Path) -> None:
+    scroll = "document.querySelector('.scroll')"
+    for size in (PHONE, LAPTOP):
+        page = open_page(trained, size).page
+        wide = page.evaluate(f"{scroll}.scrollWidth > {scroll}.clientWidth + 1")
+        assert page.evaluate(f"getComputedStyle({scroll}, '::before').content.includes('swipe')") is wide
+        assert wide is (size == PHONE)
+
+
+def test_at_night_paper_is_dark_and_letters_are_light(open_page: Opener, driven: Path) -> None:
+    page = open_page(driven).page
+    style = "getComputedStyle(document.querySelector('section'))"
+    colours = f"['background', 'color'].map(name => {style}[name].match(/\\d+/g)[0])"
+    day = [int(part) for part in page.evaluate(colours)]
+    page.emulate_media(color_scheme="dark")
+    night = [int(part) for part in page.evaluate(colours)]
+    assert day[0] > 200 > 80 > day[1]
+    assert night[0] < 80 < 200 < night[1]
 
 
 @pytest.mark.parametrize("size", [LAPTOP, PHONE], ids=["laptop", "phone"])

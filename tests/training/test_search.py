@@ -202,7 +202,7 @@ def test_a_search_of_which_all_fails_says_so(tmp_path: Path, trainings: Training
 
 def test_without_optuna_one_line_says_how_to_get_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "optuna", None)
-    with pytest.raises(MissingPartError, match=r"pip install 'unjam\[search\]'"):
+    with pytest.raises(MissingPartError, match="pip install optuna"):
         search(BASE, SPACE, 2, tmp_path / "it", 1)
     assert not (tmp_path / "it").exists()
 

@@ -18,7 +18,7 @@ from unjam.cli.results import certify, evaluate, export, model, report, verify
 from unjam.cli.runs import runs
 from unjam.cli.train import reproduce, search, train
 from unjam.cli.tune import tune
-from unjam.errors import DISK_ERRNOS, InputError, UnjamError, disk_error, wrong
+from unjam.errors import DISK_ERRNOS, InputError, UnjamError, disk_error, without_train, wrong
 from unjam.processes import end_with_parent
 
 INTERRUPTED = 130
@@ -82,6 +82,9 @@ def _run() -> int:
         return app(standalone_mode=False) or 0
     except UnjamError as error:
         return _say(str(error), error.exit_code)
+    except ModuleNotFoundError as error:
+        missing = without_train(error)
+        return _say(str(missing), missing.exit_code)
     except OSError as error:
         if error.errno in DISK_ERRNOS:
             return _say(str(disk_error(error, error.filename or "output")), 74)

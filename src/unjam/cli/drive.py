@@ -148,7 +148,7 @@ def watch(
     row = measure(episode)
     if episode.ok and video is not None:
         aside.print("drawing")
-        write_video(episode, video, driven.describe(), pace)
+        write_video(episode, video, driver, pace)
     if json:
         film = str(video) if video else None
         print_json({"scenario": scenario, "driver": driver, "video": film, "episode": row})

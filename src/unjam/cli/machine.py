@@ -21,6 +21,8 @@ RESULTS_SUMO = "1.28.0"
 """version of SUMO that all results of the documentation were made with"""
 TESTED_SUMO = RESULTS_SUMO.rpartition(".")[0]
 """minor version of SUMO that is supported"""
+TORCH_CPU = "https://download.pytorch.org/whl/cpu"
+"""index of builds of torch that are a tenth of the size of those for graphics cards"""
 
 
 def doctor(json: JsonOption = False) -> None:
@@ -72,7 +74,7 @@ def check_health() -> list[Check]:
         _sumo_package("traci", needed=False),
         _sumo_of_results(),
         _try("netconvert", lambda: sumo_program("netconvert"), sumo),
-        *map(_package, ("torch", "stable-baselines3", "sb3-contrib")),
+        *map(_learning, ("torch", "stable-baselines3", "sb3-contrib")),
         _cache(),
         _files_of_others(),
         Check("display", display, "there" if display else "none", no_display, needed=False),
@@ -86,6 +88,12 @@ def _package(name: str) -> Check:
         return Check(name, True, version(name))
     except PackageNotFoundError:
         return Check(name, False, "not installed", f"pip install {name}")
+
+
+def _learning(name: str) -> Check:
+    check = _package(name)
+    remedy = "only what learns needs it: pip install 'unjam[train]' --extra-index-url " + TORCH_CPU
+    return Check(name, check.ok, check.found, remedy, needed=False)
 
 
 def _sumo_package(name: str, needed: bool = True) -> Check:
@@ -134,7 +142,7 @@ def _files_of_others() -> Check:
 def _video() -> Check:
     check = _package("imageio-ffmpeg")
     found = f"imageio-ffmpeg {check.found}" if check.ok else check.found
-    remedy = "" if check.ok else "pip install 'unjam[video]'; .gif and .webp work without"
+    remedy = "" if check.ok else "pip install imageio-ffmpeg; .gif and .webp work without"
     return Check("mp4 video", check.ok, found, remedy, needed=False)
 
 

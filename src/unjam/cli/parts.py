@@ -186,7 +186,8 @@ def fit_drivers(
     format: Annotated[
         str,
         typer.Option(
-            help="table, ngsim, ngsim-reconstructed, openacc.", show_default="told from the columns"
+            help="table, ngsim, ngsim-reconstructed, highd, openacc, fcd.",
+            show_default="told from the columns",
         ),
     ] = "",
     driver: Annotated[

@@ -43,6 +43,9 @@ def train(
         Path | None,
         typer.Option(help="Go on with this run: after a stop, or with more --steps after its end."),
     ] = None,
+    tensorboard: Annotated[
+        bool, typer.Option("--tensorboard", help="Write curves for: tensorboard --logdir FOLDER.")
+    ] = False,
     json: JsonOption = False,
 ) -> None:
     """Train a residual on an expert, judge it on held-out seeds, write a report.
@@ -87,15 +90,23 @@ def train(
         signed,
         verdict_on,
     )
+    from unjam.training.config import steps_to_train
     from unjam.training.evaluate import Evaluation
-    from unjam.training.train import steps_to_train
+    from unjam.training.tensorboard import tensorboard_into
     from unjam.training.train import train as run
 
     if resume is None and (steps := steps_to_train(config)) > MUCH_MORE * config.steps:
         aside.print(f"note: iterations are whole: {steps:,} steps will be trained, not {config.steps:,}")
+    board = tensorboard_into(folder) if tensorboard else None
     progress = nullcontext() if json else _Progress(config.steps, folder)
     with resumable(folder, workers), progress as shown:
-        result = run(config, folder, resume is not None, shown and shown.iteration, shown and shown.judging)
+
+        def row_written(row: dict[str, Any]) -> None:
+            for tell in (board, shown and shown.iteration):
+                if tell:
+                    tell(row)
+
+        result = run(config, folder, resume is not None, row_written, shown and shown.judging)
 
     def facts(of: Any) -> dict[str, Any]:
         files = {"folder": str(of.folder), "controller": str(of.controller), "report": str(result.report)}

@@ -229,4 +229,4 @@ def needed(name: str) -> Any:
     try:
         return import_module(name)
     except ImportError:
-        raise MissingPartError(f"{name} is not installed; install it: pip install 'unjam[onnx]'") from None
+        raise MissingPartError(f"{name} is not installed; install it: pip install 'unjam[train]'") from None

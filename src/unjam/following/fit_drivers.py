@@ -18,8 +18,8 @@ from unjam.errors import InputError, wrong, wrong_name
 from unjam.files import check_folder
 from unjam.following.calibration import SEARCHED, Calibrated, CalibrationSettings, calibrate, calibrate_each
 from unjam.following.loaders import Reading, read_pairs
-from unjam.following.networks import Known, MultiStepSettings, fit_multi_step
 from unjam.following.pairs import Pair, of_split, split_by_trajectory
+from unjam.following.settings import MultiStepSettings
 from unjam.manifest import manifest
 from unjam.parameters import STRICT, Count, CountOrNone, build, nested
 from unjam.physics.idm import IDMParameters
@@ -231,6 +231,8 @@ def _residual(
     pairs: Sequence[Pair], found: dict[str, Calibrated], settings: FitDriversSettings
 ) -> tuple[Network | None, dict[str, Any]]:
     """Return the residual, None where it is of no use, and how it did."""
+    from unjam.following.networks import Known, fit_multi_step  # and torch, which IDMs do without
+
     chosen = split_by_trajectory(pairs, (1.0 - VALIDATION_SHARE, VALIDATION_SHARE, 0.0), settings.seed)
     known, validation = (
         Known(part, [found[pair.driver].parameters for pair in part])

@@ -1,11 +1,10 @@
-"""Reading car-following data: a plain table, and the public formats of NGSIM and OpenACC.
+"""Reading car-following data: a plain table, the public formats of NGSIM, highD and OpenACC, and SUMO's own.
 
 Every number is checked, and nothing is left out without a word.
 """
 
 import re
 from collections.abc import Callable, Hashable, Iterable
-from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +12,7 @@ import pandas as pd
 
 from unjam.errors import InputError, wrong_name
 from unjam.following.pairs import Pair
+from unjam.following.recorded import BadRow, Reading, Recorded
 
 COLUMNS = ("pair", "time", "speed", "leader_speed", "gap")
 """what every row must have: [s], [m/s], [m/s], [m]"""
@@ -23,8 +23,6 @@ ALLOWED = {"speed": (0.0, 70.0), "leader_speed": (0.0, 70.0), "gap": (0.0, 1000.
 """what a vehicle on a road can do; beyond it the units are wrong, or the row is"""
 ROUGHNESS = 0.01
 """by how much moments may be unevenly spaced, relative to the time step"""
-LISTED = 5
-"""bad rows that a message names"""
 FOOT = 0.3048
 """[m]"""
 VEHICLE_LENGTHS = (3.0, 8.0)
@@ -40,57 +38,23 @@ RECONSTRUCTED = {
     **{"meanspeed": "speed", "vehiclelength": "length", "leaderid": "leader"},
 }
 """of those of the reconstructed NGSIM I-80 (Montanino and Punzo 2015), by letters alone"""
+HIGHD = {
+    **{"id": "vehicle", "frame": "time", "x": "front", "width": "length", "xVelocity": "speed"},
+    **{"laneId": "lane", "precedingId": "leader"},
+}
+"""of those of the tracks of highD (Krajewski et al. 2018)"""
+HIGHD_RATE = 25.0
+"""frames of highD per second"""
+FCD = {
+    **{"timestep_time": "time", "vehicle_speed": "speed"},
+    **{"vehicle_leaderSpeed": "leader_speed", "vehicle_leaderGap": "gap"},
+}
+"""of those of SUMO's FCD output as CSV, which has leaders with --fcd-output.max-leader-distance"""
 RECONSTRUCTED_ORDER = (
     *("vehicleid", "frameid", "laneid", "localy", "meanspeed"),
     *("meanaccel", "vehiclelength", "vehicleclassid", "followerid", "leaderid"),
 )
 """columns of its files, which have no header"""
-
-
-@dataclass(frozen=True)
-class Reading:
-    """How a file is read."""
-
-    cut_bad: bool = False
-    """whether bad rows are cut out, and end their trajectory, instead of refused"""
-    shortest: float = 20.0
-    """trajectories shorter than that are left out, and counted [s]"""
-    driver: tuple[str, ...] = ()
-    """plain tables: columns that together name the driver, where `driver` is not one"""
-    kind: tuple[str, ...] = ()
-    """plain tables: columns that together name the kind of driver, where `kind` is not one"""
-
-
-@dataclass(frozen=True)
-class BadRow:
-    """A row that cannot be used."""
-
-    line: int
-    """in the file, its header being line 1"""
-    why: str
-
-
-@dataclass(frozen=True)
-class Recorded:
-    """What a file holds."""
-
-    pairs: list[Pair] = field(repr=False)
-    rows: int
-    """in the file"""
-    bad: list[BadRow]
-    """rows that were cut out, with what was wrong"""
-    left_out: dict[str, int]
-    """rows that are not wrong but of no use, by reason"""
-
-    def words(self) -> list[str]:
-        """Return lines that say what was read and what was not."""
-        moments = sum(len(pair.speed) for pair in self.pairs)
-        lines = [f"{len(self.pairs)} trajectories with {moments:,} of {self.rows:,} rows"]
-        lines += [f"left out: {count:,} rows: {why}" for why, count in self.left_out.items() if count]
-        lines += [f"cut out: line {row.line}: {row.why}" for row in self.bad[:LISTED]]
-        if len(self.bad) > LISTED:
-            lines.append(f"cut out: {len(self.bad) - LISTED} more bad rows")
-        return lines
 
 
 def read_pairs(path: Path, format: str = "", reading: Reading | None = None) -> Recorded:
@@ -136,6 +100,30 @@ def _reconstructed(frame: pd.DataFrame, path: Path, reading: Reading) -> Recorde
     vehicles = _columns(frame.rename(columns=_plain), RECONSTRUCTED, path)
     vehicles = vehicles.assign(place=path.stem, time=vehicles["time"] / 10.0)
     return _behind_leaders(vehicles, path, reading)
+
+
+def _highd(frame: pd.DataFrame, path: Path, reading: Reading) -> Recorded:
+    """Return the trajectories of a file of highD, in which x is the left end of a vehicle's box.
+
+    On one of the two carriageways all drive towards smaller x: there places count the other way.
+    """
+    vehicles = _columns(frame, HIGHD, path)
+    onwards = vehicles["speed"] >= 0
+    front = (vehicles["front"] + vehicles["length"]).where(onwards, -vehicles["front"])
+    moving = {"front": front, "speed": vehicles["speed"].abs(), "time": vehicles["time"] / HIGHD_RATE}
+    return _behind_leaders(vehicles.assign(place=path.stem, **moving), path, reading)
+
+
+def _fcd(frame: pd.DataFrame, path: Path, reading: Reading) -> Recorded:
+    """Return the trajectories of SUMO's FCD output: a vehicle behind one leader in one lane is a pair."""
+    told = ("vehicle_id", "vehicle_leaderID", "vehicle_lane")
+    vehicles = _columns(frame, FCD, path)
+    _check_columns(frame, told, path)
+    alone = vehicles["gap"] < 0
+    vehicles = vehicles.assign(
+        pair=_joined(frame, told), driver=frame["vehicle_id"].astype(str), kind="simulated"
+    )
+    return _trajectories(vehicles.loc[~alone], path, reading, {"nobody ahead": int(np.count_nonzero(alone))})
 
 
 def _behind_leaders(vehicles: pd.DataFrame, path: Path, reading: Reading) -> Recorded:
@@ -190,6 +178,8 @@ FORMATS: dict[str, Callable[[pd.DataFrame, Path, Reading], Recorded]] = {
     "ngsim": _ngsim,
     "ngsim-reconstructed": _reconstructed,
     "openacc": _openacc,
+    "highd": _highd,
+    "fcd": _fcd,
 }
 
 
@@ -204,7 +194,9 @@ def _read(path: Path) -> pd.DataFrame:
         else:
             header, about = _header(path)
             bare = {"names": list(RECONSTRUCTED_ORDER), "header": None} if header < 0 else {}
-            frame = pd.read_csv(path, skiprows=max(0, header), skipinitialspace=True, **bare)
+            with open(path, encoding="utf-8-sig") as file:
+                mark = ";" if file.readline().startswith("timestep_") else ","  # SUMO's, and everybody's
+            frame = pd.read_csv(path, sep=mark, skiprows=max(0, header), skipinitialspace=True, **bare)
     except (ValueError, OSError, UnicodeDecodeError) as error:
         raise InputError(f"{path.name}: cannot be read: {' '.join(str(error).split())}") from None
     frame = frame.assign(line=np.arange(len(frame)) + header + 2)
@@ -233,6 +225,9 @@ def _told_format(frame: pd.DataFrame) -> str:
         return "ngsim"
     if RECONSTRUCTED.keys() <= set(map(_plain, names)):
         return "ngsim-reconstructed"
+    for name, columns in (("highd", HIGHD), ("fcd", {"timestep_time", "vehicle_id"})):
+        if names >= set(columns):
+            return name
     return "openacc" if {"Speed1", "IVS1"} <= names else "table"
 
 

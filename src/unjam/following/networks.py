@@ -9,13 +9,10 @@ import itertools
 from collections.abc import Sequence
 from copy import deepcopy
 from dataclasses import dataclass, field
-from typing import Annotated
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from pydantic import Field
-from pydantic.dataclasses import dataclass as checked_dataclass
 from torch import Tensor, nn
 
 from unjam.drivers.network import Network
@@ -31,7 +28,7 @@ from unjam.following.open_loop import (
     with_residual,
 )
 from unjam.following.pairs import DRIVEN, Floats, Moments, Pair, Stretches, moments_of, stretches_of
-from unjam.parameters import STRICT, Count, NotNegative, Positive
+from unjam.following.settings import MultiStepSettings, NetworkSettings
 from unjam.physics.idm import IDMParameters, IDMRows, parameter_rows
 from unjam.scenarios.population import RESIDUAL_INPUTS, residual_inputs
 
@@ -39,50 +36,6 @@ SMALLEST = 1e-2
 """what is added to a mean square before its root [m2]: a perfect trajectory has no infinite slope"""
 LARGEST_GRADIENT = 1.0
 """norm to which gradients are cut: those through many steps can be very long"""
-
-Hidden = Annotated[tuple[Count, ...], Field(min_length=1)]
-
-
-@checked_dataclass(frozen=True, config=STRICT)
-class NetworkSettings:
-    """A network and how it learns single accelerations; the defaults are the paper's."""
-
-    hidden: Hidden = (128, 128)
-    """units of the hidden layers"""
-    rate: Positive = 1e-4
-    """learning rate of Adam"""
-    batch: Count = 1024
-    """moments in a gradient step"""
-    epochs: Count = 200
-    """most passes over the moments"""
-    patience: Count = 200
-    """passes without progress in validation after which learning ends; as many as `epochs`: never"""
-    authority: Positive = 8.0
-    """largest acceleration that it may answer [m/s2]: no network answers what no car can do"""
-
-
-@checked_dataclass(frozen=True, config=STRICT)
-class MultiStepSettings:
-    """A network and how it learns, as a residual, from simulated driving."""
-
-    hidden: Hidden = (32, 32)
-    """units of the hidden layers"""
-    authority: Positive = 2.0
-    """largest residual [m/s2]"""
-    seconds: Positive = 30.0
-    """length of the stretches that are simulated"""
-    batch: Count = 64
-    """stretches in a gradient step"""
-    steps: Count = 120
-    """gradient steps"""
-    rate: Positive = 1e-3
-    """learning rate of Adam, which falls to zero as a cosine"""
-    speed_weight: NotNegative = 2.0
-    """how much an error of the speed by 1 m/s counts beside one of the gap by 1 m"""
-    residual_weight: NotNegative = 0.1
-    """how much the squared residual counts: where data are silent, the base drives"""
-    validate_every: Count = 20
-    """gradient steps between two judgements on the validation trajectories, which choose the weights"""
 
 
 class FollowingNetwork(nn.Module):

@@ -108,9 +108,9 @@ def algorithm_1(
     budget: int,
     collect: Callable[[Network, int], Collected],
     validate: Callable[[Iteration], Validated],
-    write: Callable[[Iteration, Validated], None],
+    write: Callable[[Iteration, Validated], object],
 ) -> None:
-    """Learn until `budget` actual steps were made in all; a stop loses at most the running iteration.
+    """Learn until `budget` actual steps were made, or `write` says stop; an end loses at most an iteration.
 
     Args:
         training: where to begin; it goes on in place.
@@ -118,7 +118,7 @@ def algorithm_1(
         collect: (pi_theta, iteration) -> the episodes of an iteration, driven with exploration.
         validate: judges the policy as it is now, where it is time to, and keeps it if it is the best.
         write: writes progress and a checkpoint: what an iteration did, what `validate` says, and the state
-            of `training`.
+            of `training`; what is true ends the training.
 
     Raises:
         UnjamError: an observation, a reward or a parameter is not finite; it names the first.
@@ -175,7 +175,8 @@ def algorithm_1(
         done = Iteration(
             training.iteration, episodes, training.actual_steps, virtual_steps, facts, log, seconds
         )
-        write(done, validate(done))
+        if write(done, validate(done)):
+            return
 
 
 def plan_updates(training: Training) -> list[tuple[bool, int, int]]:

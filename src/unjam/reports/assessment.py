@@ -17,8 +17,9 @@ from unjam.measures.effect import FLOW_LOST, LEAST_JUDGED
 from unjam.measures.recommendation import percent
 from unjam.measures.statistics import Estimate, signed
 from unjam.measures.table import cell_of
-from unjam.reports.figures import INK, LINES, STYLE, data_uri, new_figure, space_time
-from unjam.reports.html import filled
+from unjam.reports.figures import INK, LINES, STYLE, data_uri, new_figure
+from unjam.reports.html import filled, page_part
+from unjam.reports.lanes import drawn_by_lane, space_time_of
 from unjam.reports.results import command_to_repeat, read_results
 
 ASSESSMENT_FILE, ASSESSMENT_PAGE = "assessment.json", "assessment.html"
@@ -63,8 +64,10 @@ def render_assessment(folder: Path) -> str:
         table=_table(found),
         tried=[_tried(each) for each in tried],
         effects=data_uri(effects(found)),
-        space_time=data_uri(space_time(panels)) if panels else "",
+        space_time=data_uri(space_time_of(panels)) if panels else "",
         panels=[panel.driver for panel in panels],
+        by_lane=drawn_by_lane(panels),
+        downloads=Markup(page_part("downloads.js")),
         percent=percent,
         named=breakable,
         most_lost=FLOW_LOST,
@@ -169,7 +172,7 @@ def effects(found: dict[str, Any]) -> Figure:
             for each in found[group]:
                 number, effect = drivers.index(each["driver"]), each["effect"]
                 place = shares.index(each["share"]) + 0.7 * ((number + 0.5) / len(drivers) - 0.5)
-                scale = 100.0 / effect[people]
+                scale = 100.0 / effect[people] if effect[people] else nan  # nobody left in so short a time
                 place += 0.06 if group == "judged" else 0.0
                 look = {"color": LINES[(number + 1) % len(LINES)], "alpha": alpha}
                 axes.plot(

@@ -129,10 +129,15 @@ def space_time(shown: Sequence[Shown]) -> Figure:
                 axes.tick_params(labelbottom=True)
     for axes in panels.flat:
         axes.set_visible(bool(axes.collections))
+    add_speed_bar(figure, panels, scale)
+    return figure
+
+
+def add_speed_bar(figure: Figure, panels: np.ndarray, scale: Normalize) -> None:
+    """Draw beside all panels which colour is which speed."""
     bar = figure.colorbar(ScalarMappable(scale, SPEED_COLOURS), ax=panels, shrink=0.8, pad=0.02, aspect=30)
     bar.set_label("speed [m/s]")
     bar.outline.set_visible(False)  # pyright: ignore[reportCallIssue]
-    return figure
 
 
 def _on_branch(episode: Shown, branch: str, main: bool) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from textwrap import fill
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
@@ -23,6 +24,8 @@ OVERSAMPLING = 2
 SMALLEST_LENGTH = 7.0
 """pixels of a vehicle's length on a large road, where a true one could not be seen"""
 ROAD = "#dfe3e8"
+LETTERS = 36
+"""of a title in a line: it lies within a ring"""
 EMPTY_CENTRE = 0.15
 """share of the road's size that must be empty around its centre for words to stand there"""
 FRAMES_PER_SECOND = 20
@@ -116,7 +119,7 @@ def write_video(episode: Episode, path: Path, title: str, pace: float = 10.0) ->
     Raises:
         InputError: another kind of file.
         DiskError: there is no folder for it.
-        MissingPartError: .mp4 without the extra `video`.
+        MissingPartError: .mp4 without imageio-ffmpeg.
     """
     check_format(path)
     check_folder(path)
@@ -144,7 +147,7 @@ def _write_mp4(frames: Iterator[Image.Image], path: Path, rate: float) -> None:
     try:
         import imageio_ffmpeg
     except ImportError:
-        raise MissingPartError("video: .mp4 needs imageio-ffmpeg: pip install 'unjam[video]'") from None
+        raise MissingPartError("video: .mp4 needs imageio-ffmpeg: pip install imageio-ffmpeg") from None
     writer = imageio_ffmpeg.write_frames(
         str(path),
         (SIZE, SIZE),
@@ -164,4 +167,4 @@ def _frames(episode: Episode, title: str, every: int) -> Iterator[Image.Image]:
     for moment, scene in zip(moments, scenes(episode, moments), strict=True):
         there = scene.speeds[~np.isnan(scene.speeds)]
         mean = f"mean {there.mean():.1f} m/s" if len(there) else "nobody on the road"
-        yield draw_road(scene, fastest, f"{title}\n{moment * episode.step:5.0f} s\n{mean}")
+        yield draw_road(scene, fastest, f"{fill(title, LETTERS)}\n{moment * episode.step:5.0f} s\n{mean}")

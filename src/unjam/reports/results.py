@@ -23,14 +23,16 @@ EVALUATION_FILE = "evaluation.json"
 """what was measured of each driver"""
 MODEL_FILE = "model.json"
 """what there is to see of a run's virtual environment"""
-PICTURED = ("speeds", "positions", "gaps", "outline", "waiting", "lines", "places")
+PICTURED = ("speeds", "positions", "gaps", "outline", "waiting", "lines", "places", "lanes")
 """arrays of an episode that pictures are made of"""
-BY_VEHICLE = ("speeds", "positions", "gaps", "places")
+BY_VEHICLE = ("speeds", "positions", "gaps", "places", "lanes")
 """those with a row per moment and a column per vehicle"""
+IN_NO_LANE = -1
+"""lanes are stored as small integers, which have no NaN"""
 STORED = (*PICTURED, "there")
 ABOUT_SHOWN = (
     *("step", "seed", "drawn", "loop_length", "crossings", "branches", "limit_speed"),
-    *("vehicle_ids", "cav_ids"),
+    *("vehicle_ids", "cav_ids", "lane_names"),
 )
 """what is written of an episode that pictures show, beside its arrays"""
 
@@ -59,6 +61,8 @@ class Shown:
     waiting: Floats
     lines: Floats
     places: Floats
+    lanes: Floats = field(default_factory=lambda: np.zeros((0, 0), np.float32))
+    lane_names: list[str] = field(default_factory=list)
 
     @property
     def closed(self) -> bool:
@@ -93,6 +97,8 @@ def packed(shown: Shown) -> dict[str, Floats]:
     if there.all():
         return arrays
     kept = {name: array[there] for name, array in arrays.items() if array.shape[:2] == there.shape}
+    if "lanes" in kept:
+        kept["lanes"] = np.nan_to_num(kept["lanes"], nan=IN_NO_LANE).astype(np.int8)
     return {**arrays, **kept, "there": there}
 
 
@@ -105,7 +111,7 @@ def unpacked(arrays: dict[str, Any]) -> dict[str, Any]:
     for name, array in arrays.items():
         if len(array) == there.sum() and name in BY_VEHICLE:
             whole[name] = np.full((*there.shape, *array.shape[1:]), np.nan, np.float32)
-            whole[name][there] = array
+            whole[name][there] = np.where(array == IN_NO_LANE, np.nan, array) if name == "lanes" else array
     return {**arrays, **whole}
 
 

@@ -5,7 +5,8 @@ import pandas as pd
 from unjam.measures.metrics import METRICS
 from unjam.measures.statistics import summarise
 from unjam.measures.table import Rows, baseline_of, headings_of, table_of
-from unjam.reports.figures import data_uri, space_time
+from unjam.reports.figures import data_uri
+from unjam.reports.lanes import space_time_of
 from unjam.reports.results import shown_of
 from unjam.worlds.record import Episode
 
@@ -44,5 +45,5 @@ def html_of(rows_by_driver: Rows, shown: dict[str, Episode]) -> str:
     table = pd.DataFrame(cells, columns=headings).to_html(index=False, border=0)
     if not shown:
         return table
-    picture = data_uri(space_time([shown_of(label, episode) for label, episode in shown.items()]))
+    picture = data_uri(space_time_of([shown_of(label, episode) for label, episode in shown.items()]))
     return f'{table}<img style="max-width: 100%" alt="every vehicle over time, dark is slow" src="{picture}">'

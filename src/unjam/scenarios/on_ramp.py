@@ -139,6 +139,7 @@ class OnRamp(Scenario):
             kinds=kinds,
             cav_ids=self._chosen(draws),
             lanes=_lanes(self.lanes),
+            ways=("ramp", "motorway") if self.lanes == 1 else ("ramp", "right lane", "left lane"),
             merge=BEFORE,
             length=BEFORE + MERGING + AFTER,
             vehicle_length=self.vehicle_length,

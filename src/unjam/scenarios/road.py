@@ -202,6 +202,8 @@ class MotorwayRoad(BuiltRoad):
     """vehicles that a driver drives"""
     lanes: tuple[Lane, ...]
     """of all edges"""
+    ways: tuple[str, ...]
+    """names of the ways that lanes join to, from right to left"""
     merge: float
     """where along the main road the ramp's lane begins to run beside it [m]"""
     length: float

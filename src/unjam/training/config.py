@@ -1,7 +1,9 @@
 """Everything that decides what a training run does: one validated configuration, as TOML and flags."""
 
 import tomllib
+from collections.abc import Sequence
 from dataclasses import asdict, field, replace
+from math import ceil
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -38,6 +40,8 @@ class EvaluationSettings:
 
     every: CountOrNone = 5
     """iterations between two validations; 0: none, and the last policy becomes the controller"""
+    patience: CountOrNone = 0
+    """validations in a row without a new best after which training ends; 0: it goes on to `steps`"""
     validation_episodes: Count = 4
     """episodes of a validation, the same seeds each time: they choose the controller"""
     episodes: Count = 20
@@ -159,6 +163,20 @@ class RunConfig(Agents):
         step = self.make_scenario().decision_step
         expert = make_driver(self.expert, step)
         return Remembering(expert, step) if self.policy.remember else expert
+
+
+def episodes_of_iteration(tasks: Sequence[Task], steps: int) -> list[int]:
+    """Return how many episodes an iteration of so many actual steps has on each road, at least one."""
+    total = sum(task.weight for task in tasks)
+    return [max(1, ceil(round(task.weight / total * steps / task.scenario.horizon, 9))) for task in tasks]
+
+
+def steps_to_train(config: RunConfig) -> int:
+    """Return how many actual steps a new training will make: whole iterations, unless episodes end early."""
+    tasks = config.make_tasks()
+    counts = episodes_of_iteration(tasks, config.learner.batch_steps)
+    each = sum(count * task.scenario.horizon for count, task in zip(counts, tasks, strict=True))
+    return ceil(config.steps / each) * each
 
 
 def load_config(

@@ -7,7 +7,7 @@ are made at the end of iterations: written whole, checked by hash, two generatio
 import hashlib
 import json
 import shutil
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -143,6 +143,16 @@ def save_checkpoint(folder: Path, state: dict[str, Any], tensors: "Tensors") -> 
     said = json.dumps({**state, "sha256": _hash(state, data)}, indent=1)
     write_folder(folder / f"{state['iteration']:06d}", {TENSORS: data, STATE: said})
     _sweep(folder)
+
+
+def gave_up(config: RunConfig, progress: Sequence[dict[str, Any]]) -> bool:
+    """Return whether so many validations in a row found nothing better that `evaluation.patience` is over."""
+    found = [value for row in progress if (value := row.get("return_validation")) is not None]
+    if not config.evaluation.patience or not found:
+        return False
+    best = max(range(len(found)), key=found.__getitem__)
+    since = len(found) - 1 - best if found[best] > progress[0]["return_expert"] else len(found)
+    return since >= config.evaluation.patience
 
 
 def last_state(

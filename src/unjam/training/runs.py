@@ -13,7 +13,7 @@ from unjam.parameters import flat
 from unjam.processes import is_owned, owned
 from unjam.reports.results import DAMAGED, EVALUATION_FILE, damaged, read_about, read_progress
 from unjam.training.config import RunConfig
-from unjam.training.folder import MANIFEST, read_config
+from unjam.training.folder import MANIFEST, gave_up, read_config
 
 State = Literal["running", "finished", "stopped"]
 
@@ -83,7 +83,8 @@ def read_run(folder: Path, name: str = "") -> Run:
     except DAMAGED as error:
         raise damaged(folder, error) from None
     judged = all((folder / road / EVALUATION_FILE).is_file() for road in gains)
-    done: State = "finished" if judged and steps >= config.steps else "stopped"
+    over = steps >= config.steps or gave_up(config, progress)
+    done: State = "finished" if judged and over else "stopped"
     return Run(name or str(folder), folder, config, "running" if is_owned(folder) else done, steps, gains)
 
 

@@ -206,7 +206,7 @@ def quiet_optuna(verb: str) -> Any:
     try:
         import optuna
     except ImportError:
-        raise MissingPartError(f"{verb}: optuna is not installed: pip install 'unjam[search]'") from None
+        raise MissingPartError(f"{verb}: optuna is not installed: pip install optuna") from None
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     return optuna
 

@@ -3,7 +3,6 @@
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from math import ceil
 from pathlib import Path
 from typing import Any
 
@@ -21,8 +20,9 @@ from unjam.measures.metrics import measure
 from unjam.measures.statistics import Estimate, paired_difference
 from unjam.processes import owned
 from unjam.reports.html import write_report
+from unjam.reports.results import read_progress
 from unjam.training.belonging import belonging
-from unjam.training.config import RunConfig, to_toml
+from unjam.training.config import RunConfig, episodes_of_iteration, to_toml
 from unjam.training.controllers import KeptControllers
 from unjam.training.evaluate import TRAINED, Progress, Rows, judge, raise_failure
 from unjam.training.executors import OnIteration, train_apart
@@ -30,6 +30,7 @@ from unjam.training.folder import (
     PROGRESS,
     check_possible,
     continue_folder,
+    gave_up,
     last_state,
     make_new_folder,
     note_lineage,
@@ -40,7 +41,6 @@ from unjam.training.folder import (
 )
 from unjam.training.model_facts import write_model_facts
 from unjam.training.seeds import VALIDATE
-from unjam.worlds.episode import Task
 from unjam.worlds.workers import EpisodeTask, Workers
 
 MEANS = (
@@ -161,20 +161,6 @@ def gain_of(config: RunConfig, rows: Rows) -> Estimate | None:
     return paired_difference(rows[TRAINED], rows[config.make_expert().describe()], "return")
 
 
-def episodes_of_iteration(tasks: Sequence[Task], steps: int) -> list[int]:
-    """Return how many episodes an iteration of so many actual steps has on each road, at least one."""
-    total = sum(task.weight for task in tasks)
-    return [max(1, ceil(round(task.weight / total * steps / task.scenario.horizon, 9))) for task in tasks]
-
-
-def steps_to_train(config: RunConfig) -> int:
-    """Return how many actual steps a new training will make: whole iterations, unless episodes end early."""
-    tasks = config.make_tasks()
-    counts = episodes_of_iteration(tasks, config.learner.batch_steps)
-    each = sum(count * task.scenario.horizon for count, task in zip(counts, tasks, strict=True))
-    return ceil(config.steps / each) * each
-
-
 class Trainer:
     """What Algorithm 1 needs around it: episodes from the workers, validation, and the run's folder.
 
@@ -246,8 +232,11 @@ class Trainer:
         iteration.seconds["validation"] = time.perf_counter() - started
         return found
 
-    def write(self, iteration: Iteration, validated: Validated) -> None:
-        """Write a row of progress, of the whole run and of each road, and a checkpoint."""
+    def write(self, iteration: Iteration, validated: Validated) -> bool:
+        """Write a row of progress, of the whole run and of each road, and a checkpoint.
+
+        Return whether it is time to stop: `evaluation.patience` is over.
+        """
         rows = [self._row(iteration, validated, index) for index in range(len(self.tasks))]
         whole = rows[0]
         if self.config.tasks:
@@ -274,6 +263,7 @@ class Trainer:
         }
         save_checkpoint(self.folder / "checkpoint", state, {**tensors, **self._controllers.tensors()})
         self._on_iteration(whole)
+        return gave_up(self.config, read_progress(self.folder))
 
     def returns_of(self, drivers: Sequence[Driver]) -> list[float]:
         """Return the mean return on the validation seeds, by road, each driven by its own of `drivers`."""

@@ -164,6 +164,11 @@ class Episode:
     places: Floats = field(default_factory=lambda: np.zeros((0, 0, 3)))
     """(x, y, heading) of front bumpers on a road with ends [m, rad], shape (T + 1, N, 3); no rows where not
     recorded"""
+    lanes: Floats = field(default_factory=lambda: np.zeros((0, 0)))
+    """which of `lane_names` each vehicle is in, shape (T + 1, N), NaN where in none of them; (0, 0) where not
+    recorded"""
+    lane_names: tuple[str, ...] = ()
+    """of a road with lanes, from left to right as one drives"""
     terms: dict[str, Floats] = field(default_factory=dict)
     """terms of the reward by name, shape (T,)"""
     trajectories: tuple[Trajectory, ...] = ()

@@ -20,6 +20,7 @@ from unjam.worlds.sumo import make_traffic
 from unjam.worlds.sumo.own import OwnTraffic
 from unjam.worlds.sumo.simulation import Simulation
 from unjam.worlds.workers import EpisodeTask, Workers
+from unjam.worlds.world import Driven
 
 
 @pytest.fixture(scope="module", params=["ramp", "cross", "grid"])
@@ -217,6 +218,28 @@ def test_an_episode_is_measured_without_complaint(file: Path, simulation: Simula
     assert row["throughput_veh_per_h"] == pytest.approx(found.arrived / (200 * found.step) * 3600)
     assert 0.2 < row["speed_limit_ratio"] < 1.2
     assert row["fuel_ml_per_km"] > 20
+
+
+def test_lanes_count_from_the_left_and_are_those_that_sumo_says(
+    tmp_path: Path, simulation: Simulation
+) -> None:
+    traffic = own(simulation, game(tmp_path, "ramp"))
+    for _ in range(60):
+        traffic.advance(Command(np.zeros(len(traffic.cavs))))
+    here = {
+        name: (libsumo.vehicle.getRoadID(name), libsumo.vehicle.getLaneIndex(name))
+        for name in libsumo.vehicle.getIDList()
+    }
+    episode = traffic.record(Driven())
+    column, seen = {name: number for number, name in enumerate(episode.vehicle_ids)}, set()
+    for name, (edge, index) in here.items():
+        lane = episode.lanes[-1, column[name]]
+        assert np.isnan(lane) == np.isnan(episode.positions[-1, column[name]]), "lanes of the route alone"
+        if not np.isnan(lane):
+            assert lane == libsumo.edge.getLaneNumber(edge) - 1 - index
+            seen.add(episode.lane_names[int(lane)])
+    assert "left lane" in seen
+    assert len(seen) > 1
 
 
 def test_positions_are_along_the_route_that_most_drive(file: Path, simulation: Simulation) -> None:

@@ -1,13 +1,20 @@
 // Plays the shown episodes side by side: vehicles on their road, coloured by speed.
-(() => {
+(async () => {
   const data = JSON.parse(document.getElementById("replay-data").textContent);
   const section = document.getElementById("replay");
   if (!section || !data.drivers.length) return;
   const find = (name) => section.querySelector(name);
-  const [play, slider, clock, pace] = [".play", ".time", ".clock", ".pace"].map(find);
+  const [play, slider, clock, pace, zoom] = [".play", ".time", ".clock", ".pace", ".zoom"].map(find);
 
-  const numbers = (text, Kind) => new Kind(Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0)).buffer);
-  const roads = data.drivers.map((driver) => {
+  // Values of all frames, NaN where there is none; the page holds steps from frame to frame, deflated.
+  async function numbers({ data: text, low, scale }, width) {
+    const bytes = Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
+    const plain = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate"));
+    const steps = new Uint16Array(await new Response(plain).arrayBuffer());
+    for (let index = width; index < steps.length; index++) steps[index] += steps[index - width];
+    return Float32Array.from(steps, (step) => step === data.no_value ? NaN : low + scale * step);
+  }
+  async function shown(driver) {
     const figure = document.createElement("figure");
     const canvas = document.createElement("canvas");
     canvas.setAttribute("role", "img");
@@ -17,10 +24,16 @@
     caption.append(driver.name, mean);
     figure.append(canvas, caption);
     find(".roads").append(figure);
-    const arrays = Object.fromEntries(["positions", "places", "speeds"].filter((name) => driver[name])
-      .map((name) => [name, numbers(driver[name], Float32Array)]));
-    return { ...driver, ...arrays, canvas, mean, cavs: new Set(driver.cavs) };
-  });
+    const all = (name) => Promise.all((driver[name] || []).map((each) => numbers(each, driver.vehicles)));
+    const [[speeds], [positions], places] = await Promise.all([all("speeds"), all("positions"), all("places")]);
+    return { ...driver, speeds, positions, places, canvas, mean, cavs: new Set(driver.cavs) };
+  }
+  if (!window.DecompressionStream) {
+    find(".roads").textContent = "The replay needs a browser of 2023 or later.";
+    return;
+  }
+  const roads = [];
+  for (const driver of data.drivers) roads.push(await shown(driver));
   const end = (data.frames - 1) * data.step;
   slider.max = end;
 
@@ -43,16 +56,13 @@
 
   // Where a vehicle's middle is between two frames, and which way it points; nothing where it is not there.
   function spot(road, a, b, part) {
-    const mix = (values, width, index) => {
-      const [from, to] = [values[a * width + index], values[b * width + index]];
-      return Number.isNaN(to) ? from : from + part * (to - from);
-    };
+    const mix = (values) => Number.isNaN(values[b]) ? values[a] : values[a] + part * (values[b] - values[a]);
     if (road.positions) {
-      const middle = mix(road.positions, 1, 0) - data.vehicle_length / 2;
+      const middle = mix(road.positions) - data.vehicle_length / 2;
       return place(road.lines[0], (middle % road.loop_length + road.loop_length) % road.loop_length);
     }
-    const angle = road.places[3 * a + 2], half = data.vehicle_length / 2;
-    return [mix(road.places, 3, 0) - half * Math.cos(angle), mix(road.places, 3, 1) - half * Math.sin(angle), angle];
+    const [x, y, headings] = road.places, half = data.vehicle_length / 2, angle = headings[a];
+    return [mix(x) - half * Math.cos(angle), mix(y) - half * Math.sin(angle), angle];
   }
 
   function bounds(lines) {
@@ -70,20 +80,48 @@
     road.canvas.parentElement.classList.toggle("wide", right - left > 2 * (high - low));
   });
 
+  // What is in the middle of the pictures, as a share of the roads' width and height: the same on all.
+  const view = { x: 0.5, y: 0.5 };
+  roads.forEach((road) => road.canvas.addEventListener("pointermove", (event) => {
+    if (!event.buttons || zoom.value === "1") return;
+    const share = (value, moved, from, to) => Math.max(0, Math.min(1, value + moved / road.metre / Math.max(to - from, 1)));
+    view.x = share(view.x, -event.movementX, road.box[0], road.box[1]);
+    view.y = share(view.y, event.movementY, road.box[2], road.box[3]);
+    show();
+  }));
+  // Who zooms in is shown the slowest vehicle: that is where the wave is.
+  function goToSlowest(road, frame) {
+    const there = [...Array(road.vehicles).keys()].map((vehicle) => frame * road.vehicles + vehicle)
+      .filter((at) => !Number.isNaN(road.speeds[at]));
+    if (!there.length) return;
+    const at = there.reduce((one, other) => road.speeds[other] < road.speeds[one] ? other : one);
+    const [x, y] = spot(road, at, at, 0), [left, right, low, high] = road.box;
+    [view.x, view.y] = [(x - left) / Math.max(right - left, 1), (y - low) / Math.max(high - low, 1)];
+  }
+  zoom.addEventListener("change", () => {
+    view.x = view.y = 0.5;
+    if (zoom.value !== "1") goToSlowest(roads[0], Math.floor(now / data.step));
+    find(".roads").classList.toggle("zoomed", zoom.value !== "1");
+    show();
+  });
+
   function draw(road, time) {
     const [left, right, low, high] = road.box;
     const width = Math.round(road.canvas.clientWidth * (window.devicePixelRatio || 1));
     const metre = width / (right - left + 12);
-    const height = Math.round(Math.min(1.2 * width, metre * (high - low + 12)));
+    const near = Number(zoom.value), across = high - low + 12;
+    const height = Math.round(Math.max(Math.min(1.2 * width, metre * across), Math.min(0.15 * width, near * metre * across)));
     if (road.canvas.width !== width || road.canvas.height !== height) {
       road.canvas.width = width; road.canvas.height = height;
     }
-    const scale = Math.min(metre, height / (high - low + 12));
+    const scale = near * Math.min(metre, height / across);
+    const middle = [left + view.x * (right - left), low + view.y * (high - low)];
+    road.metre = scale / (window.devicePixelRatio || 1);
     const enlarged = Math.max(1, 6 * (window.devicePixelRatio || 1) / (scale * data.vehicle_length));
     const pen = road.canvas.getContext("2d");
     pen.setTransform(1, 0, 0, 1, 0, 0);
     pen.clearRect(0, 0, width, height);
-    pen.setTransform(scale, 0, 0, -scale, width / 2 - scale * (left + right) / 2, height / 2 + scale * (low + high) / 2);
+    pen.setTransform(scale, 0, 0, -scale, width / 2 - scale * middle[0], height / 2 + scale * middle[1]);
 
     pen.beginPath();
     road.lines.forEach((line) => line.forEach(([, x, y], index) => index ? pen.lineTo(x, y) : pen.moveTo(x, y)));
@@ -142,4 +180,5 @@
   window.addEventListener("resize", show);
   now = Math.min(data.start, end);
   show();
+  section.classList.add("ready");
 })();

@@ -5,6 +5,7 @@ from math import inf
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from unjam.drivers.local_state import LARGEST_GAP, LocalState
 from unjam.drivers.roadside import Messages
@@ -28,6 +29,7 @@ class MotorwayTraffic(LaneTraffic[MotorwayRoad]):
             np.array(each) for each in zip(*(lane[1:4] for lane in road.lanes), strict=True)
         )
         self._closing = {number for number, lane in enumerate(road.lanes) if lane.closing}
+        self._log_ways = list[NDArray[np.intp]]()
         self._factors = {entry.name: road.kinds[entry.kind].speed_factor for entry in road.entries}
         ways, step = int(self._ways.max()) + 1, scenario.decision_step
         self._messages = Messages(road.roadside, ways, road.length, step, self._noise_generator)
@@ -79,6 +81,8 @@ class MotorwayTraffic(LaneTraffic[MotorwayRoad]):
 
     def _moment(self) -> Moment:
         self._messages.measure(self._way, self._place, self._speed, self.road.limit_speed)
+        if self.full:
+            self._log_ways.append(self._way)
         ahead = self._leader
         gaps = np.where(ahead >= 0, self._gap(np.arange(len(ahead)), ahead), np.nan)
         places = self._place - self.road.merge  # as on the merge: zero where the ways meet
@@ -123,4 +127,11 @@ class MotorwayTraffic(LaneTraffic[MotorwayRoad]):
     def _pictured(self, vehicles: Sequence[str]) -> dict[str, Any]:
         routes = {entry.name: entry.route for entry in self.road.entries}
         road, branches = self.road, tuple(routes[name] for name in vehicles)
-        return {"branches": branches, "peak": road.peak, "free_time": road.free_time}
+        facts = {"branches": branches, "peak": road.peak, "free_time": road.free_time}
+        if not self.full:
+            return facts
+        column = {name: number for number, name in enumerate(vehicles)}
+        lanes = np.full((len(self._log_ways), len(vehicles)), np.nan)
+        for time, (moment, ways) in enumerate(zip(self._log_moments, self._log_ways, strict=True)):
+            lanes[time, [column[name] for name in moment.names]] = len(road.ways) - 1 - ways
+        return {**facts, "lanes": lanes, "lane_names": road.ways[::-1]}

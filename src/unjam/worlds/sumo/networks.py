@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import tempfile
 import time
+from collections import Counter
 from collections.abc import Iterable
 from contextlib import suppress
 from functools import cache
@@ -115,6 +116,12 @@ def network_lines(path: Path) -> Floats:
 def edge_lengths(path: Path) -> dict[str, float]:
     """Return the length of each edge [m]."""
     return {edge: length for edge, length, _ in read_lanes(path)}
+
+
+@cache
+def lane_counts(path: Path) -> dict[str, int]:
+    """Return how many lanes each edge has."""
+    return dict(Counter(edge for edge, _, _ in read_lanes(path)))
 
 
 def _node(node: Node) -> Attributes:

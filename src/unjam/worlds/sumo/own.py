@@ -14,7 +14,7 @@ from unjam.scenarios.road import OwnRoad
 from unjam.worlds.record import Episode, Floats
 from unjam.worlds.sumo.files import CAV_TYPES
 from unjam.worlds.sumo.lanes import Followed, LaneTraffic
-from unjam.worlds.sumo.networks import edge_lengths, network_lines
+from unjam.worlds.sumo.networks import edge_lengths, lane_counts, network_lines
 from unjam.worlds.sumo.open import Moment
 from unjam.worlds.world import Driven, OnProgress
 
@@ -25,7 +25,7 @@ class OwnTraffic(LaneTraffic[OwnRoad]):
     def start(self, controlled: bool, on_progress: OnProgress | None = None) -> None:
         """Run the warm-up, then hand the CAVs over; drivers remember nothing of it."""
         self._routes: Counter[tuple[str, ...]] = Counter()
-        self._log_edges: list[list[tuple[str, float]]] = []
+        self._log_edges: list[list[tuple[str, int, float]]] = []
         self._allowed: list[float] = []
         super().start(controlled, on_progress)
 
@@ -85,11 +85,15 @@ class OwnTraffic(LaneTraffic[OwnRoad]):
         return LocalState(speed, leader_speed, leader_gap, follower_speed, follower_gap, unknown, unknown)
 
     def record(self, driven: Driven) -> Episode:
-        """Return what happened since the start; positions are those along the route that is driven most."""
+        """Return what happened since the start; positions are those along the route that is driven most.
+
+        Its lanes count from the left: what widens a road is on its right most of the time.
+        """
         found = super().record(driven)
         if not self.full or not self._routes:
             return found
-        lengths = edge_lengths(self.road.files.network)
+        network = self.road.files.network
+        lengths, counts = edge_lengths(network), lane_counts(network)
         planned: Counter[str] = Counter()  # not where they were: all drivers' pictures show the same route
         for edges, count in self._routes.items():
             planned.update(dict.fromkeys(edges, count))
@@ -97,11 +101,18 @@ class OwnTraffic(LaneTraffic[OwnRoad]):
         starts = accumulate((lengths[edge] for edge in route), initial=0.0)
         begins = dict(reversed(list(zip(route, starts, strict=False))))
         column = {name: index for index, name in enumerate(found.vehicle_ids)}
-        positions = np.full_like(found.positions, np.nan)
+        positions, lanes = np.full((2, *found.positions.shape), np.nan)
         for time, ((names, *_), places) in enumerate(zip(self._log_moments, self._log_edges, strict=True)):
-            for name, (edge, along) in zip(names, places, strict=True):
-                positions[time, column[name]] = begins.get(edge, np.nan) + along
-        return replace(found, positions=positions)
+            for name, (edge, lane, along) in zip(names, places, strict=True):
+                if edge in begins:
+                    positions[time, column[name]] = begins[edge] + along
+                    lanes[time, column[name]] = counts[edge] - 1 - lane
+        most = max(counts[edge] for edge in route)
+        if most == 1:
+            return replace(found, positions=positions)
+        further = ("2nd", "3rd", *(f"{number}th" for number in range(4, most + 1)))
+        named = ("left lane", *(f"{ordinal} lane" for ordinal in further[: most - 1]))
+        return replace(found, positions=positions, lanes=lanes, lane_names=named)
 
     def _lines(self) -> Floats:
         return network_lines(self.road.files.network)

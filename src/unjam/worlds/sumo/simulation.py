@@ -199,10 +199,10 @@ class Simulation:
         """Return the edges of a vehicle's route."""
         return tuple(self._sumo.vehicle.getRoute(name))
 
-    def edge_places(self, ids: Sequence[str]) -> list[tuple[str, float]]:
-        """Return on which edge each of `ids` is, and where along it [m]."""
-        vehicle = self._sumo.vehicle
-        return [(vehicle.getRoadID(name), vehicle.getLanePosition(name)) for name in ids]
+    def edge_places(self, ids: Sequence[str]) -> list[tuple[str, int, float]]:
+        """Return on which edge each of `ids` is, in which lane from the right, and where along it [m]."""
+        here = self._sumo.vehicle
+        return [(here.getRoadID(name), here.getLaneIndex(name), here.getLanePosition(name)) for name in ids]
 
     def allowed_speeds(self, ids: Sequence[str]) -> list[float]:
         """Return how fast each of `ids` may drive where it is [m/s]."""

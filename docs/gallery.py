@@ -1,0 +1,32 @@
+"""Cards of the gallery, made from results/gallery/gallery.json: no number is typed in."""
+
+import json
+
+import pandas as pd
+from IPython.display import HTML
+from tables import RESULTS, show
+
+CARDS = json.loads((RESULTS / "gallery/gallery.json").read_text())["cards"]
+
+
+def card(name: str) -> HTML:
+    """Return what there is to know of a shipped controller on its road."""
+    found = CARDS[name]
+    changes = "".join(f" --set {key}={value}" for key, value in found["changes"].items())
+    command = f"unjam drive {found['road']} -d human -d unjam:{name}{changes} --held-out -n {found['seeds']}"
+    domain = found["domain"]
+    certified = (
+        ", ".join(f"{key.replace('_', ' ')} {low:.1f} to {high:.1f}" for key, (low, high) in domain.items())
+        if domain
+        else "not certified"
+    )
+    rows = {
+        "beside people alone": f"{found['beside people alone']}; {found['seeds']} seeds",
+        "smallest time headway": f"{found['headway']:.2f} s",
+        "hardest braking": f"{found['braking']:.1f} m/s²",
+        "could a car drive so?": found["drivable"],
+        "made for": found["made_for"],
+        "certified domain": certified,
+        "see it": command,
+    }
+    return show(pd.DataFrame({"": rows}), index=True)

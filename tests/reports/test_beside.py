@@ -1,0 +1,50 @@
+import csv
+from typing import Any
+
+import numpy as np
+
+from unjam.measures.metrics import METRICS
+from unjam.reports.beside import BETTER, against_people, episodes_as_csv
+from unjam.reports.story import Column
+
+
+def column(name: str, values: list[float], **more: Any) -> Column:
+    rows = [
+        {"seed": seed, "status": "completed", **dict.fromkeys(METRICS, float("nan")), "fuel_ml_per_km": value}
+        for seed, value in enumerate(values)
+    ]
+    return Column(name, [{**row, **more} for row in rows], None)
+
+
+PEOPLE = column("human", [100.0, 200.0, 300.0], mean_speed=5.0)
+
+
+def test_less_fuel_is_better_and_less_speed_is_worse() -> None:
+    found = against_people([PEOPLE, column("pi", [90.0, 191.0, 289.0], mean_speed=4.0)])
+    cells = {row["label"]: row["cells"][0] for row in found["rows"]}
+    assert found["names"] == ["pi"]
+    assert cells["fuel"] == {"text": "-10.0 [-11.0, -9.0]", "mark": "better"}
+    assert cells["mean speed"]["mark"] == "worse"
+    assert list(cells) == [METRICS[name].label for name in BETTER if METRICS[name].label in cells]
+
+
+def test_what_may_be_nothing_has_no_mark_and_what_is_unknown_no_row() -> None:
+    found = against_people([PEOPLE, column("pi", [90.0, 210.0, 301.0])])
+    assert [(row["label"], row["cells"][0]["mark"]) for row in found["rows"]] == [("fuel", "")]
+
+
+def test_without_people_or_without_anybody_else_there_is_no_table() -> None:
+    assert against_people([PEOPLE]) == {}
+    assert against_people([column("pi", [1.0]), column("idm", [2.0])]) == {}
+
+
+def test_all_episodes_are_in_the_csv_with_nothing_where_nothing_is_known() -> None:
+    columns = [PEOPLE, column('a "b", c', [1.25])]
+    found = list(csv.DictReader(episodes_as_csv(columns).splitlines()))
+    assert [(row["driver"], row["seed"]) for row in found] == [
+        *(("human", str(seed)) for seed in range(3)),
+        ('a "b", c', "0"),
+    ]
+    assert [float(row["fuel_ml_per_km"]) for row in found] == [100.0, 200.0, 300.0, 1.25]
+    assert {row["return"] for row in found} == {""}
+    assert np.isclose(float(found[0]["mean_speed"]), 5.0)

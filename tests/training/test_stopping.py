@@ -1,0 +1,65 @@
+"""When a training ends before its steps, and where its numbers go while it runs."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.training.test_run import STEPS, learn_with, small_config
+from unjam.errors import MissingPartError
+from unjam.reports.results import read_progress
+from unjam.training.folder import gave_up
+from unjam.training.tensorboard import FOLDER, tensorboard_into
+from unjam.training.train import Trainer
+from unjam.worlds.workers import Workers
+
+
+@pytest.mark.parametrize(
+    ("validations", "patience", "over"),
+    [
+        ([], 1, False),
+        ([10.0], 1, True),  # the expert alone is better
+        ([12.0, 13.0], 1, False),
+        ([12.0, 11.5], 1, True),
+        ([12.0, None, 11.5, None], 2, False),
+        ([12.0, 11.5, 11.9], 2, True),
+        ([9.0, 10.0], 2, True),
+        ([12.0, 11.5, 11.9], 0, False),
+    ],
+)
+def test_patience_counts_validations_since_the_best(
+    validations: list[float | None], patience: int, over: bool
+) -> None:
+    rows = [{"return_validation": value, "return_expert": 11.0} for value in validations]
+    assert gave_up(small_config(evaluation__patience=patience), rows) is over
+
+
+def test_training_ends_where_patience_is_over(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    returns = iter([5.0, 6.0, 5.5, 5.8, 9.0])
+    monkeypatch.setattr(Trainer, "returns_of", lambda *given: [next(returns)])
+    config = small_config(steps=20 * STEPS, evaluation__patience=2)
+    with Workers(1) as workers:
+        learn_with(workers, tmp_path / "run", config)
+    found = [row["return_validation"] for row in read_progress(tmp_path / "run")]
+    assert found == [6.0, 5.5, 5.8]
+
+
+def test_tensorboard_has_every_number_at_its_actual_step(tmp_path: Path) -> None:
+    events = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
+    write = tensorboard_into(tmp_path)
+    for step in (300, 600):
+        row: dict[str, Any] = {"iteration": step // 300, "actual_steps": step, "return_mean": step / 10}
+        write({**row, "return_validation": None, "learner": {"kl": 0.5}, "seconds": {"actual": 1}})
+    board = events.EventAccumulator(str(tmp_path / FOLDER))
+    board.Reload()
+    assert set(board.Tags()["scalars"]) == {"return_mean", "learner/kl", "seconds/actual"}
+    assert [(event.step, event.value) for event in board.Scalars("return_mean")] == [(300, 30.0), (600, 60.0)]
+
+
+def test_without_tensorboard_a_line_says_so_before_anything_is_trained(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr("unjam.training.tensorboard.find_spec", lambda name: None)
+    with pytest.raises(MissingPartError, match=r"pip install 'unjam\[train\]'"):
+        tensorboard_into(tmp_path)
+    assert not list(tmp_path.iterdir())
