@@ -16,7 +16,7 @@ from unjam.learners.algorithm_1 import actual_experience
 from unjam.learners.settings import AGENTS
 from unjam.training.config import RunConfig, load_config, to_toml
 from unjam.training.folder import check_possible, read_config
-from unjam.training.train import Trainer, steps_to_train, train
+from unjam.training.train import Trainer, train
 from unjam.worlds.workers import Workers
 
 torch.set_num_threads(1)  # as a training does
