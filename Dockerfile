@@ -1,5 +1,5 @@
 # unjam with what learns, on the CPU. Written for, and not yet tried on, a machine with Docker:
-#   docker build -t unjam . && docker run --rm -v "$PWD/runs:/work/runs" unjam drive ring -d human -d pi
+#   docker build -t unjam . && docker run --rm -v "$PWD/runs:/data/runs" unjam drive ring -d human -d pi
 FROM python:3.11-slim
 COPY . /source
 # netconvert and libsumo are linked against libraries of X that the slim image lacks
@@ -9,6 +9,6 @@ RUN apt-get update && apt-get install -y --no-install-recommends libgl1 libxrend
     && pip install --no-cache-dir -c /source/constraints.txt "/source[train]" \
         --extra-index-url https://download.pytorch.org/whl/cpu \
     && rm -rf /source
-WORKDIR /work
+WORKDIR /data
 ENTRYPOINT ["unjam"]
 CMD ["--help"]
