@@ -16,6 +16,7 @@ import psutil
 from tests.faults.files import any_mutation
 from tests.faults.outcome import Outcome, one_line
 from tests.worlds.sumo.own_roads import straight
+from tests.worlds.sumo.test_hostile import OPTIONS, WRITING
 from tests.worlds.test_record import fingerprint
 from tests.worlds.test_workers import processes
 from unjam.drivers import IDM, PISaturation
@@ -101,6 +102,32 @@ def networks(count: int, folder: Path, generator: np.random.Generator) -> Outcom
             name = str(generator.choice(names))
             (folder / name).write_bytes(broken(whole[name], generator))
             outcome.happened[driven(path, workers)] += 1
+    return outcome
+
+
+def hostile(count: int, folder: Path, generator: np.random.Generator) -> Outcome:
+    """Let a configuration, or a file that it names, ask SUMO to write, to listen, or to read another file."""
+    outcome, here = Outcome(), folder / "here"
+    here.mkdir()
+    path, canary = straight(here, DEMAND, length=600.0), here / "canary"
+    canary.write_text("as it was")
+    plain, elements = path.read_text(), re.findall(r"^  <.*/>$", WRITING, re.MULTILINE)
+    with Workers(1) as workers:
+        for _ in range(count):
+            asked = f'<{generator.choice(OPTIONS)} value="{canary}"/>'
+            asked = str(generator.choice([asked, '<remote-port value="45871"/>']))
+            if generator.random() < 0.5:
+                asked = '<additional-files value="more.add.xml"/>'
+                inside = "".join(generator.choice(elements, size=3, replace=False))
+                more = f"<additional>{inside}</additional>".replace("CANARY", str(canary))
+                (here / "more.add.xml").write_text(more)
+            path.write_text(plain.replace("</configuration>", f"{asked}</configuration>"))
+            before = {each.name: each.read_bytes() for each in here.iterdir()}
+            assert driven(path, workers) == DRIVEN
+            assert {each.name: each.read_bytes() for each in here.iterdir()} == before
+            for process in map(psutil.Process, [os.getpid(), *processes(workers)]):
+                assert not any(one.status == "LISTEN" for one in process.net_connections())
+            outcome.happened["it drove, nothing was written, and nothing listened"] += 1
     return outcome
 
 

@@ -2,7 +2,7 @@
 
 from tests.faults.files import checkpoints, configurations, controllers, full_disks, results
 from tests.faults.outcome import Fault
-from tests.faults.processes import killed_runs, lost_workers, networks, resets
+from tests.faults.processes import hostile, killed_runs, lost_workers, networks, resets
 
 FAULTS: dict[str, Fault] = {
     "checkpoints": Fault(
@@ -22,6 +22,9 @@ FAULTS: dict[str, Fault] = {
     ),
     "full disk": Fault("disk full after some bytes of a checkpoint", full_disks, quick=20, long=200),
     "networks": Fault("network, demand or configuration of SUMO broken", networks, quick=12, long=500),
+    "hostile files": Fault(
+        "network of others that wants SUMO to write, to listen or to read another file", hostile, 8, 200
+    ),
     "lost workers": Fault("worker killed, crashed or stopped in an episode", lost_workers, quick=2, long=200),
     "resets": Fault("episodes one after the other in one process", resets, quick=100, long=10_000),
     "killed runs": Fault("training run killed (signal 9)", killed_runs, quick=4, long=12, slow=True),

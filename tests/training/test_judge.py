@@ -1,13 +1,16 @@
+import hashlib
 import json
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
+from tests.pictures import empty_pictures
 from tests.training.test_run import STEPS, learn_with, small_config
 from unjam.controller import controller_bytes, load_controller
 from unjam.drivers import PISaturation, ResidualDriver
 from unjam.errors import InputError
+from unjam.reports.html import render
 from unjam.reports.results import read_results
 from unjam.training.config import RunConfig
 from unjam.training.evaluate import TRAINED, comparison, judge
@@ -44,6 +47,18 @@ def test_compares_baselines_the_expert_and_what_was_trained(run: tuple[Path, Run
     trained = drivers[TRAINED]
     assert isinstance(trained, ResidualDriver)
     assert trained.expert == PISaturation()
+
+
+def test_results_and_their_report_name_the_hash_of_the_controller_that_was_judged(
+    run: tuple[Path, RunConfig], pool: Workers, tmp_path: Path
+) -> None:
+    folder, config = run
+    judge(folder, config, pool, baselines=[], episodes=1, out=tmp_path)
+    sha256 = hashlib.sha256((folder / "controller.unjam").read_bytes()).hexdigest()
+    found = read_results(tmp_path)
+    assert found.about["controllers"] == {TRAINED: sha256}
+    with empty_pictures():
+        assert f"Controller {TRAINED}: SHA-256 {sha256}" in render([found])
 
 
 def test_an_expert_among_the_baselines_is_compared_once(run: tuple[Path, RunConfig]) -> None:

@@ -10,7 +10,7 @@ import re
 from importlib.resources import files
 from pathlib import Path
 
-from unjam.controller.file import SUFFIX, controller_bytes, load_controller
+from unjam.controller.file import SUFFIX, controller_bytes, hash_of, load_controller
 from unjam.drivers.driver import Driver
 from unjam.drivers.from_file import is_file_reference
 from unjam.drivers.registry import DRIVERS, named_driver
@@ -56,6 +56,17 @@ def make_driver(text: str, time_step: float) -> Driver:
     if not named and (text.endswith(SUFFIX) or os.path.isdir(text)):
         return load_controller(text)
     return named_driver(text, time_step)
+
+
+def hash_of_controller(text: str) -> str | None:
+    """Return the SHA-256 of the controller's file that a driver's name stands for; None where it is none."""
+    path = Path(text)
+    if text.startswith(SHIPPED):
+        path = shipped_file(text.removeprefix(SHIPPED))
+    elif os.path.isdir(text):
+        path = path / f"controller{SUFFIX}"
+    is_one = path.suffix == SUFFIX and os.path.isfile(path)
+    return hash_of(path.read_bytes()) if is_one else None
 
 
 def shipped_names() -> list[str]:

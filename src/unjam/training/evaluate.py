@@ -12,7 +12,7 @@ from typing import Any
 
 from safetensors.numpy import save
 
-from unjam.controller import make_driver
+from unjam.controller import hash_of_controller, make_driver
 from unjam.drivers.driver import Driver
 from unjam.drivers.from_file import DriverLike, as_driver
 from unjam.drivers.registry import driver_names, free_label, travels
@@ -213,11 +213,18 @@ def judge(
         "reward": config.reward or scenario.reward,
         "trained": TRAINED,
         "expert": config.make_expert().describe() if config.expert != "none" else "none",
+        "controllers": _hashes({TRAINED: str(folder)}),
         "manifest": manifest(),
     }
     save_evaluation(out or folder, found, about)
     raise_failures(found)
     return found
+
+
+def _hashes(controllers: dict[str, str]) -> dict[str, str]:
+    """Return the hashes of the files that were judged, by the driver's label; others are none."""
+    found = {label: hash_of_controller(text) for label, text in controllers.items()}
+    return {label: sha256 for label, sha256 in found.items() if sha256}
 
 
 def drive(
@@ -279,6 +286,7 @@ def drive(
     report, notes = None, notes_on_controllers(made, drivers, found.shown)
     if folder is not None:
         about = {"scenario": Path(scenario).name, "reward": reward or made.reward, "manifest": manifest()}
-        save_evaluation(folder, found, {**about, "notes": notes})
+        named = {label: label for label in drivers}
+        save_evaluation(folder, found, {**about, "controllers": _hashes(named), "notes": notes})
         report = write_report([folder], folder / "report.html")
     return DriveResult(scenario, found.rows, folder, report, found.shown, notes)
