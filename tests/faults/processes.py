@@ -118,8 +118,9 @@ def hostile(count: int, folder: Path, generator: np.random.Generator) -> Outcome
             asked = str(generator.choice([asked, '<remote-port value="45871"/>']))
             if generator.random() < 0.5:
                 asked = '<additional-files value="more.add.xml"/>'
-                inside = "".join(generator.choice(elements, size=3)).replace("CANARY", str(canary))
-                (here / "more.add.xml").write_text(f"<additional>{inside}</additional>")
+                inside = "".join(generator.choice(elements, size=3, replace=False))
+                more = f"<additional>{inside}</additional>".replace("CANARY", str(canary))
+                (here / "more.add.xml").write_text(more)
             path.write_text(plain.replace("</configuration>", f"{asked}</configuration>"))
             before = {each.name: each.read_bytes() for each in here.iterdir()}
             assert driven(path, workers) == DRIVEN
