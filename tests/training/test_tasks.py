@@ -14,7 +14,7 @@ from unjam.drivers import PISaturation, ResidualDriver
 from unjam.errors import InputError
 from unjam.learners.algorithm_1 import actual_experience
 from unjam.learners.settings import AGENTS
-from unjam.training.config import RunConfig, load_config, to_toml
+from unjam.training.config import RunConfig, load_config, steps_to_train, to_toml
 from unjam.training.folder import check_possible, read_config
 from unjam.training.train import Trainer, train
 from unjam.worlds.workers import Workers
