@@ -13,8 +13,12 @@ HELD = {
 }
 """drivers by kind of road, and the time between two of their decisions there [s]"""
 
+ABOUT = "one law for each kind of road, each tuned; the car's map and messages choose: " + ", ".join(
+    f"{kind} {name}" for kind, (name, _) in HELD.items()
+)
+
 if __name__ == "__main__":
     held = {kind: make_driver(name, step) for kind, (name, step) in HELD.items()}
     best = Path(SHIPPED_FOLDER) / "best.unjam"
-    best.write_bytes(controller_bytes(ByRoad(**held), {}))
+    best.write_bytes(controller_bytes(ByRoad(**held), {"about": ABOUT}))
     print(best)

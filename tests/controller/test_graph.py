@@ -124,5 +124,5 @@ def test_a_graph_that_cannot_be_run_is_refused_in_one_line() -> None:
 def test_what_is_not_installed_is_told(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, name, None)
     part = graph()
-    with pytest.raises(MissingPartError, match=rf"{name} is not installed.*unjam\[onnx\]"):
+    with pytest.raises(MissingPartError, match=rf"{name} is not installed.*unjam\[train\]"):
         check_graph(part, Constant()) if name == "onnx" else run_graph(part, Constant(), perceived())

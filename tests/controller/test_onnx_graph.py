@@ -156,5 +156,5 @@ def test_a_driver_that_cannot_be_drawn_says_so_in_one_line(name: str, my_drivers
 
 def test_without_onnxscript_it_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "onnxscript", None)
-    with pytest.raises(MissingPartError, match=r"pip install 'unjam\[onnx\]'"):
+    with pytest.raises(MissingPartError, match=r"pip install 'unjam\[train\]'"):
         onnx_graph(IDM(), 1.0)

@@ -23,7 +23,7 @@ def test_less_fuel_is_better_and_less_speed_is_worse() -> None:
     found = against_people([PEOPLE, column("pi", [90.0, 191.0, 289.0], mean_speed=4.0)])
     cells = {row["label"]: row["cells"][0] for row in found["rows"]}
     assert found["names"] == ["pi"]
-    assert cells["fuel"] == {"text": "-10.0 [-11.0, -9.0]", "mark": "better"}
+    assert cells["fuel"] == {"text": "-10.0 [-12.5, -7.5]", "mark": "better"}
     assert cells["mean speed"]["mark"] == "worse"
     assert list(cells) == [METRICS[name].label for name in BETTER if METRICS[name].label in cells]
 

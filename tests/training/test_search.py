@@ -79,7 +79,10 @@ def test_a_trial_differs_from_the_base_in_its_values_alone() -> None:
 
 def test_a_training_is_worth_its_best_validation_beyond_its_expert(tmp_path: Path) -> None:
     rows = [(None, 10.0), (12.0, 10.0), (17.0, 10.0), (11.0, 10.0)]
-    lines = [to_json({"return_validation": found, "return_expert": expert}) for found, expert in rows]
+    lines = [
+        to_json({"iteration": number, "return_validation": found, "return_expert": expert})
+        for number, (found, expert) in enumerate(rows, 1)
+    ]
     (tmp_path / "progress.jsonl").write_text("\n".join(lines))
     assert validation_gain(tmp_path) == 7.0
     (tmp_path / "progress.jsonl").write_text(lines[0])
@@ -122,7 +125,7 @@ class Trainings:
         folder = Path(command.words[-1])
         folder.mkdir(parents=True)
         worth = -abs(math.log10(config.trpo.target_kl) + 2)
-        row = {"return_validation": worth, "return_expert": 0.0}
+        row = {"iteration": 1, "return_validation": worth, "return_expert": 0.0}
         (folder / "progress.jsonl").write_text(to_json(row))
         self.done.append(folder)
         return 0

@@ -138,11 +138,15 @@ def _about_shipped(name: str) -> str:
     """Return what a shipped controller is, and what it was measured to do, from its manifest."""
     from unjam.controller import shipped_file
     from unjam.controller.file import read_controller
+    from unjam.measures.gain import MEAN_GAIN
 
     manifest = read_controller(shipped_file(name)).manifest
     if tuned := manifest.get("tuned"):
-        earned = [tuned[one]["score"] for one in ("best", "default")]
-        return f"{manifest['expert']}, tuned: returns {earned[0]:.0f} on tuning seeds, before {earned[1]:.0f}"
+        after, before = (f"{tuned[one]['score']:.4g}" for one in ("best", "default"))
+        what = tuned["reward"] if tuned["reward"] == MEAN_GAIN else "return"
+        return f"{manifest['expert']}, tuned: {what} {after} on tuning seeds, before {before}"
+    if about := manifest.get("about"):
+        return about
     expert, metrics, road = manifest["expert"], manifest["metrics"], manifest["run"]["scenario"]
     ours, theirs = (metrics[label]["mean_speed"]["mean"] for label in ("trained", expert))
     return (

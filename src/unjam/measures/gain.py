@@ -17,6 +17,8 @@ WORST, MOST = -1.0, 1.5
 """between which a gain counts"""
 LEAST = 0.03
 """share of people's own number by which the best must be better: else there is only to lose"""
+MEAN_GAIN = "mean gain"
+"""what an expert is tuned for on several roads"""
 
 Rows = Sequence[dict[str, Any]]
 

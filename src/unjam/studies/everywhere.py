@@ -21,7 +21,7 @@ from unjam.measures.metrics import measure
 from unjam.measures.statistics import Estimate, signed
 from unjam.reports.figures import INK, new_figure
 from unjam.scenarios.scenario import Scenario
-from unjam.studies.study import Study, StudyFolder
+from unjam.studies.study import Study, StudyFolder, about_study
 from unjam.training.family import FAMILY, GROUPS
 from unjam.training.seeds import held_out_seeds, tuning_seeds
 from unjam.worlds.workers import EpisodeTask, Workers
@@ -66,6 +66,7 @@ def _driven(
 
 
 def _write(studies: StudyFolder, seeds: int, folder: Path, workers: int) -> None:
+    about_study(folder)
     with Workers(workers) as pool:
         for number, (name, road) in enumerate(FAMILY.items()):
             file = folder / f"{number:02d}.json"

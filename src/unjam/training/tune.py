@@ -21,7 +21,7 @@ from unjam.errors import InputError, UnjamError, wrong_name
 from unjam.files import to_json, write_whole
 from unjam.manifest import manifest
 from unjam.measures.drivable import DRIVABLE, drivable_in_all
-from unjam.measures.gain import Rows, ceiling, gain, mean_gain
+from unjam.measures.gain import MEAN_GAIN, Rows, ceiling, gain, mean_gain
 from unjam.measures.metrics import measure
 from unjam.scenarios import scenario_recipe
 from unjam.scenarios.scenario import Scenario
@@ -283,7 +283,7 @@ def _write(
     about = {
         "scenario": recipes if len(roads) > 1 else scenario_recipe(scenario),
         "expert": expert,
-        "reward": reward or (scenario.reward if len(roads) == 1 else "mean gain"),
+        "reward": reward or (scenario.reward if len(roads) == 1 else MEAN_GAIN),
         "seed": seed,
         "actual_steps": found.actual_steps,
         "imagined_steps": found.imagined_steps,
