@@ -67,12 +67,12 @@ def _driven(
 
 def _write(studies: StudyFolder, seeds: int, folder: Path, workers: int) -> None:
     about_study(folder)
+    made = [(number, name, road, road.make()) for number, (name, road) in enumerate(FAMILY.items())]
     with Workers(workers) as pool:
-        for number, (name, road) in enumerate(FAMILY.items()):
+        for number, name, road, scenario in sorted(made, key=lambda each: not each[3].closed):  # quick first
             file = folder / f"{number:02d}.json"
             if file.is_file():
                 continue
-            scenario = road.make()
             group = next(group for group, kinds in GROUPS.items() if road.scenario in kinds)
             tuned = {expert: expert for expert in TUNED[group]}
             tried = _driven(scenario, tuned, tuning_seeds(EPISODES, 1000), pool)
