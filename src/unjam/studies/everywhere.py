@@ -124,14 +124,15 @@ def picture(folder: Path) -> Figure:
     values = np.array([[road["gains"][label].mean for label in JUDGED] for road in roads.values()])
     figure = new_figure(0.3 * len(roads) + 1.0)
     axes = figure.subplots()
-    shown = axes.imshow(values, cmap="RdYlGn", vmin=WORST, vmax=-WORST, aspect="auto")
+    # Within half of the colours, which are pale: numbers stay legible on them.
+    shown = axes.imshow(values, cmap="RdYlGn", vmin=-2 * MOST, vmax=2 * MOST, aspect="auto")
     for (row, column), value in np.ndenumerate(values):
         axes.text(column, row, f"{value:+.2f}", ha="center", va="center", color=INK, fontsize=8)
     axes.set_xticks(range(len(JUDGED)), list(JUDGED), rotation=20, ha="right")
     marks = {"seen": "", "combination": " (new combination)", "axis": " (new)"}
     axes.set_yticks(range(len(roads)), [f"{name}{marks[road['part']]}" for name, road in roads.items()])
     axes.grid(visible=False)
-    figure.colorbar(shown, ax=axes, label=f"gain, from {WORST:g} to {MOST:g}", shrink=0.5)
+    figure.colorbar(shown, ax=axes, label=f"gain, kept within {WORST:g} and {MOST:g}", shrink=0.5)
     return figure
 
 
