@@ -78,6 +78,8 @@ WRONG: dict[str, tuple[str, list[str]]] = {
     "unknown learner": ("agent: 'ghost'", ["train ring --agent ghost"]),
     "unknown expert": ("ghost", ["train ring --expert ghost"]),
     "negative seed": ("seed", ["train ring --seed -1"]),
+    "tuning a family that is changed": ("scenario: with rings", ["tune rings --length 230"]),
+    "tuning with too few steps": ("steps: 10", ["tune rings --steps 10"]),
     "training into a folder that is not empty": ("--resume full", ["train ring --out full"]),
     "resuming what is no run": ("not a run folder", ["train --resume full"]),
     "resuming with a preset": ("not allowed beside it", ["train --resume full --preset demo"]),

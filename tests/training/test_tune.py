@@ -11,11 +11,12 @@ from unjam.drivers import PISaturation
 from unjam.drivers.registry import named_driver
 from unjam.errors import InputError
 from unjam.measures.drivable import drivable_in_all
+from unjam.measures.gain import MEAN_GAIN, MOST, WORST
 from unjam.measures.metrics import measure
 from unjam.scenarios import FigureEight, Ring
 from unjam.training.search import Choice, Range
 from unjam.training.seeds import TUNE, tuning_seeds
-from unjam.training.tune import EPISODES, FINALISTS, TUNED, space_around, tune
+from unjam.training.tune import EPISODES, FINALISTS, OF_EACH, TUNED, space_around, tune
 from unjam.worlds.episode import run_episode
 from unjam.worlds.sumo.simulation import Simulation
 from unjam.worlds.workers import Workers
@@ -97,3 +98,17 @@ def test_the_space_around_an_expert_has_its_numbers_words_and_truths() -> None:
 def test_finalists_meet_seeds_that_no_setting_was_tried_on() -> None:
     assert not set(tuning_seeds(EPISODES)) & set(tuning_seeds(2 * EPISODES, EPISODES))
     assert {first for first, _ in tuning_seeds(3)} == {TUNE}
+
+
+def test_on_several_roads_the_mean_gain_is_maximised_and_the_worst_road_named(tmp_path: Path) -> None:
+    roads = {"short": SMALL, "full": Ring(horizon=80, length=(200, 210))}
+    each = OF_EACH * (60 + 80)
+    steps = each * ((FINALISTS + 1) * 2 + 3) + 2 * each
+    with Workers(1) as workers:
+        found = tune(roads, "pi", SPACE, steps, tmp_path, workers)
+    assert (len(found.settings), found.actual_steps) == (2, steps)
+    assert all(one.score is not None and WORST <= one.score <= MOST for one in found.settings)
+    assert found.best.verdict.startswith("worst on ")
+    written = json.loads((tmp_path / TUNED).read_text())
+    assert written["reward"] == MEAN_GAIN
+    assert set(written["scenario"]) == set(roads)

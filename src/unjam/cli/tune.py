@@ -64,7 +64,6 @@ def tune(
     """
     from unjam.scenarios import make_scenario
     from unjam.training.family import FAMILY, is_family, roads_of
-    from unjam.training.folder import make_new_folder
     from unjam.training.search import space_of
     from unjam.training.tune import space_around
     from unjam.training.tune import tune as run
@@ -84,7 +83,6 @@ def tune(
     around = space_around(expert, made.decision_step)
     space = space_of(vary) if vary else around
     folder = new_folder(out, f"tune-{Path(scenario).stem}")
-    make_new_folder(folder)
     with Workers(workers) as pool:
         found = run(
             *(roads, expert, space, steps, folder, pool, reward, seed),

@@ -86,17 +86,18 @@ FAMILY: dict[str, FamilyRoad] = {
 
 GROUPS = {"rings": ("ring",), "figure-eights": ("figure-eight",), "motorways": ("on-ramp", "on-ramp-1")}
 """roads that one law can be written for, by their scenarios"""
-EVERYWHERE = "everywhere"
+ALL_ROADS = "everywhere"
+"""name of the whole family"""
 
 
 def is_family(name: str) -> bool:
     """Return whether a name is that of several roads."""
-    return name == EVERYWHERE or name in GROUPS
+    return name == ALL_ROADS or name in GROUPS
 
 
 def roads_of(group: str, *parts: Part) -> dict[str, Scenario]:
     """Return the roads of some parts of the family, by name; `group` is a key of GROUPS, or `everywhere`."""
-    scenarios = [each for name, kinds in GROUPS.items() for each in kinds if group in (name, EVERYWHERE)]
+    scenarios = [each for name, kinds in GROUPS.items() for each in kinds if group in (name, ALL_ROADS)]
     return {
         name: road.make()
         for name, road in FAMILY.items()

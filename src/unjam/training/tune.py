@@ -26,7 +26,7 @@ from unjam.measures.metrics import measure
 from unjam.scenarios import scenario_recipe
 from unjam.scenarios.scenario import Scenario
 from unjam.training.evaluate import raise_failure
-from unjam.training.folder import origin
+from unjam.training.folder import make_new_folder, origin
 from unjam.training.search import Choice, Range, Space, quiet_optuna
 from unjam.training.seeds import tuning_seeds
 from unjam.worlds.batch.run import run_batch
@@ -140,7 +140,7 @@ def tune(
         expert: its name.
         space: what is varied, of `space_around` or `search.space_of`.
         steps: that may be driven in all.
-        folder: exists and is empty.
+        folder: new, or empty.
         workers: drive; the result does not depend on how many.
         reward: what is maximised on one road; empty: the scenario's own.
         seed: of the proposals.
@@ -163,6 +163,7 @@ def tune(
     why = [why_not(scenario) for scenario in roads.values() if screen and why_not(scenario)]
     if why:
         raise InputError(f"screen: {why[0]}")
+    make_new_folder(folder)
     run = partial(_in_sumo, workers)
     alone = {
         first: _driven(roads, ["human"], first, count, reward, run)[0] if len(roads) > 1 else {}

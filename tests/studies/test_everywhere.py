@@ -1,0 +1,33 @@
+"""Does the study of all roads say what its files hold?"""
+
+from pathlib import Path
+
+import pytest
+
+from unjam.measures.gain import MOST, WORST
+from unjam.studies.everywhere import HELD_OUT, JUDGED, gains_of, picture, table
+from unjam.training.family import FAMILY
+
+RESULTS = Path(__file__).parents[2] / "results/everywhere"
+
+
+def test_each_road_has_a_row_and_the_mean_and_the_worst_follow() -> None:
+    roads = gains_of(RESULTS)
+    assert set(roads) <= set(FAMILY)
+    for parts in (("seen",), HELD_OUT):
+        shown = table(parts, RESULTS)
+        names = [name for name, road in roads.items() if road["part"] in parts]
+        assert list(shown["road"]) == [*names, "mean", "worst"]
+        worst = min(roads[name]["gains"]["unjam:best"].mean for name in names)
+        assert shown["unjam:best"].iloc[-1] == f"{worst:+.2f}"
+
+
+def test_the_best_of_a_road_gains_what_its_one_says() -> None:
+    for road in gains_of(RESULTS).values():
+        assert all(WORST <= found.mean <= MOST for found in road["gains"].values())
+        assert road["gains"][road["best"]].mean in (0.0, pytest.approx(1.0)), "nothing counts, or it is the one"
+
+
+def test_the_picture_has_a_field_for_each_driver_on_each_road() -> None:
+    axes = picture(RESULTS).axes[0]
+    assert len(axes.texts) == len(gains_of(RESULTS)) * len(JUDGED)
