@@ -25,7 +25,9 @@ def test_each_road_has_a_row_and_the_mean_and_the_worst_follow() -> None:
 def test_the_best_of_a_road_gains_what_its_one_says() -> None:
     for road in gains_of(RESULTS).values():
         assert all(WORST <= found.mean <= MOST for found in road["gains"].values())
-        assert road["gains"][road["best"]].mean in (0.0, pytest.approx(1.0)), "nothing counts, or it is the one"
+        assert road["gains"][road["best"]].mean in (0.0, pytest.approx(1.0)), (
+            "nothing counts, or it is the one"
+        )
 
 
 def test_the_picture_has_a_field_for_each_driver_on_each_road() -> None:
