@@ -22,7 +22,7 @@ from unjam.measures.drivable import (
     share_short_headway,
     yielded,
 )
-from unjam.worlds.audit import BEYOND
+from unjam.worlds.audit import BEYOND, SHIELD_ROUNDING
 from unjam.worlds.record import Episode, Floats, outcome_of
 from unjam.worlds.reward import eq16
 
@@ -185,9 +185,8 @@ def collisions(episode: Episode) -> float:
 
 
 def shield_override_share(episode: Episode) -> float:
-    """Share of the CAV's commands that SUMO's safety check did not let pass (by more than 1e-6 m/s)."""
-    tolerance = 1e-6 / episode.step
-    return _over_cavs([(trajectory.shield > tolerance).mean() for trajectory in episode.trajectories])
+    """Share of the CAV's commands that SUMO's safety check did not let pass."""
+    return _over_cavs([(trajectory.shield > SHIELD_ROUNDING).mean() for trajectory in episode.trajectories])
 
 
 def shield_max_braking(episode: Episode) -> float:

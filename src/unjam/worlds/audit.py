@@ -10,8 +10,9 @@ BEYOND = (3.5, 4.5, 9.0)
 """brakings that are counted [m/s2]: ISO 15622's above 20 m/s, a hard one, and what dry asphalt allows"""
 ROUNDING = 1e-6
 """of a braking [m/s2]"""
-SHIELD_ROUNDING = 1e-6
-"""by how much SUMO changes a speed that it lets pass [m/s]"""
+SHIELD_ROUNDING = 1e-4
+"""by how much SUMO changes a command that it lets pass: it takes some micrometres beyond the smallest gap for
+none, and holds who would creep there [m/s2]"""
 MOVING_SPEED = 1.0
 """speed above which a time headway is a matter of safety [m/s]"""
 SHORT_HEADWAY = 1.0

@@ -117,7 +117,7 @@ class ClosedLog:
         before = [(end - states.route_position[:-1]) % loop for _, end in self.road.crossings]
         ways = [end - start + APPROACH for start, end in self.road.crossings]
         close = sum((left < way for left, way in zip(before, ways, strict=True)), np.zeros(1, bool))
-        found = following(*followed, step, self._added() > SHIELD_ROUNDING / step, close)
+        found = following(*followed, step, self._added() > SHIELD_ROUNDING, close)
         return Audit(brakings(accelerations[~driven]), brakings(accelerations[driven]), found, floor)
 
     def _applied(self) -> tuple[Floats, Floats]:

@@ -280,7 +280,7 @@ class OpenTraffic(Traffic[RoadKind]):
             leader[rows, column], gap[rows, column] = each.states.leader_speed, each.states.leader_gap
         step = self.scenario.decision_step
         added = np.concatenate([each.shield for each in trajectories]) if trajectories else np.zeros(0)
-        return following(speed, leader, gap, step, added > SHIELD_ROUNDING / step, np.zeros_like(added))
+        return following(speed, leader, gap, step, added > SHIELD_ROUNDING, np.zeros_like(added))
 
     def _trajectories(self, driven: Driven) -> tuple[Trajectory, ...]:
         """Return the stays of at least one decision, in order of entry."""
