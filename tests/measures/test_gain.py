@@ -3,10 +3,11 @@
 from math import nan
 from typing import Any
 
+import numpy as np
 import pytest
 
 from unjam.measures.gain import LEAST, MOST, WORST, ceiling, gain, mean_gain, worth
-from unjam.measures.statistics import Estimate
+from unjam.measures.statistics import Estimate, estimate
 
 CLOSED: dict[str, Any] = {
     "status": "completed",
@@ -72,8 +73,19 @@ def test_where_nothing_is_to_be_gained_a_loss_is_all_that_counts() -> None:
     assert gain(ring([2.955] * 4), PEOPLE, best).mean == pytest.approx(-0.5)
 
 
-def test_the_mean_over_roads_is_surer_than_that_of_each() -> None:
-    each = Estimate(0.5, 0.3, 0.7, 10)
-    found = mean_gain({str(number): each for number in range(4)})
-    assert (found.mean, found.count) == (0.5, 4)
-    assert found.high - found.low == pytest.approx(0.2)
+def test_the_mean_over_roads_is_no_surer_than_each_where_a_seed_is_kind_on_all() -> None:
+    values = np.array([0.2, 0.4, 0.6, 0.8])
+    each = estimate(values.tolist())
+    together = mean_gain([each] * 4, [values] * 4)
+    assert (together.mean, together.count) == (pytest.approx(0.5), 4)
+    assert (together.low, together.high) == (pytest.approx(each.low), pytest.approx(each.high))
+    apart = mean_gain([each, each], [values, values[::-1]])
+    assert (apart.low, apart.high) == (pytest.approx(0.5), pytest.approx(0.5))
+
+
+def test_a_gain_that_a_rule_has_fixed_adds_no_error() -> None:
+    values = np.array([0.2, 0.4, 0.6, 0.8])
+    each = estimate(values.tolist())
+    found = mean_gain([each, Estimate(0.0, 0.0, 0.0, 4)], [values, 10.0 * values])
+    assert found.mean == pytest.approx(0.25)
+    assert found.high - found.low == pytest.approx((each.high - each.low) / 2)

@@ -99,5 +99,5 @@ def tune(
     console.print(
         f"{best.driver}: {best.score:.4g} on tuning seeds; {default.driver}: {before}", soft_wrap=True
     )
-    on = next(iter(FAMILY.values())).scenario if is_family(scenario) else scenario
+    on = FAMILY[next(iter(roads))].scenario if is_family(scenario) else scenario
     console.print(f"drive with it: unjam drive {on} --driver {found.file} --held-out", soft_wrap=True)

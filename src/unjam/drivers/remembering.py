@@ -8,7 +8,6 @@ long it is, and how fast traffic could flow.
 from dataclasses import dataclass
 from functools import cached_property
 from math import exp
-from typing import ClassVar
 
 import numpy as np
 
@@ -38,7 +37,6 @@ class Remembering(Wrapper):
     driver: Driver
     time_step: Positive
     """time between two decisions [s]"""
-    plain_numbers: ClassVar[bool] = False
 
     @property
     def inner(self) -> dict[str, Driver]:

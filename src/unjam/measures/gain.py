@@ -4,7 +4,7 @@ So roads can be compared and averaged whose numbers are not alike: speed on clos
 with ends.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -12,6 +12,7 @@ import numpy as np
 from unjam.measures.drivable import DRIVABLE, drivable_in_all
 from unjam.measures.effect import FLOW, FLOW_LOST
 from unjam.measures.statistics import Estimate, estimate, paired_difference
+from unjam.worlds.record import Floats
 
 WORST, MOST = -1.0, 1.5
 """between which a gain counts"""
@@ -39,6 +40,17 @@ def ceiling(row: dict[str, Any]) -> float:
     return row["mean_speed"] / row["speed_limit_ratio"]
 
 
+def scaled(rows: Rows, people: Rows, best: float) -> Floats:
+    """Return by how much a driver is better than people on each seed, over what the best is on average.
+
+    Where that is less than `LEAST`, over that. Arguments as `gain` takes them.
+    """
+    alone = {str(row["seed"]): worth(row) for row in people}
+    before = float(np.mean(list(alone.values())))
+    scale = max(best - before, LEAST * abs(before))
+    return np.array([(worth(row) - alone[str(row["seed"])]) / scale for row in rows])
+
+
 def gain(rows: Rows, people: Rows, best: float) -> Estimate:
     """Return what a driver gains on one road, the same seeds paired.
 
@@ -50,24 +62,31 @@ def gain(rows: Rows, people: Rows, best: float) -> Estimate:
         people: of people alone on the same seeds.
         best: mean of `worth` of the best that is known there.
     """
-    alone = {str(row["seed"]): worth(row) for row in people}
-    before = float(np.mean(list(alone.values())))
-    least = LEAST * abs(before)
-    scale = max(best - before, least)
-    found = estimate([(worth(row) - alone[str(row["seed"])]) / scale for row in rows])
+    found = estimate(scaled(rows, people, best).tolist())
     mean, low, high = (float(np.clip(each, WORST, MOST)) for each in (found.mean, found.low, found.high))
     flow = paired_difference(rows, people, FLOW)
     slower = flow.high < -FLOW_LOST * float(np.mean([row[FLOW] for row in people]))
     verdict = drivable_in_all(rows, people)
-    if best - before < least or slower or verdict != DRIVABLE:
+    before = float(np.mean([worth(row) for row in people]))
+    if best - before < LEAST * abs(before) or slower or verdict != DRIVABLE:
         mean, low, high = min(mean, 0.0), min(low, 0.0), min(high, 0.0)
     return Estimate(mean, low, high, found.count)
 
 
-def mean_gain(gains: Mapping[str, Estimate]) -> Estimate:
-    """Return the mean gain over roads, each with seeds of its own: their errors are independent."""
-    means = np.array([each.mean for each in gains.values()])
-    halves = np.array([(each.high - each.low) / 2.0 for each in gains.values()])
-    half = float(np.sqrt((halves**2).sum()) / len(halves))
-    mean = float(means.mean())
-    return Estimate(mean, mean - half, mean + half, len(means))
+def mean_gain(gains: Sequence[Estimate], by_seed: Sequence[Floats]) -> Estimate:
+    """Return the mean gain over roads that were driven on the same seeds, with its interval over seeds.
+
+    A seed may be kind to a driver on many roads: their errors are not independent. A gain that a rule has
+    fixed has none.
+
+    Args:
+        gains: of each road.
+        by_seed: what `scaled` says of each road, arrays of shape (seeds,).
+    """
+    mean = float(np.mean([each.mean for each in gains]))
+    errors = [
+        values - values.mean() if each.low < each.high else np.zeros(len(values))
+        for each, values in zip(gains, by_seed, strict=True)
+    ]
+    around = estimate(np.mean(errors, axis=0).tolist())
+    return Estimate(mean, mean + around.low, mean + around.high, len(gains))

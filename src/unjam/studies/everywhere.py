@@ -16,9 +16,9 @@ from matplotlib.figure import Figure
 from unjam.controller import make_driver
 from unjam.files import to_json, write_whole
 from unjam.measures.drivable import drivable_in_all
-from unjam.measures.gain import MOST, WORST, Rows, gain, mean_gain, worth
+from unjam.measures.gain import MOST, WORST, Rows, gain, mean_gain, scaled, worth
 from unjam.measures.metrics import measure
-from unjam.measures.statistics import Estimate, signed
+from unjam.measures.statistics import signed
 from unjam.reports.figures import INK, new_figure
 from unjam.scenarios.scenario import Scenario
 from unjam.studies.study import Study, StudyFolder, about_study
@@ -95,6 +95,7 @@ def gains_of(folder: Path) -> dict[str, dict[str, Any]]:
             **{key: found[key] for key in ("part", "best")},
             "people": float(np.mean([worth(row) for row in people])),
             "gains": {label: gain(of, people, best) for label, of in rows.items()},
+            "by_seed": {label: scaled(of, people, best) for label, of in rows.items()},
             "verdicts": {label: drivable_in_all(of, people) for label, of in rows.items()},
         }
     return roads
@@ -104,12 +105,12 @@ def table(parts: tuple[str, ...], folder: Path) -> pd.DataFrame:
     """Return what each driver gains on each road of some parts of the family, with the mean and the worst."""
     roads = {name: road for name, road in gains_of(folder).items() if road["part"] in parts}
     rows = [{"road": name, **_cells(road)} for name, road in roads.items()]
-    means: dict[str, Estimate] = {
-        label: mean_gain({name: road["gains"][label] for name, road in roads.items()}) for label in JUDGED
-    }
-    worst = {label: min(road["gains"][label].mean for road in roads.values()) for label in JUDGED}
-    rows.append({"road": "mean", **{label: signed(found, 2) for label, found in means.items()}})
-    rows.append({"road": "worst", **{label: f"{found:+.2f}" for label, found in worst.items()}})
+    mean, worst = {"road": "mean"}, {"road": "worst"}
+    for label in JUDGED:
+        gains = [road["gains"][label] for road in roads.values()]
+        mean[label] = signed(mean_gain(gains, [road["by_seed"][label] for road in roads.values()]), 2)
+        worst[label] = f"{min(each.mean for each in gains):+.2f}"
+    rows += [mean, worst]
     return pd.DataFrame(rows).fillna("")
 
 

@@ -30,6 +30,7 @@ from unjam.studies.comparison import HONEST, entries, estimates, interval, numbe
 from unjam.studies.study import REFERENCES, ROADS, OnProgress, PlannedRun, Study, StudyFolder, Table, planned
 from unjam.training.config import load_config
 from unjam.training.evaluate import TRAINED, Evaluation, evaluate, raise_failure, save_evaluation
+from unjam.training.family import MEASURED
 from unjam.training.seeds import held_out_seeds
 from unjam.worlds.record import Episode
 from unjam.worlds.workers import EpisodeTask, Workers
@@ -37,14 +38,6 @@ from unjam.worlds.workers import EpisodeTask, Workers
 EPISODES = 10
 """of each driver under each condition"""
 SHOWN = ("mean_speed", "mean_speed_steady", "speed_std_fleet", "min_headway", "collisions", "backlog_veh")
-PEOPLE = {
-    "desired_speed": 17.49,
-    "time_headway": 1.355,
-    "max_acceleration": 1.243,
-    "comfortable_deceleration": 1.424,
-    "minimum_gap": 2.157,
-}
-"""the IDM that suits the 325 drivers of the NGSIM pairs best together, results/field/ngsim-drivers.json"""
 
 
 @dataclass(frozen=True)
@@ -60,7 +53,7 @@ class Condition:
 EVERYWHERE = (
     Condition("as in training"),
     Condition("twice the noise", {"noise": 0.4}),
-    Condition("people of NGSIM", {"humans": PEOPLE}),
+    Condition("people of NGSIM", {"humans": MEASURED}),
     Condition("gaps ± 0.5 m", impaired={"gap_noise": 0.5}),
 )
 LATE = Condition("0.3 s late", impaired={"delay": 0.3})

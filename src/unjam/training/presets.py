@@ -4,7 +4,7 @@ from typing import Any, cast
 
 from unjam.errors import wrong, wrong_name
 from unjam.scenarios.ring import Ring
-from unjam.training.family import FAMILY, GROUPS, FamilyRoad
+from unjam.training.family import FAMILY, roads_of
 
 PRESETS: dict[str, dict[str, Any]] = {
     # What the paper says, where it says something: Tables B2 to B5, section 4.1.
@@ -51,13 +51,12 @@ BRAKING_COST = 0.0075
 """weight of the acceleration's term where the speed's is such that the limit earns 1"""
 
 
-def _task(name: str, road: FamilyRoad) -> dict[str, Any]:
+def _task(name: str, ring: Ring) -> dict[str, Any]:
     """Return a ring of the family as a task; returns are alike: a share of what its people could drive."""
-    ring = cast(Ring, road.make())
     limits = [ring.limit(size) for size in ring.length]
     speed = round(5.0 * len(limits) / sum(limits), 4)
     reward = f"released:speed={speed},acceleration={BRAKING_COST}"
-    return {"scenario": road.scenario, "road": road.changes, "reward": reward, "name": name}
+    return {"scenario": FAMILY[name].scenario, "road": FAMILY[name].changes, "reward": reward, "name": name}
 
 
 # One residual for all rings of the family that may be seen. An iteration is large, for the roads differ.
@@ -68,11 +67,7 @@ PRESETS["rings"] = {
     "trpo": {"batch_steps": 240_000, "target_kl": 0.02},
     "virtual": {"virtual_ratio": 0.0},
     "evaluation": {"validation_episodes": 4, "episodes": 10, "baselines": ["human", "pi"]},
-    "tasks": [
-        _task(name, road)
-        for name, road in FAMILY.items()
-        if road.part == "seen" and road.scenario in GROUPS["rings"]
-    ],
+    "tasks": [_task(name, cast(Ring, ring)) for name, ring in roads_of("rings", "seen").items()],
 }
 
 CLOSING_ABSORBER = "jam-absorber:gap_gain=0,push=0.9,speed_gain=0.8"

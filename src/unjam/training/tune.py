@@ -21,7 +21,7 @@ from unjam.errors import InputError, UnjamError, wrong_name
 from unjam.files import to_json, write_whole
 from unjam.manifest import manifest
 from unjam.measures.drivable import DRIVABLE, drivable_in_all
-from unjam.measures.gain import MEAN_GAIN, Rows, ceiling, gain, mean_gain
+from unjam.measures.gain import MEAN_GAIN, Rows, ceiling, gain
 from unjam.measures.metrics import measure
 from unjam.scenarios import scenario_recipe
 from unjam.scenarios.scenario import Scenario
@@ -160,9 +160,9 @@ def tune(
     trials = (steps - final) // each
     if trials < 2:
         raise InputError(f"steps: {steps} is not allowed; allowed: >= {final + 2 * each} for two settings")
-    why = [why_not(scenario) for scenario in roads.values() if screen and why_not(scenario)]
-    if why:
-        raise InputError(f"screen: {why[0]}")
+    for scenario in roads.values() if screen else ():
+        if why := why_not(scenario):
+            raise InputError(f"screen: {why}")
     make_new_folder(folder)
     run = partial(_in_sumo, workers)
     alone = {
@@ -265,7 +265,8 @@ def _score(found: Mapping[str, Rows], people: Mapping[str, Rows]) -> tuple[float
             for road, rows in found.items()
         }
         worst = min(gains, key=lambda road: gains[road].mean)
-        return mean_gain(gains).mean, f"worst on {worst}: {gains[worst].mean:+.2f}"
+        mean = float(np.mean([each.mean for each in gains.values()]))
+        return mean, f"worst on {worst}: {gains[worst].mean:+.2f}"
     (rows,) = found.values()
     verdict = drivable_in_all([{**row, "people_beyond_4_5": 0.0} for row in rows])
     return float(np.mean([row["return"] for row in rows])) if verdict == DRIVABLE else None, verdict
