@@ -19,8 +19,8 @@ from unjam.controller.file import (
     hash_of,
     pack_parts,
     read_controller,
+    sample_bytes,
 )
-from unjam.controller.sample import sample_bytes
 from unjam.controller.verify import verify_controller
 from unjam.drivers import IDM, Driver, LocalState, PISaturation
 from unjam.drivers.car_following import Constant

@@ -4,11 +4,10 @@ import numpy as np
 import pytest
 
 from unjam.controller import shipped_file
-from unjam.controller.domain import other_road, outside_domain, road_of
+from unjam.controller.domain import notes_on_controllers, other_road, outside_domain, road_of
 from unjam.controller.file import read_controller
 from unjam.drivers import LocalState
 from unjam.scenarios import Ring, Scenario, make_scenario, scenario_recipe
-from unjam.training.notes import notes_on_controllers
 
 TRAINED = {"scenario": scenario_recipe(Ring())}
 
@@ -46,7 +45,7 @@ def test_states_outside_of_the_certified_domain_are_counted() -> None:
 
 
 def test_only_controllers_on_another_road_get_a_note() -> None:
-    road = make_scenario("figure-eight")
+    road = scenario_recipe(make_scenario("figure-eight"))
     names = ["pi", "human", "unjam:figure-eight-tuned", "unjam:ring-tuned"]
     assert notes_on_controllers(road, names, {}) == [
         "unjam:ring-tuned was tuned on the ring, not on the figure-eight"

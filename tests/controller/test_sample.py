@@ -3,9 +3,9 @@ import pytest
 from safetensors.numpy import load, save
 
 from tests.controller.test_file import residual
-from unjam.controller.sample import read_sample, replay, sample_bytes
+from unjam.controller.file import read_sample, replay, sample_bytes
 from unjam.drivers import LocalState, PISaturation
-from unjam.drivers.check import random_state
+from unjam.drivers.from_file import random_state
 from unjam.errors import InputError
 
 

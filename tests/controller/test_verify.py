@@ -14,8 +14,7 @@ from tests.conftest import random_network
 from tests.controller.test_file import ABOUT, residual, written
 from tests.controller.test_sample import perceived
 from unjam.controller import controller_bytes, load_controller
-from unjam.controller.file import GRAPH, MANIFEST, SAMPLE, hash_of, pack_parts, unpack_parts
-from unjam.controller.sample import sample_bytes
+from unjam.controller.file import GRAPH, MANIFEST, SAMPLE, hash_of, pack_parts, sample_bytes, unpack_parts
 from unjam.controller.verify import verify_controller
 from unjam.drivers import Constant, Driver, PISaturation, ResidualDriver
 from unjam.drivers.from_file import FileDriver

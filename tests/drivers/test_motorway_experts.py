@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from unjam.drivers.local_state import EVERYWHERE, SECTIONS_AHEAD, LocalState, like_ones
-from unjam.drivers.motorway_experts import FREELY, Cruise, JamAhead
 from unjam.drivers.registry import named_driver
+from unjam.drivers.road_experts import FREELY, Cruise, JamAhead
 from unjam.errors import InputError
 
 

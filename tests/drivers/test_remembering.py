@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from unjam.drivers import FollowerStopper, PISaturation
-from unjam.drivers.check import check_driver
+from unjam.drivers.from_file import check_driver
 from unjam.drivers.local_state import EVERYWHERE, LocalState, like_ones
 from unjam.drivers.registry import driver_from_recipe, recipe_of
-from unjam.drivers.remembering import SPANS, Remembering
+from unjam.drivers.wrappers import SPANS, Remembering
 
 STEP = 0.5
 

@@ -8,12 +8,10 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from unjam.drivers.actuator import Actuator, Underway
-from unjam.drivers.safety import Ahead, SafetyFilter
+from unjam.drivers.safety import Actuator, Ahead, SafetyFilter, Underway
 from unjam.errors import InputError
 from unjam.parameters import build
-from unjam.physics.kinematics import next_speed
-from unjam.physics.stopping import speed_to_stop_within, stopping_distance
+from unjam.physics.kinematics import next_speed, speed_to_stop_within, stopping_distance
 
 STEPS = st.sampled_from([0.05, 0.1, 0.2, 0.5])
 SPEEDS = st.floats(0.0, 40.0)

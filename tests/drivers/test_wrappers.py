@@ -6,7 +6,7 @@ import torch
 
 from unjam.controller import make_driver
 from unjam.drivers import IDM, Driver, FollowerStopper, PISaturation, check_driver
-from unjam.drivers.check import random_state
+from unjam.drivers.from_file import random_state
 from unjam.drivers.registry import driver_from_recipe, recipe_of
 from unjam.drivers.wrappers import Impaired, Mixed
 from unjam.errors import InputError

@@ -12,10 +12,10 @@ from numpy.typing import ArrayLike
 
 from unjam.drivers import LocalState
 from unjam.measures.metrics import METRICS, measure
-from unjam.measures.waves import speed_along_road, wave_speed
 from unjam.scenarios.scenario import VEHICLE_LENGTH
+from unjam.studies.robustness import speed_along_road, wave_speed
 from unjam.worlds.audit import Audit, Following, following
-from unjam.worlds.neighbours import loop_neighbours, loop_state
+from unjam.worlds.closed import loop_neighbours, loop_state
 from unjam.worlds.record import Episode, Floats, Trajectory, failed_episode, outcome_of
 
 LENGTH = 200.0

@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 from tests.measures.test_effect import GOOD, between
-from unjam.measures.recommendation import Judged, headline, recommended, shown_beside
+from unjam.measures.effect import Judged, headline, recommended, shown_beside
 
 HELPS = Judged(0.05, "acc", GOOD)
 HELPS_MORE = Judged(0.2, "pi", replace(GOOD, travel_time=between(-12.0, -8.0)))

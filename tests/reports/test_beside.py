@@ -4,8 +4,7 @@ from typing import Any
 import numpy as np
 
 from unjam.measures.metrics import METRICS
-from unjam.reports.beside import BETTER, against_people, episodes_as_csv
-from unjam.reports.story import Column
+from unjam.reports.story import BETTER, Column, against_people, episodes_as_csv
 
 
 def column(name: str, values: list[float], **more: Any) -> Column:

@@ -14,8 +14,7 @@ from tests.controller.test_sample import perceived
 from tests.drivers.test_experts import EXPERTS
 from tests.worlds.sumo.own_roads import straight
 from unjam.controller import controller_bytes
-from unjam.controller.file import SAMPLE
-from unjam.controller.sample import replay, sample_bytes
+from unjam.controller.file import SAMPLE, replay, sample_bytes
 from unjam.drivers import LACC, Driver, FollowerStopper, LocalState, Pacer, PISaturation
 from unjam.drivers.local_state import LARGEST_GAP
 from unjam.drivers.registry import named_driver

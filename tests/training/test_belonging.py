@@ -12,10 +12,17 @@ import torch
 from tests.training.test_run import small_config
 from tests.worlds.sumo.own_roads import straight
 from unjam.errors import InputError
-from unjam.training.belonging import belonging, check_belongs
 from unjam.training.config import RunConfig, load_config, to_toml
-from unjam.training.controllers import KeptControllers
-from unjam.training.folder import MANIFEST, last_state, note_lineage, save_checkpoint, start_folder
+from unjam.training.export import KeptControllers
+from unjam.training.folder import (
+    MANIFEST,
+    belonging,
+    check_belongs,
+    last_state,
+    note_lineage,
+    save_checkpoint,
+    start_folder,
+)
 
 EXPERT = "def gentle(state):\n    return 0.1 * (state.leader_speed - state.speed)\n"
 

@@ -1,6 +1,6 @@
 """Does a budget end what it should, by number and by time?"""
 
-from unjam.training.budget import Budget
+from unjam.training.choice import Budget
 
 
 def test_episodes_are_counted_and_a_part_may_be_asked_for() -> None:

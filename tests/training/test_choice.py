@@ -9,8 +9,17 @@ import pytest
 from tests.measures.test_effect import USUAL
 from unjam.errors import InputError
 from unjam.measures.effect import LEAST_JUDGED
-from unjam.training.budget import Budget
-from unjam.training.choice import LEAST_CHOOSING, PEOPLE, Option, Rows, Seed, choose, judge, least_episodes
+from unjam.training.choice import (
+    LEAST_CHOOSING,
+    PEOPLE,
+    Budget,
+    Option,
+    Rows,
+    Seed,
+    choose,
+    judge,
+    least_episodes,
+)
 from unjam.training.seeds import CHOOSE, JUDGE
 
 ACC, PI = (Option(0.1, name) for name in ("acc", "pi"))

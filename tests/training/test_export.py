@@ -8,8 +8,7 @@ import pytest
 from tests.pictures import empty_pictures
 from tests.training.test_run import small_config
 from unjam.controller import load_controller
-from unjam.controller.file import GRAPH, MANIFEST, SAMPLE, WEIGHTS, unpack_parts
-from unjam.controller.sample import read_sample
+from unjam.controller.file import GRAPH, MANIFEST, SAMPLE, WEIGHTS, read_sample, unpack_parts
 from unjam.drivers import PISaturation, ResidualDriver
 from unjam.drivers.wrappers import Filtered
 from unjam.errors import InputError

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 import pytest
 
 from unjam.drivers import PISaturation
-from unjam.drivers.check import check_driver
+from unjam.drivers.from_file import check_driver
 from unjam.training import speed
 from unjam.training.speed import measure_speed, neural_driver
 

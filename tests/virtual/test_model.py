@@ -3,7 +3,7 @@ import torch
 from torch.testing import assert_close
 
 from unjam.drivers import LocalState
-from unjam.drivers.check import random_state
+from unjam.drivers.from_file import random_state
 from unjam.virtual.model import (
     BLOCK,
     NUMBERS,

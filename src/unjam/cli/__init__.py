@@ -10,8 +10,7 @@ from typing import Annotated
 import typer
 
 from unjam import __version__
-from unjam.cli.assess import assess
-from unjam.cli.drive import drive, watch
+from unjam.cli.drive import assess, drive, watch
 from unjam.cli.machine import bench, doctor
 from unjam.cli.parts import drivers, fit_drivers, scenarios
 from unjam.cli.results import certify, evaluate, export, model, report, verify

@@ -1,4 +1,4 @@
-"""Episodes with a driver: `unjam drive` measures them, `unjam watch` shows one."""
+"""Episodes with drivers: `unjam drive` measures them, `watch` shows one, `assess` recommends or does not."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from unjam.cli.next_step import after_drive
 from unjam.cli.options import (
     DEFAULT_WORKERS,
     JsonOption,
@@ -21,7 +20,7 @@ from unjam.cli.options import (
     scenario_changes,
     with_options,
 )
-from unjam.cli.output import aside, console, counting_steps, print_json, print_metrics
+from unjam.cli.output import after_drive, aside, console, counting_steps, print_json, print_metrics
 from unjam.errors import MissingPartError
 from unjam.processes import has_display
 
@@ -29,6 +28,7 @@ if TYPE_CHECKING:
     from unjam.drivers.driver import Driver
     from unjam.scenarios.scenario import Scenario
     from unjam.worlds.record import Episode
+from unjam.errors import wrong
 
 
 @with_options(changes=scenario_changes)
@@ -125,17 +125,17 @@ def watch(
       unjam watch ring-jammed --driver runs/ring-001 --video wave.mp4
     """
     from unjam.controller import make_driver
+    from unjam.controller.domain import notes_on_controllers
     from unjam.files import check_folder
     from unjam.measures.metrics import measure
     from unjam.reports.film import check_format, write_video
-    from unjam.scenarios import make_scenario
+    from unjam.scenarios import make_scenario, scenario_recipe
     from unjam.training.evaluate import raise_failure
-    from unjam.training.notes import notes_on_controllers
     from unjam.worlds.workers import EpisodeTask, Workers
 
     road = make_scenario(scenario, changes | assignments(settings))
     driven = make_driver(driver, road.decision_step)
-    for note in notes_on_controllers(road, [driver], {}):
+    for note in notes_on_controllers(scenario_recipe(road), [driver], {}):
         aside.print(f"note: {note}", markup=False, soft_wrap=True)
     if video is None:
         episode = watch_in_window(road, driven, (seed,), pace)
@@ -174,3 +174,74 @@ def watch_in_window(scenario: "Scenario", driver: "Driver", seed: Sequence[int],
     options = ("--start", "true", "--quit-on-end", "true", "--delay", str(delay))
     with Simulation("gui", gui_options=options) as window:
         return run_episode(scenario, driver, seed, simulation=window)
+
+
+def assess(
+    *,
+    scenario: Annotated[str, typer.Argument(help="Your own .sumocfg file.", metavar="FILE")],
+    driver: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--driver",
+            "-d",
+            help="Who drives the CAVs, as in drive; given several times, the best of them is chosen.",
+            show_default="those that fit roads with ends",
+        ),
+    ] = None,
+    shares: Annotated[
+        str, typer.Option(help="Shares of CAVs among the cars and the like; people alone are always driven.")
+    ] = "0.02,0.05,0.1,0.2",
+    episodes: Annotated[int, typer.Option("--episodes", "-n", min=1, help="Episodes in all, at most.")] = 400,
+    minutes: Annotated[
+        float | None, typer.Option(help="Minutes, at most; looked at between batches of episodes.")
+    ] = None,
+    precision: Annotated[
+        float,
+        typer.Option(
+            help="Half-width of the interval of travel time that is narrow enough, as a share of it."
+        ),
+    ] = 0.02,
+    settings: ScenarioSettingsOption = None,
+    workers: WorkersOption = DEFAULT_WORKERS,
+    out: OutOption = None,
+    json: JsonOption = False,
+) -> None:
+    """What would CAVs do on my road? Shares and drivers beside people alone, and a recommendation, or none.
+
+    For each share a driver is chosen on some seeds and judged on fresh ones. It is recommended only where the
+    interval of travel time lies below zero, flow is not lower, a car could drive so, and people brake hard no
+    more often than alone.
+
+    Examples:
+
+      unjam assess my.sumocfg
+
+      unjam assess my.sumocfg --shares 0.05,0.2 -d acc -d pi --minutes 30
+
+      unjam assess my.sumocfg -d runs/my-001 --shares 0.1 --set horizon=6000 --json
+    """
+    from unjam.training.assess import DRIVERS_OF_OPEN_ROADS, question
+    from unjam.training.assess import assess as run
+    from unjam.worlds.workers import Workers
+
+    drivers, changes = driver or DRIVERS_OF_OPEN_ROADS, assignments(settings)
+    asked = question(scenario, _shares(shares), episodes, precision, minutes, drivers, changes)
+    folder = new_folder(out, f"assess-{Path(scenario).stem}")
+    total = asked.road.horizon * episodes
+    with counting_steps("assessing, at most", total) as steps, Workers(workers) as pool:
+        found = run(asked, folder, pool, steps, (lambda line: None) if json else aside.print)
+    if json:
+        print_json({**found.document, "folder": str(folder), "report": str(found.page)})
+        return
+    console.print(found.document["headline"], soft_wrap=True, markup=False)
+    for each in found.judged:
+        console.print(f"- {each.words}", soft_wrap=True, markup=False)
+    aside.print(f"report: {found.page}", soft_wrap=True, markup=False)
+
+
+def _shares(text: str) -> list[float]:
+    """Return the numbers of a list like 0.02,0.1."""
+    try:
+        return [float(word) for word in text.split(",")]
+    except ValueError:
+        raise wrong("shares", text, "numbers from 0 to 1, like 0.02,0.1") from None

@@ -119,7 +119,7 @@ def _try(name: str, run: Callable[[], str], remedy: str) -> Check:
 
 
 def _cache() -> Check:
-    from unjam.worlds.sumo.cache import cache_folder
+    from unjam.worlds.sumo.networks import cache_folder
 
     folder = cache_folder()
     try:

@@ -1,10 +1,12 @@
-"""What the command line prints: tables for people, one JSON document for programs, progress on the side."""
+"""What the command line prints: tables, one JSON document, progress on the side, and what to type next."""
 
 import os
+import shlex
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from textwrap import fill
 from typing import TYPE_CHECKING, Any, Self
 
@@ -14,9 +16,12 @@ from rich.measure import Measurement
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
+from unjam.cli.options import DEFAULT_WORKERS
+from unjam.errors import InputError, MissingPartError
 from unjam.files import to_json
 
 if TYPE_CHECKING:
+    from unjam.measures.statistics import Estimate
     from unjam.measures.table import Cell
 
 LINE_SECONDS = 5.0
@@ -141,3 +146,53 @@ def counting_steps(label: str, total: int) -> Iterator[Callable[[Any, int], None
             counted(sum(done.values()), total)
 
         yield note
+
+
+def say_next(why: str, *words: object) -> None:
+    """Print a command line that makes sense now, whole: it is copied."""
+    aside.print(f"{why}: {shlex.join(['unjam', *map(str, words)])}", soft_wrap=True, markup=False)
+
+
+def after_drive(scenario: str, drivers: Sequence[str]) -> None:
+    """Compare with people first, then learn on an expert, then look at what was learned."""
+    from unjam.drivers.registry import DRIVERS
+
+    experts = [driver for driver in drivers if driver.partition(":")[0] in DRIVERS and driver != "human"]
+    if "human" not in drivers:
+        say_next("compare with people", *_command_without_out(), "-d", "human")
+    elif experts and len(experts) == len(drivers) - 1:
+        say_next("learn on an expert", "train", scenario, "--expert", experts[-1], "--preset", "demo")
+    elif drivers != ["human"]:
+        say_next("see it", "watch", scenario, "-d", drivers[-1], "--video", f"{Path(scenario).stem}.gif")
+    else:
+        say_next("compare with an expert", *_command_without_out(), "-d", "pi")
+
+
+def _command_without_out() -> list[str]:
+    """Return what was typed, but for the folder that is now taken."""
+    words = list(sys.argv[1:])
+    if "--out" in words:
+        place = words.index("--out")
+        del words[place : place + 2]
+    return [word for word in words if not word.startswith("--out=")]
+
+
+def after_training(folder: Path, gain: "Estimate | None", steps: int) -> None:
+    """Ship what gained, train on what did not; a single held-out seed shows nothing."""
+    if gain is not None and not gain.low > 0:
+        say_next("no gain is shown; train longer", "train", "--resume", folder, "--steps", 2 * steps)
+    else:
+        say_next("ship it", "export", folder, "--to", f"{folder.name}.unjam")
+
+
+@contextmanager
+def resumable(folder: Path, workers: int) -> Iterator[None]:
+    """Say how a training goes on that is stopped in the midst of it."""
+    try:
+        yield
+    except BaseException as stop:
+        mendable = isinstance(stop, InputError | MissingPartError)
+        if not mendable and (folder / "config.toml").is_file():
+            once = [] if workers == DEFAULT_WORKERS else ["--workers", workers]
+            say_next("go on with", "train", "--resume", folder, *once)
+        raise

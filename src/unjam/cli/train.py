@@ -7,7 +7,6 @@ from typing import Annotated, Any
 
 import typer
 
-from unjam.cli.next_step import after_training, resumable
 from unjam.cli.options import (
     DEFAULT_WORKERS,
     AskedRun,
@@ -22,7 +21,7 @@ from unjam.cli.options import (
     scenario_changes,
     with_options,
 )
-from unjam.cli.output import Counted, aside, console, print_json, print_metrics
+from unjam.cli.output import Counted, after_training, aside, console, print_json, print_metrics, resumable
 from unjam.errors import InputError
 
 LINE_EVERY = 5

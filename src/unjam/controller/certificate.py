@@ -6,8 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from unjam.controller.file import SAMPLE, Controller
-from unjam.controller.sample import Floats, read_sample
+from unjam.controller.file import SAMPLE, Controller, Floats, read_sample
 from unjam.drivers.local_state import LocalState
 from unjam.drivers.safety import Ahead
 from unjam.drivers.wrappers import Filtered
@@ -15,7 +14,7 @@ from unjam.errors import InputError
 from unjam.parameters import build
 from unjam.physics.idm import IDMParameters, equilibrium_gap, idm_acceleration
 from unjam.worlds.drive import drive
-from unjam.worlds.pursuit import Pursued, PursuitWorld
+from unjam.worlds.world import Pursued, PursuitWorld
 
 MEAN_SECONDS = 2.0
 """over which ISO 15622 takes the mean of an acceleration [s]"""
@@ -142,14 +141,10 @@ Pursue = Callable[[Ahead, Floats], Pursued]
 """drives a controller behind leaders: (where the pairs begin, what leaders do)"""
 
 
-def certify(driver: Filtered, visited: LocalState, humans: IDMParameters, seed: int = 0) -> Certificate:
+def certify(driver: Filtered, visited: LocalState, humans: IDMParameters) -> Certificate:
     """Try a controller with its filter, and say what holds; the same controller gets the same certificate.
 
-    Args:
-        driver: the controller.
-        visited: what one of its CAVs perceived on its road, arrays of shape (T,).
-        humans: who drives behind it.
-        seed: of the adversary.
+    `visited` is what one of its CAVs perceived on its road, arrays of shape (T,); `humans` drive behind it.
     """
     loop = float(visited.loop_length[0])
 
@@ -161,7 +156,7 @@ def certify(driver: Filtered, visited: LocalState, humans: IDMParameters, seed: 
     speeds = [round(share * float(states.speed.max()), 1) for share in STRING_SHARES]
     speeds = [speed for speed in speeds if speed > MOVING]
     return Certificate(
-        _worst_cases(pursue, states, driver, np.random.default_rng(seed)),
+        _worst_cases(pursue, states, driver, np.random.default_rng(0)),
         _comfort(states.speed, driver.time_step),
         _strings(pursue, speeds, driver.time_step, humans) if speeds else (),
         Domain(*ranges),

@@ -1,17 +1,20 @@
-"""What a controller is for: the road that it was trained on, and what it met there."""
+"""What a controller is for: the road that it was trained on, what it met there, and notes on others."""
 
 import json
 import os
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from unjam.controller import SHIPPED, shipped_file
 from unjam.controller.certificate import Domain
 from unjam.controller.file import CERTIFICATE, Controller, read_controller
 from unjam.drivers.local_state import LocalState
 from unjam.errors import InputError
 from unjam.parameters import build, flat
+from unjam.worlds.record import Episode
 
 WITHOUT_EFFECT = {"horizon", "emission_class", "recall_warmup", "population"}
 """parameters of a scenario that make no other road of it"""
@@ -19,13 +22,35 @@ FACTS = ("length", "radius", "vehicles", "cavs", "cav_share", "warmup")
 """parameters that tell roads of a kind apart at a glance"""
 SHOWN = 3
 """parameters that a note names"""
+MUCH = 0.05
+"""share of decisions outside of what a controller is certified for, from which a note says so"""
 
 
-def controller_of(text: str, file: Path | None) -> Controller | None:
+def notes_on_controllers(road: dict[str, Any], names: Iterable[str], shown: dict[str, Episode]) -> list[str]:
+    """Return a line for each controller that was not made for this road, or met there what it never had.
+
+    `road` is the recipe of the scenario; `shown` is what some of the drivers met, by name.
+    """
+    notes = []
+    for name in names:
+        controller = controller_of(name)
+        if controller is None:
+            continue
+        if other := other_road(controller.manifest, road):
+            notes.append(f"{name} {other}")
+        states = [each.states for each in shown[name].trajectories] if name in shown else []
+        share = max((outside_domain(controller, each) for each in states), default=0.0)
+        if share > MUCH:
+            notes.append(f"{name} was outside of its certified domain in {100 * share:.0f} % of decisions")
+    return notes
+
+
+def controller_of(text: str) -> Controller | None:
     """Return the controller that a driver's name stands for; None where it is none, or cannot be read."""
-    path = file or Path(text)
+    shipped = text.startswith(SHIPPED)
+    path = shipped_file(text.removeprefix(SHIPPED)) if shipped else Path(text)
     try:
-        return read_controller(path) if os.path.exists(path) and (file or not text.endswith(".py")) else None
+        return read_controller(path) if os.path.exists(path) and not text.endswith(".py") else None
     except InputError:
         return None
 
@@ -33,9 +58,7 @@ def controller_of(text: str, file: Path | None) -> Controller | None:
 def other_road(manifest: dict[str, Any], road: dict[str, Any]) -> str:
     """Return in what a road is not the one that a controller was trained on; empty where it is, or unknown.
 
-    Args:
-        manifest: the controller's.
-        road: recipe of the scenario, as the manifest has one. A range within the trained one is the same.
+    `road` is the recipe of the scenario, as the manifest has one. A range within the trained one is the same.
     """
     trained = manifest.get("scenario")
     if not isinstance(trained, dict):

@@ -1,4 +1,4 @@
-"""Writing and reading a `.unjam` file: its archive, its manifest, and what is checked of them."""
+"""Writing and reading a `.unjam` file: archive, manifest, recorded sample, and what is checked of them."""
 
 import hashlib
 import io
@@ -12,16 +12,20 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
 from unjam import __version__
+from unjam.drivers.command import Limits
 from unjam.drivers.driver import Driver
-from unjam.drivers.local_state import STATE_UNITS
+from unjam.drivers.local_state import BY_SECTION, EVERYWHERE, SECTIONS_AHEAD, STATE_UNITS, LocalState
 from unjam.drivers.registry import code_of, driver_from_recipe, recipe_of
 from unjam.errors import InputError
 from unjam.files import to_json, write_whole
 from unjam.tree import leaves
+from unjam.worlds.drive import drive
+from unjam.worlds.world import RecordedWorld
 
 SUFFIX = ".unjam"
 FORMAT = 3
@@ -42,6 +46,10 @@ DAMAGED = (
     RuntimeError,  # of a kind that zipfile does not know, or nested without end
 )
 """what reading can raise where a file is none of ours"""
+Floats = NDArray[np.float64]
+
+ANSWER = "acceleration"
+"""the answer's name in a sample and in a graph"""
 
 
 @dataclass(frozen=True)
@@ -57,10 +65,7 @@ class Controller:
 def controller_bytes(driver: Driver, about: dict[str, Any], parts: dict[str, bytes] | None = None) -> bytes:
     """Return the content of a `.unjam` file.
 
-    Args:
-        driver: what it drives by.
-        about: where it comes from, for its manifest; `action_limit` [m/s2] is what the road allows.
-        parts: further parts of the archive, by name.
+    `about` says where it comes from, for its manifest; its `action_limit` [m/s2] is what the road allows.
     """
     recipe, arrays = recipe_of(driver)
     parts = {WEIGHTS: save(arrays), **(parts or {})}
@@ -198,9 +203,7 @@ def _what_is_wrong(entry: zipfile.ZipInfo) -> str:
 def description(driver: Driver, action_limit: float | None = None) -> dict[str, Any]:
     """Return what whoever runs a controller must know beside the recipe of its driver, as JSON.
 
-    Args:
-        driver: the controller's.
-        action_limit: of the road it is for [m/s2], where the driver has none of its own.
+    `action_limit` is that of the road it is for [m/s2], where the driver has none of its own.
 
     Returns:
         `observation`: what it is given at each decision, in order, in SI units; `networks`: what each of its
@@ -236,3 +239,41 @@ def _remembered(name: str, value: Any) -> dict[str, Any]:
     different = np.unique(values)  # NaN is one value
     first = different[0].item() if len(different) == 1 else values.tolist()
     return {"name": name, "shape": list(values.shape), "first": None if first != first else first}
+
+
+def sample_bytes(driver: Driver, states: LocalState, limit: float) -> bytes:
+    """Return the part of an archive with `states`, arrays of shape (T,), and the answers of `driver`."""
+    seen = {name: values for name, values in states._asdict().items() if values is not None}
+    arrays = {name: np.array(values, np.float64) for name, values in seen.items()}
+    return save({**arrays, ANSWER: replay(driver, states, limit)})
+
+
+def read_sample(part: bytes) -> tuple[LocalState, Floats]:
+    """Return the states of a sample and the recorded accelerations [m/s2], all of shape (T,).
+
+    Raises:
+        InputError: an array is missing, unknown, of another shape or type, or an acceleration is not finite.
+    """
+    arrays: dict[str, Any] = load(part)
+    needed, known = {*EVERYWHERE, ANSWER}, {*LocalState._fields, ANSWER}
+    wrong = (needed - arrays.keys()) | (arrays.keys() - known)
+    if wrong:
+        first = min(wrong)
+        raise InputError(f"sample: {first!r} is {'missing' if first in needed else 'unknown'}")
+    answers = arrays.pop(ANSWER)
+    for name, values in {**arrays, ANSWER: answers}.items():
+        shape = (len(values), SECTIONS_AHEAD) if name in BY_SECTION else answers.shape
+        if values.ndim != len(shape) or values.shape != shape or values.dtype != np.float64:
+            raise InputError(f"sample: {name!r} has shape {values.shape} of {values.dtype}; allowed: numbers")
+    if not np.isfinite(answers).all():
+        raise InputError("sample: a recorded acceleration is not finite")
+    return LocalState(**arrays), answers
+
+
+def replay(driver: Driver, states: LocalState, limit: float) -> Floats:
+    """Return what a driver answers when it perceives `states` one after the other, from its first memory.
+
+    States are of one CAV, arrays of shape (T,), as the answers are: within `limit` [m/s2].
+    """
+    world = RecordedWorld(states.at(np.s_[:, None]), Limits.symmetric(limit))
+    return drive(world, driver).ravel()

@@ -15,6 +15,7 @@ import numpy as np
 from unjam.controller.certificate import certificate_of
 from unjam.controller.domain import road_of
 from unjam.controller.file import (
+    ANSWER,
     CERTIFICATE,
     FORMAT,
     GRAPH,
@@ -22,10 +23,12 @@ from unjam.controller.file import (
     SAMPLE,
     WEIGHTS,
     Controller,
+    Floats,
     description,
     read_controller,
+    read_sample,
+    replay,
 )
-from unjam.controller.sample import ANSWER, Floats, read_sample, replay
 from unjam.drivers.driver import Driver
 from unjam.drivers.local_state import LocalState
 from unjam.errors import InputError, MissingPartError
@@ -192,15 +195,9 @@ def check_graph(part: bytes, driver: Driver) -> None:
 
 
 def run_graph(part: bytes, driver: Driver, states: LocalState) -> Floats:
-    """Return what a graph answers when it perceives `states` one after the other, from its first memory.
+    """Return what a checked graph answers when it perceives `states` one after the other [m/s2].
 
-    Args:
-        part: the graph, checked.
-        driver: whose graph it is; its memory is the graph's.
-        states: arrays of shape (T,).
-
-    Returns:
-        Accelerations [m/s2], shape (T,).
+    It begins with the first memory of `driver`, whose graph it is; all arrays have the shape (T,).
 
     Raises:
         InputError: onnxruntime refuses it.

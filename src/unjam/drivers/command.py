@@ -16,17 +16,10 @@ from unjam.physics.arrays import Array, clip
 
 
 class Command(NamedTuple):
-    """What n CAVs shall do until the next decision; arrays of shape (n,), or plain numbers of one.
-
-    No world carries out `speed_cap` and `lane` yet.
-    """
+    """What n CAVs shall do until the next decision; arrays of shape (n,), or plain numbers of one."""
 
     acceleration: Array
     """[m/s2]"""
-    speed_cap: Array | None = None
-    """speed not to be exceeded [m/s]; None: none but the road's"""
-    lane: Array | None = None
-    """lane to be on, from 0 at the right; None: the simulator chooses"""
 
 
 class Limits(NamedTuple):
@@ -60,13 +53,9 @@ def as_rows(acceleration: Any, rows: int, where: str) -> NDArray[np.float64]:
 
 
 def accelerations(command: Command | None, limits: Limits, names: Sequence[str], step: int) -> list[float]:
-    """Return what vehicles are told, within the limits, as plain floats [m/s2].
+    """Return what the vehicles `names` are told, within the limits, as plain floats [m/s2].
 
-    Args:
-        command: a driver's; its acceleration a number, or one for each vehicle. None is right for no vehicle.
-        limits: of the road.
-        names: the vehicles, in order.
-        step: in which it was asked for, for messages.
+    An acceleration is a number, or one for each vehicle; None is right for no vehicle. Messages name `step`.
 
     Raises:
         InputError: an acceleration is not finite, or there are not as many as vehicles.

@@ -14,15 +14,13 @@ from unjam.drivers.car_following import ACC, BCM, IDM, LACC, OVM, Constant, Huma
 from unjam.drivers.driver import Driver, Recipe
 from unjam.drivers.follower_stopper import FollowerStopper
 from unjam.drivers.from_file import FileDriver, FileReference, is_file_reference
-from unjam.drivers.motorway_experts import Cruise, JamAhead
 from unjam.drivers.network import network_from_arrays
 from unjam.drivers.observation import FEATURES, FeatureName, observation_size
 from unjam.drivers.pi_saturation import PISaturation
-from unjam.drivers.remembering import Remembering
 from unjam.drivers.residual import EXPERT, ResidualDriver
-from unjam.drivers.road_experts import JamAbsorber, Pacer
+from unjam.drivers.road_experts import Cruise, JamAbsorber, JamAhead, Pacer
 from unjam.drivers.safety import SafetyFilter
-from unjam.drivers.wrappers import INNER, Filtered, Impaired, Mixed
+from unjam.drivers.wrappers import INNER, Filtered, Impaired, Mixed, Remembering
 from unjam.errors import InputError, did_you_mean, wrong
 from unjam.parameters import STRICT, Count, NotNegative, Positive, build, split_parameters
 from unjam.tree import Arrays
@@ -121,10 +119,6 @@ def _named(recipe: Recipe, arrays: Arrays, held: Held) -> Driver:
     return build(DRIVERS[name], recipe["parameters"], f"driver {name}")
 
 
-def _file(recipe: Recipe, arrays: Arrays, held: Held) -> Driver:
-    return FileDriver(Path(recipe["path"]), recipe["name"], recipe["parameters"], recipe["time_step"])
-
-
 def _residual(recipe: Recipe, arrays: Arrays, held: Held) -> Driver:
     found = build(_ResidualRecipe, recipe, "driver recipe")
     expert = held(found.expert, EXPERT)
@@ -134,10 +128,6 @@ def _residual(recipe: Recipe, arrays: Arrays, held: Held) -> Driver:
     if network.inputs != shown:
         raise InputError(f"network: {network.inputs} inputs are not allowed; allowed: {shown}")
     return ResidualDriver(expert, network, found.action_limit, found.parts, found.hold)
-
-
-def _mixed(recipe: Recipe, arrays: Arrays, held: Held) -> Driver:
-    return Mixed(tuple(held(part, str(number)) for number, part in enumerate(recipe["drivers"])))
 
 
 def _impaired(recipe: Recipe, arrays: Arrays, held: Held) -> Driver:
@@ -161,23 +151,23 @@ def _filtered(recipe: Recipe, arrays: Arrays, held: Held) -> Driver:
     return Filtered(held(found.driver, INNER), found.action_limit, found.safety, found.time_step)
 
 
-def _remembering(recipe: Recipe, arrays: Arrays, held: Held) -> Driver:
-    return Remembering(held(recipe["driver"], INNER), float(recipe["time_step"]))
-
-
-def _by_road(recipe: Recipe, arrays: Arrays, held: Held) -> Driver:
-    return ByRoad(**{kind: held(recipe["drivers"][kind], kind) for kind in KINDS_OF_ROAD})
-
-
 RECIPES: dict[str, Callable[[Recipe, Arrays, Held], Driver]] = {
     "named": _named,
-    "file": _file,
+    "file": lambda recipe, arrays, held: FileDriver(
+        Path(recipe["path"]), recipe["name"], recipe["parameters"], recipe["time_step"]
+    ),
     "residual": _residual,
-    "mixed": _mixed,
+    "mixed": lambda recipe, arrays, held: Mixed(
+        tuple(held(part, str(number)) for number, part in enumerate(recipe["drivers"]))
+    ),
     "impaired": _impaired,
     "filtered": _filtered,
-    "by-road": _by_road,
-    "remembering": _remembering,
+    "by-road": lambda recipe, arrays, held: ByRoad(
+        **{kind: held(recipe["drivers"][kind], kind) for kind in KINDS_OF_ROAD}
+    ),
+    "remembering": lambda recipe, arrays, held: Remembering(
+        held(recipe["driver"], INNER), float(recipe["time_step"])
+    ),
 }
 """how each kind of recipe becomes a driver again"""
 

@@ -1,19 +1,74 @@
-"""The safety filter between a driver and the road: no contact, and no time headway below a floor.
+"""What lies between a driver and the road: the safety filter, and how late a car does what it is told.
 
-It lets each acceleration pass that leaves the car able to stop behind a leader who brakes as hard as anybody
-can, and able to keep its time headway behind one who brakes hard; otherwise it brakes, as hard as it must.
+The filter keeps a car from contact, and its time headway above a floor. It lets each acceleration pass that
+leaves the car able to stop behind a leader who brakes as hard as anybody can, and able to keep its time
+headway behind one who brakes hard; otherwise it brakes, as hard as it must.
 `docs/safety.md` states the assumptions, and proves both for the discrete steps of the simulator.
 """
 
+from math import exp
 from typing import NamedTuple
 
 from pydantic import model_validator
 from pydantic.dataclasses import dataclass
 
-from unjam.drivers.actuator import Actuator, Underway
 from unjam.parameters import STRICT, NotNegative, Positive
 from unjam.physics.arrays import Array, at_least, at_most
-from unjam.physics.stopping import speed_to_stop_within, stopping_distance
+from unjam.physics.kinematics import speed_to_stop_within, stopping_distance
+
+
+class Underway(NamedTuple):
+    """What a car is doing and what it has been told already; arrays of shape (n,), or plain numbers."""
+
+    acceleration: Array
+    """that it has now [m/s2]"""
+    pending: tuple[Array, ...] = ()
+    """commands on their way, the next to arrive first [m/s2]"""
+
+
+@dataclass(frozen=True, config=STRICT)
+class Actuator:
+    """How late a car does what it is told: da/dt = (u(t - delay) - a) / lag, exactly over each step.
+
+    Cars that drivers' aids steer: lag 0.2 to 0.5 s, delay 0.05 to 0.5 s.
+    """
+
+    delay: NotNegative = 0.0
+    """time after which a command arrives, rounded to whole simulation steps [s]"""
+    lag: NotNegative = 0.0
+    """time constant with which the acceleration follows [s]"""
+
+    @property
+    def instant(self) -> bool:
+        """Whether it does at once what it is told."""
+        return self.delay == 0.0 == self.lag
+
+    def start(self, like: Array, step: float) -> Underway:
+        """Return that nothing is done and nothing on its way, for cars like those of `like`."""
+        return Underway(0.0 * like, (0.0 * like,) * round(self.delay / step))
+
+    def obey(self, told: Array, speed: Array, underway: Underway, step: float) -> Underway:
+        """Return what is under way once a car was told something: its acceleration holds for this step.
+
+        Brakes do not push backwards: a car that stands has no acceleration.
+        """
+        arriving, *pending = *underway.pending, told
+        left = self._left(step)
+        acceleration = underway.acceleration * left + arriving * (1.0 - left)
+        return Underway(at_least(acceleration, -speed / step), tuple(pending))
+
+    def equivalent_speed(self, speed: Array, underway: Underway, braking: float, step: float) -> Array:
+        """Return the speed z of a car without lag that drives at least as far under any commands [m/s].
+
+        z = v + T (a + `braking`) with T = h r / (1 - r), where r is what one step of length h leaves of the
+        difference to a command. Whatever is commanded, a step makes z + h u of it: as if there was no lag.
+        """
+        left = self._left(step)
+        return speed + step * left / (1.0 - left) * (underway.acceleration + braking)
+
+    def _left(self, step: float) -> float:
+        """Return which share of the difference to a command one step leaves."""
+        return exp(-step / self.lag) if self.lag else 0.0
 
 
 class Ahead(NamedTuple):
@@ -76,12 +131,8 @@ class SafetyFilter:
     ) -> Array:
         """Return what may be commanded of the acceleration that is wanted [m/s2], of its shape.
 
-        Args:
-            wanted: [m/s2].
-            ahead: the car and its leader, as sensed.
-            step: of simulation, for which the command holds [s].
-            actuator: how late the car obeys; None: at once.
-            underway: of that actuator.
+        The command holds for one `step` of simulation [s]. Without an `actuator` the car obeys at once; with
+        one, `underway` is what it does already.
         """
         if not self.active:
             return wanted
@@ -139,3 +190,27 @@ class SafetyFilter:
             and speed * (speed / own + step) / 2.0 + own * step * step / 8.0
             <= room + leader * (leader / others - step) / 2.0
         )
+
+
+class Cars:
+    """CAVs by name; what each is told passes its filter, and is then obeyed as late as its actuator is."""
+
+    def __init__(self, safety: SafetyFilter, actuator: Actuator, step: float) -> None:
+        """Take what all cars have; `step` is that of simulation [s]."""
+        self._keep, self._actuator, self._step = safety.keep, actuator, step
+        self._late = not actuator.instant
+        self._underway: dict[str, Underway] = {}
+
+    def carry_out(self, name: str, wanted: Array, ahead: Ahead) -> tuple[Array, Array]:
+        """Return what a car is told of the acceleration that is wanted, and what it does in this step [m/s2].
+
+        Once in each simulation step; all numbers are plain, or arrays of cars that share the name.
+        """
+        if not self._late:
+            told = self._keep(wanted, ahead, self._step)
+            return told, told
+        underway = self._underway.get(name) or self._actuator.start(ahead.speed, self._step)
+        told = self._keep(wanted, ahead, self._step, self._actuator, underway)
+        underway = self._actuator.obey(told, ahead.speed, underway, self._step)
+        self._underway[name] = underway
+        return told, underway.acceleration

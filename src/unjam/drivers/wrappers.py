@@ -1,18 +1,19 @@
-"""Drivers around drivers: several side by side, one with worse sensors, one with its safety filter."""
+"""Drivers around drivers: several side by side, worse sensors, the safety filter, a memory of the past."""
 
 from dataclasses import asdict, dataclass
 from functools import cached_property
+from math import exp
 from typing import ClassVar
 
 import numpy as np
 
 from unjam.drivers.command import Limits
 from unjam.drivers.driver import Driver, Memory, Recipe
-from unjam.drivers.local_state import LocalState
+from unjam.drivers.local_state import SPEED_SCALE, LocalState, Observed
 from unjam.drivers.safety import Ahead, SafetyFilter
 from unjam.errors import InputError
-from unjam.parameters import NotNegative
-from unjam.physics.arrays import Array, namespace
+from unjam.parameters import NotNegative, Positive
+from unjam.physics.arrays import Array, at_least, join_columns, namespace, square_root, stack_columns
 
 KIND = "kind"
 """name in the memory of a mixture: which driver a CAV has"""
@@ -21,6 +22,14 @@ INNER, AGE, SENT = "inner", "age", "sent"
 far; what was said and not yet done"""
 SMALLEST_SEEN_GAP = 0.1
 """[m], however wrong a sensor is"""
+SPANS = (10.0, 40.0, 160.0)
+"""time constants of the means [s]: within a wave, of a wave, of several"""
+SPREAD_SCALE, ROOM_SCALE = 2.0, 20.0
+"""of the spread of speeds [m/s] and of the mean gap [m], before a network sees them"""
+WATCHED = "watched"
+"""name in the memory: moments that were watched"""
+SPEED, SQUARE, ROOM = "speed", "square", "room"
+"""names of the means in the memory, by their span"""
 
 
 class Wrapper(Driver):
@@ -35,6 +44,17 @@ class Wrapper(Driver):
     def needs_loop(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Whether one that it holds must know its place on a closed road."""
         return any(held.needs_loop for held in self.inner.values())
+
+
+class Around(Wrapper):
+    """A driver around one other."""
+
+    driver: Driver
+
+    @property
+    def inner(self) -> dict[str, Driver]:
+        """The other driver."""
+        return {INNER: self.driver}
 
 
 @dataclass(frozen=True)
@@ -79,7 +99,7 @@ class Mixed(Wrapper):
 
 
 @dataclass(frozen=True)
-class Impaired(Wrapper):
+class Impaired(Around):
     """Passes what it sees, with noise, to another driver, and hands on what that one said a while ago."""
 
     tensors: ClassVar[bool] = False  # pyright: ignore[reportIncompatibleMethodOverride]
@@ -91,11 +111,6 @@ class Impaired(Wrapper):
     """standard deviation of both gaps, anew in every decision [m]"""
     time_step: float = 0.1
     """time between two decisions [s]"""
-
-    @property
-    def inner(self) -> dict[str, Driver]:
-        """The other driver."""
-        return {INNER: self.driver}
 
     def initial_memory(self, n: int) -> Memory:
         """Return that of the other driver, that nothing was said yet, and that no decision was made."""
@@ -133,7 +148,7 @@ class Impaired(Wrapper):
 
 
 @dataclass(frozen=True)
-class Filtered(Wrapper):
+class Filtered(Around):
     """Another driver with the limits and the safety filter of a road, for a car that has none of its own.
 
     A controller is shipped so: what drives elsewhere is what was proven. Where the road filters as well, as
@@ -146,11 +161,6 @@ class Filtered(Wrapper):
     safety: SafetyFilter
     time_step: float
     """time between two decisions [s]"""
-
-    @property
-    def inner(self) -> dict[str, Driver]:
-        """The other driver."""
-        return {INNER: self.driver}
 
     @property
     def plain_numbers(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -180,3 +190,79 @@ class Filtered(Wrapper):
         """Return what the other driver is made from, and the filter's settings."""
         settings = {"action_limit": self.action_limit, "safety": asdict(self.safety)}
         return {"kind": "filtered", "driver": self.driver.recipe(), **settings, "time_step": self.time_step}
+
+
+@dataclass(frozen=True)
+class Remembering(Around):
+    """Drives as another driver does, and remembers means of its own speed, its square, and its gap.
+
+    Until a span has passed, its mean is that of all that was watched.
+    """
+
+    driver: Driver
+    time_step: Positive
+    """time between two decisions [s]"""
+
+    @property
+    def observed_memory(self) -> tuple[Observed, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """What the other driver's are, and its own."""
+        mine: list[Observed] = []
+        for span in SPANS:
+            mine += [
+                Observed(f"own mean speed over {span:g} s", SPEED_SCALE, "m/s"),
+                Observed(f"spread of own speed over {span:g} s", SPREAD_SCALE, "m/s"),
+                Observed(f"mean gap over {span:g} s", ROOM_SCALE, "m"),
+            ]
+        return (*self.driver.observed_memory, *mine)
+
+    @cached_property
+    def _fading(self) -> tuple[tuple[float, float], ...]:
+        """Spans, and what a step weighs in their means."""
+        return tuple((span, 1.0 - exp(-self.time_step / span)) for span in SPANS)
+
+    def initial_memory(self, n: int) -> Memory:
+        """Return that of the other driver, and that nothing was watched yet."""
+        means = {f"{name}_{span:g}": np.zeros(n) for span in SPANS for name in (SPEED, SQUARE, ROOM)}
+        return {**super().initial_memory(n), WATCHED: np.zeros(n), **means}
+
+    def recall(self, memory: Memory, history: LocalState) -> Memory:
+        """Return `memory` as if both had watched `history`."""
+        memory = super().recall(memory, history)
+        for moment in range(history.speed.shape[1]):
+            memory = self._watch(memory, history.speed[:, moment], history.leader_gap[:, moment])
+        return memory
+
+    def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
+        """Return what the other driver wants, and the new memory."""
+        wanted, after = self.driver.act(state, memory[INNER])
+        return wanted, {**self._watch(memory, state.speed, state.leader_gap), INNER: after}
+
+    def _watch(self, memory: Memory, speed: Array, gap: Array) -> Memory:
+        xp, after = namespace(speed), dict(memory)
+        after[WATCHED] = memory[WATCHED] + 1.0
+        early = 1.0 / after[WATCHED]
+        for span, fading in self._fading:
+            weight = xp.where(early > fading, early, early * 0.0 + fading)
+            for name, now in ((SPEED, speed), (SQUARE, speed * speed), (ROOM, gap)):
+                before = memory[f"{name}_{span:g}"]
+                after[f"{name}_{span:g}"] = before + weight * (now - before)
+        return after
+
+    def memory_features(self, memory: Memory) -> Array:
+        """Return the other driver's features, and for each span mean speed, its spread and the mean gap."""
+        columns: list[Array] = []
+        for span in SPANS:
+            speed, square, room = (memory[f"{name}_{span:g}"] for name in (SPEED, SQUARE, ROOM))
+            spread = square_root(at_least(square - speed * speed, 0.0) + 1e-9)  # never the root of zero
+            columns += [speed / SPEED_SCALE, spread / SPREAD_SCALE, room / ROOM_SCALE]
+        mine = stack_columns(tuple(columns))
+        others = self.driver.memory_features(memory[INNER])
+        return mine if others is None else join_columns([others, mine])
+
+    def describe(self) -> str:
+        """Return the other driver, and that it remembers."""
+        return f"{self.driver.describe()}, remembering"
+
+    def recipe(self) -> Recipe:
+        """Return what the other driver is made from, and the time between two decisions."""
+        return {"kind": "remembering", "driver": self.driver.recipe(), "time_step": self.time_step}

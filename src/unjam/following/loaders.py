@@ -11,8 +11,7 @@ import numpy as np
 import pandas as pd
 
 from unjam.errors import InputError, wrong_name
-from unjam.following.pairs import Pair
-from unjam.following.recorded import BadRow, Reading, Recorded
+from unjam.following.pairs import BadRow, Pair, Reading, Recorded
 
 COLUMNS = ("pair", "time", "speed", "leader_speed", "gap")
 """what every row must have: [s], [m/s], [m/s], [m]"""

@@ -109,14 +109,8 @@ def fit_one_step(
 ) -> tuple[FollowingNetwork, Losses]:
     """Return a network that has learned the accelerations of single moments, less what the base says of them.
 
-    It ends with the weights of the pass that was best on `validation`.
-
-    Args:
-        moments: to learn from.
-        validation: that judge each pass.
-        base: what is known; None: the network learns all of it.
-        settings: of network and learning.
-        seed: of the first weights and the order of the moments.
+    It ends with the weights of the pass that was best on `validation`. Without a base it learns all of it.
+    `seed` draws the first weights and the order of the moments.
 
     Raises:
         UnjamError: a loss is not finite.
@@ -186,14 +180,8 @@ def fit_multi_step(
     """Return a residual on what is known that makes the simulated gaps those of the trajectories.
 
     It starts at zero, so that what drives at first is the base alone, and ends with the weights that were
-    best on whole trajectories of `validation`; these may be the first.
-
-    Args:
-        known: to learn from.
-        validation: of other drivers.
-        limits: of the acceleration [m/s2].
-        settings: of network and learning.
-        seed: of the first weights and the order of the stretches.
+    best on whole trajectories of other drivers, `validation`; these may be the first. `limits` are those of
+    the acceleration [m/s2]; `seed` draws the first weights and the order of the stretches.
 
     Raises:
         UnjamError: a loss is not finite.

@@ -59,12 +59,8 @@ def personal_idm(parameters: IDMParameters | IDMRows, kept: Array, limits: Bound
     """Return an IDM that keeps a part of the headway with which a driver was found.
 
     People differ most in the distance they keep. Of a driver nothing is known but the moment of taking over,
-    whose time headway T0 = (gap - s0) / v says a part of it: the driver's own T is T^(1 - kept) T0^kept.
-
-    Args:
-        parameters: of people in general.
-        kept: 0: all drive alike; 1: everybody keeps the headway of that moment.
-        limits: of the acceleration [m/s2].
+    whose time headway T0 = (gap - s0) / v says a part of it: the driver's own T is T^(1 - kept) T0^kept. With
+    `kept` 0 all drive alike, with 1 everybody keeps the headway of that moment.
     """
     p = parameters
 
@@ -99,11 +95,8 @@ def drive_behind(follow: Follow, start: tuple[Array, Array], leader: Any, step: 
     Who uses the gap up touches the leader and is no faster, until it brakes: without that, a network that has
     driven through its leader would be asked what nobody can know.
 
-    Args:
-        follow: who drives.
-        start: speed [m/s] and gap [m] at the first moment, shape (..., n).
-        leader: (speeds, paths), each of shape (T, n); paths as in `Pair.leader_path`.
-        step: time between two moments [s].
+    Starts are a speed [m/s] and a gap [m], shape (..., n); leaders (speeds, paths), each of shape (T, n),
+    paths as in `Pair.leader_path`; `step` lies between two moments [s].
     """
     (speed, gap), (leader_speeds, paths) = start, leader
     position = gap * 0.0

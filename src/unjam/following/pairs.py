@@ -1,4 +1,4 @@
-"""What is known of how people drive: one follower behind one leader, moment by moment."""
+"""What is known of how people drive: one follower behind one leader; and what was found in a file."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
@@ -21,6 +21,8 @@ SHORTEST = 20.0
 """drives behind a CAV that are shorter tell too little [s]"""
 LONGEST_JUMP = 0.5
 """change of the gap in a decision that speeds do not explain, beyond which another vehicle is behind [m]"""
+LISTED = 5
+"""bad rows that a message names"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,10 +66,10 @@ class Pair:
         way = next_position(np.zeros(len(self.speed)), np.r_[0.0, np.cumsum(self.speed[1:])], self.step)
         return self.gap + way
 
-    def part(self, first: int, last: int, name: str = "") -> "Pair":
+    def part(self, first: int, last: int) -> "Pair":
         """Return the moments from `first` on and before `last` as a trajectory of its own."""
         cut = {each: getattr(self, each)[first:last] for each in ("speed", "leader_speed", "gap")}
-        return replace(self, name=name or self.name, **cut)
+        return replace(self, **cut)
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,10 +180,7 @@ def stretches_of(pairs: Sequence[Pair], seconds: float | None = None) -> Stretch
 def split_by_trajectory(pairs: Sequence[Pair], shares: Sequence[float], seed: int) -> list[Pair]:
     """Return `pairs` with `split` set to train, validation or test; all pairs of a driver go together.
 
-    Args:
-        pairs: any number.
-        shares: of training, validation and test, of the number of drivers; they add up to one.
-        seed: who goes where.
+    `shares` are those of training, validation and test in the number of drivers; they add up to one.
     """
     drivers = sorted({pair.driver for pair in pairs})
     order = np.random.default_rng(seed).permutation(len(drivers))
@@ -199,9 +198,7 @@ def of_split(pairs: Sequence[Pair], *names: str) -> list[Pair]:
 def people_behind(recordings: Iterable[LocalState], step: float) -> list[Pair]:
     """Return the drives of those who followed a CAV, each of the same vehicle throughout.
 
-    Args:
-        recordings: what CAVs perceived, one after the other, each of shape (T,).
-        step: time between two decisions [s].
+    `recordings` are what CAVs perceived, each of shape (T,), a decision every `step` [s].
     """
     pairs = []
     for number, states in enumerate(recordings):
@@ -217,3 +214,49 @@ def people_behind(recordings: Iterable[LocalState], step: float) -> list[Pair]:
                 name = f"{number}-{first}"
                 pairs.append(Pair(name, name, step, own, leader, gap))
     return pairs
+
+
+@dataclass(frozen=True)
+class Reading:
+    """How a file is read."""
+
+    cut_bad: bool = False
+    """whether bad rows are cut out, and end their trajectory, instead of refused"""
+    shortest: float = 20.0
+    """trajectories shorter than that are left out, and counted [s]"""
+    driver: tuple[str, ...] = ()
+    """plain tables: columns that together name the driver, where `driver` is not one"""
+    kind: tuple[str, ...] = ()
+    """plain tables: columns that together name the kind of driver, where `kind` is not one"""
+
+
+@dataclass(frozen=True)
+class BadRow:
+    """A row that cannot be used."""
+
+    line: int
+    """in the file, its header being line 1"""
+    why: str
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """What a file holds."""
+
+    pairs: list[Pair] = field(repr=False)
+    rows: int
+    """in the file"""
+    bad: list[BadRow]
+    """rows that were cut out, with what was wrong"""
+    left_out: dict[str, int]
+    """rows that are not wrong but of no use, by reason"""
+
+    def words(self) -> list[str]:
+        """Return lines that say what was read and what was not."""
+        moments = sum(len(pair.speed) for pair in self.pairs)
+        lines = [f"{len(self.pairs)} trajectories with {moments:,} of {self.rows:,} rows"]
+        lines += [f"left out: {count:,} rows: {why}" for why, count in self.left_out.items() if count]
+        lines += [f"cut out: line {row.line}: {row.why}" for row in self.bad[:LISTED]]
+        if len(self.bad) > LISTED:
+            lines.append(f"cut out: {len(self.bad) - LISTED} more bad rows")
+        return lines

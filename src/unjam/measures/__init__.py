@@ -1,1 +1,1 @@
-"""What is measured of episodes, and what may be said of it: metrics, statistics, waves. Draws nothing."""
+"""What is measured of episodes, and what may be said of it: metrics, statistics, verdicts. Draws nothing."""

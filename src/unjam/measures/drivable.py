@@ -116,11 +116,8 @@ def yielded(episode: Episode) -> float:
 def drivable(row: dict[str, Any], people_alone: float = 0.0) -> str:
     """Return the verdict on an episode: `drivable`, or the first reason why not.
 
-    Empty where nobody automated drove, or the episode failed.
-
-    Args:
-        row: what was measured of it.
-        people_alone: how often in a million moments people brake beyond 4.5 m/s2 where there are no CAVs.
+    Empty where nobody automated drove, or the episode failed. `people_alone` is how often in a million
+    moments people brake beyond 4.5 m/s2 where there are no CAVs.
     """
     if row["status"] == "failed" or isnan(row["cav_max_braking"]):
         return ""

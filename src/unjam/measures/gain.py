@@ -52,15 +52,11 @@ def scaled(rows: Rows, people: Rows, best: float) -> Floats:
 
 
 def gain(rows: Rows, people: Rows, best: float) -> Estimate:
-    """Return what a driver gains on one road, the same seeds paired.
+    """Return what a driver gains on one road beside people alone, the same seeds paired.
 
     A driver that no car could drive, or that is shown to lower flow by more than 1 %, gains nothing: what it
-    loses counts. Where the best is hardly better than people, what is not lost is all that counts.
-
-    Args:
-        rows: of `measure`, of the driver.
-        people: of people alone on the same seeds.
-        best: mean of `worth` of the best that is known there.
+    loses counts. Where the best, whose mean `worth` is `best`, is hardly better than people, what is not lost
+    is all that counts.
     """
     found = estimate(scaled(rows, people, best).tolist())
     mean, low, high = (float(np.clip(each, WORST, MOST)) for each in (found.mean, found.low, found.high))
@@ -77,11 +73,7 @@ def mean_gain(gains: Sequence[Estimate], by_seed: Sequence[Floats]) -> Estimate:
     """Return the mean gain over roads that were driven on the same seeds, with its interval over seeds.
 
     A seed may be kind to a driver on many roads: their errors are not independent. A gain that a rule has
-    fixed has none.
-
-    Args:
-        gains: of each road.
-        by_seed: what `scaled` says of each road, arrays of shape (seeds,).
+    fixed has none. `by_seed` is what `scaled` says of each road, arrays of shape (seeds,).
     """
     mean = float(np.mean([each.mean for each in gains]))
     errors = [

@@ -149,10 +149,8 @@ def probability_of_improvement(differences: Any) -> Estimate:
     """Return how often a driver is better than another on the same seed, a tie counting half.
 
     The interval is Wilson's, which stays possible and covers near 0 and 1, too; of several trainings with the
-    number of independent episodes that would have their variance.
-
-    Args:
-        differences: of each training, or of the one driver, on each seed, shape (T, S); above zero is better.
+    number of independent episodes that would have their variance. Differences have the shape (trainings,
+    seeds); above zero is better.
 
     Source: Wilson 1927, Journal of the American Statistical Association 22; Korn and Graubard 1998, Survey
     Methodology 24.
@@ -190,9 +188,7 @@ def crossed_estimate(values: Any) -> Estimate:
     Both trainings and seeds are drawn at random, and every training meets every seed: two-way random effects
     without repetition. The interval is that of Student's t with Satterthwaite's degrees of freedom. Of fewer
     than `LEAST` trainings or seeds, and of trainings of two modes, there is none, but the range of means.
-
-    Args:
-        values: of each training on each seed, shape (T, S).
+    Values have the shape (trainings, seeds).
 
     Source: Satterthwaite 1946, Biometrics Bulletin 2; Searle, Casella, McCulloch 1992, Variance Components.
     """

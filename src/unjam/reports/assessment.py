@@ -13,8 +13,7 @@ from matplotlib.figure import Figure
 
 from unjam.errors import InputError
 from unjam.files import check_folder, write_whole
-from unjam.measures.effect import FLOW_LOST, LEAST_JUDGED
-from unjam.measures.recommendation import percent
+from unjam.measures.effect import FLOW_LOST, LEAST_JUDGED, percent
 from unjam.measures.statistics import Estimate, signed
 from unjam.measures.table import cell_of
 from unjam.reports.figures import INK, LINES, STYLE, data_uri, new_figure

@@ -223,12 +223,7 @@ def _three_of(episode: Shown, closed: bool) -> dict[str, np.ndarray]:
 
 @rc_context(STYLE)
 def learning_curve(runs: dict[str, list[dict[str, Any]]], references: dict[str, float]) -> Figure:
-    """Draw return against actual simulator steps.
-
-    Args:
-        runs: rows of progress, by the label of the run.
-        references: returns of drivers that do not learn, drawn as lines.
-    """
+    """Draw return against actual steps: of each run by its label, and of drivers that do not learn."""
     figure = new_figure(3.8)
     axes = figure.subplots()
     for (label, rows), colour in zip(runs.items(), cycle(LINES[2:]), strict=False):
@@ -278,6 +273,6 @@ def stacked_bars(bars: dict[str, dict[str, float]], label: str, height: float) -
     return figure
 
 
-def colour_table(steps: int = 32) -> list[str]:
+def colour_table() -> list[str]:
     """Return the colours of speed as hex codes, slowest first: for pictures that matplotlib does not draw."""
-    return [to_hex(colour) for colour in colormaps[SPEED_COLOURS](np.linspace(0, 1, steps))]
+    return [to_hex(colour) for colour in colormaps[SPEED_COLOURS](np.linspace(0, 1, 32))]

@@ -11,7 +11,7 @@ from unjam.errors import InputError, MissingPartError
 from unjam.files import check_folder
 from unjam.reports.figures import CAV_COLOUR, INK, colour_table
 from unjam.scenarios.scenario import VEHICLE_LENGTH
-from unjam.worlds.neighbours import places_along
+from unjam.worlds.closed import places_along
 from unjam.worlds.record import Episode
 from unjam.worlds.sumo.traffic import Scene
 
@@ -33,12 +33,9 @@ FORMATS = (".gif", ".webp", ".mp4")
 
 
 def draw_road(scene: Scene, fastest: float, words: str) -> Image.Image:
-    """Return the picture of one moment, vehicles coloured by speed.
+    """Return the picture of one moment, vehicles coloured by speed, and a few lines of words.
 
-    Args:
-        scene: the road's lines and its vehicles; one whose speed is NaN is not on the road.
-        fastest: the speed of the brightest colour [m/s].
-        words: a few lines, written beside the road.
+    `fastest` is the speed of the brightest colour [m/s]; a vehicle whose speed is NaN is not on the road.
     """
     lines = split_lines(scene.lines)
     points = np.concatenate(lines)

@@ -10,7 +10,7 @@ from typing import Any
 from zlib import compress
 
 import numpy as np
-from jinja2 import Environment, StrictUndefined
+from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 from matplotlib.figure import Figure
 
@@ -18,7 +18,6 @@ from unjam import __version__
 from unjam.files import check_folder, write_whole
 from unjam.measures.statistics import estimate_of
 from unjam.measures.table import headings_of, table_of
-from unjam.reports.beside import against_people, episodes_as_csv
 from unjam.reports.figures import (
     colour_table,
     data_uri,
@@ -32,9 +31,11 @@ from unjam.reports.lanes import drawn_by_lane, space_time_of
 from unjam.reports.model import errors, examples, model_section, trust
 from unjam.reports.results import DAMAGED, Results, Shown, command_to_repeat, damaged, read_results
 from unjam.reports.story import (
+    against_people,
     baseline_of_columns,
     cards_of,
     columns_of,
+    episodes_as_csv,
     lead_of,
     names_of,
     notes_of,
@@ -70,11 +71,12 @@ def write_report(folders: Sequence[Path], target: Path) -> Path:
 
 def filled(template: str, **values: Any) -> str:
     """Return a page of the folder `page/`, with the style of all, as text: what `values` say is escaped."""
+    loader = PackageLoader("unjam.reports", "page")
     environment = Environment(
-        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+        loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
     style = Markup(page_part("report.css"))
-    return environment.from_string(page_part(template)).render(version=__version__, style=style, **values)
+    return environment.get_template(template).render(version=__version__, style=style, **values)
 
 
 def page_part(name: str) -> str:

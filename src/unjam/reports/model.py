@@ -161,12 +161,7 @@ def model_section(result: Results) -> dict[str, Any] | None:
 
 @rc_context(STYLE)
 def trust(progress: Sequence[dict[str, Any]], facts: dict[str, Any]) -> Figure:
-    """Draw over training how far the model is trusted, why, and what came of it; and the bound by length.
-
-    Args:
-        progress: rows of progress of a run with a virtual environment.
-        facts: of its `model.json`.
-    """
+    """Draw over training how far the model is trusted, why, and what came of it; and the bound by length."""
     figure, (lengths, estimates, returns, bounds) = _panels(2, 2, 2.3)
     steps = np.array([row["actual_steps"] for row in progress]) / 1000
     virtual = [row["virtual"] for row in progress]

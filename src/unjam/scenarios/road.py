@@ -128,7 +128,7 @@ class ClosedRoad(BuiltRoad):
     vehicle_ids: tuple[str, ...]
     """all vehicles, in the order in which they stand along the road"""
     cav_ids: tuple[str, ...]
-    """those of them that a driver drives"""
+    """those of them that a driver drives, in the same order"""
     start_positions: NDArray[np.float64]
     """front bumper of each vehicle along the route at the start [m]"""
     loop_length: float
@@ -170,6 +170,14 @@ class Lane(NamedTuple):
     """whether it leads nowhere and is there to change lanes: nobody is commanded on its edge"""
 
 
+@dataclass(frozen=True, kw_only=True)
+class OpenRoad(Road):
+    """A road with ends: vehicles come and go."""
+
+    cav_ids: frozenset[str] = frozenset()
+    """those that a driver drives, where that is known before they enter"""
+
+
 class Origin(NamedTuple):
     """Where a vehicle of a merging road comes from."""
 
@@ -180,26 +188,22 @@ class Origin(NamedTuple):
 
 
 @dataclass(frozen=True, kw_only=True)
-class MergingRoad(BuiltRoad):
-    """A main road that a ramp joins, with one lane each; vehicles come and go."""
+class MergingRoad(BuiltRoad, OpenRoad):
+    """A main road that a ramp joins, with one lane each."""
 
     origins: dict[str, Origin]
     """of all vehicles that may enter"""
-    cav_ids: frozenset[str]
-    """those of them that a driver drives"""
     junctions: tuple[float, float]
     """lengths of the ways across the junction, of main road and ramp [m]; they end where the ways meet, and
     there SUMO drives commanded people itself"""
 
 
 @dataclass(frozen=True, kw_only=True)
-class MotorwayRoad(BuiltRoad):
-    """A main road with lanes that ramps join; people differ, overtake, come and go."""
+class MotorwayRoad(BuiltRoad, OpenRoad):
+    """A main road with lanes that ramps join; people differ and overtake."""
 
     kinds: dict[str, Person]
     """the people that there are, by name"""
-    cav_ids: frozenset[str]
-    """vehicles that a driver drives"""
     lanes: tuple[Lane, ...]
     """of all edges"""
     ways: tuple[str, ...]
@@ -219,7 +223,7 @@ class MotorwayRoad(BuiltRoad):
 
 
 @dataclass(frozen=True, kw_only=True)
-class OwnRoad(Road):
+class OwnRoad(OpenRoad):
     """A network of the user's own, with all its traffic."""
 
     files: SumoFiles

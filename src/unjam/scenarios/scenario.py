@@ -9,9 +9,8 @@ import numpy as np
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
-from unjam.drivers.actuator import Actuator
 from unjam.drivers.command import Limits
-from unjam.drivers.safety import SafetyFilter
+from unjam.drivers.safety import Actuator, SafetyFilter
 from unjam.parameters import STRICT, Count, CountOrNone, NotNegative, Positive
 from unjam.physics.idm import IDMParameters
 from unjam.scenarios.population import Population, read_population

@@ -278,11 +278,7 @@ def draw_curves(
 ) -> Figure:
     """Draw return and speed in training against actual steps, side by side.
 
-    Args:
-        road: its name.
-        curves: what `curves_of` returned.
-        references: rows of drivers that do not learn, by label, drawn as lines.
-        metric: which of their returns.
+    `curves` are of `curves_of`; `references`, drivers that do not learn, are lines at the mean of `metric`.
     """
     figure = new_figure(3.1)
     for (name, label), axes in zip(DRAWN.items(), figure.subplots(1, len(DRAWN)), strict=True):

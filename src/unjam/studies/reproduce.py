@@ -79,15 +79,10 @@ def _kind(road: str) -> str:
 def reproduce(
     plan: "Plan", workers: int, executor: Executor = "local", on_line: OnProgress = lambda line: None
 ) -> list[Path]:
-    """Make what is missing for some studies, draw them, and return their folders.
+    """Make what is missing, `workers` trainings at once, draw the studies, and return their folders.
 
-    A study that was stopped goes on where it was: trainings from their last checkpoint.
-
-    Args:
-        plan: of `make_plan`.
-        workers: trainings at once.
-        executor: `ray`: on a Ray cluster whose machines share the folder.
-        on_line: told a line when something is done.
+    A study that was stopped goes on where it was: trainings from their last checkpoint. With `ray` they run
+    on a cluster whose machines share the folder.
 
     Raises:
         UnjamError: a training failed; the others are there.

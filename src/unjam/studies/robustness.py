@@ -6,7 +6,6 @@ them? In the experiment of Sugiyama et al. (2008), 22 cars on 230 m, a jam arose
 against the traffic at about 20 km/h, 5.6 m/s; on motorways it is 15 to 20 km/h.
 """
 
-import json
 from dataclasses import dataclass, field
 from functools import partial
 from math import nan
@@ -22,22 +21,37 @@ from unjam.files import make_folder, to_json, write_whole
 from unjam.manifest import manifest
 from unjam.measures.metrics import measure
 from unjam.measures.statistics import Estimate, paired_difference
-from unjam.measures.waves import wave_speed
 from unjam.reports.figures import png_bytes, space_time
 from unjam.reports.results import read_results
 from unjam.scenarios import make_scenario
 from unjam.studies.comparison import HONEST, entries, estimates, interval, number, table_rows, write_table
-from unjam.studies.study import REFERENCES, ROADS, OnProgress, PlannedRun, Study, StudyFolder, Table, planned
+from unjam.studies.study import (
+    REFERENCES,
+    ROADS,
+    OnProgress,
+    PlannedRun,
+    Study,
+    StudyFolder,
+    Table,
+    planned,
+    read_part,
+)
 from unjam.training.config import load_config
 from unjam.training.evaluate import TRAINED, Evaluation, evaluate, raise_failure, save_evaluation
 from unjam.training.family import MEASURED
 from unjam.training.seeds import held_out_seeds
-from unjam.worlds.record import Episode
+from unjam.worlds.record import Episode, Floats
 from unjam.worlds.workers import EpisodeTask, Workers
 
 EPISODES = 10
 """of each driver under each condition"""
 SHOWN = ("mean_speed", "mean_speed_steady", "speed_std_fleet", "min_headway", "collisions", "backlog_veh")
+CELLS = 512
+"""places along the road at which the speed is looked at"""
+LATER = 8.0
+"""time between the two moments that are compared [s]: a wave moves far less than half a lap in it"""
+SMALLEST_WAVE = 0.5
+"""standard deviation of speed along the road below which there is no wave to follow [m/s]"""
 
 
 @dataclass(frozen=True)
@@ -156,7 +170,7 @@ def _write(studies: StudyFolder, seeds: int, folder: Path, workers: int) -> None
 def _table(road: str, folder: Path) -> pd.DataFrame:
     """Return the mean speed of all vehicles by condition and driver, and what training has added."""
     table: dict[str, dict[str, str]] = {}
-    for row in json.loads((folder / "robustness.json").read_text()):
+    for row in read_part(folder, "robustness"):
         if row["road"] == road:
             cells = table.setdefault(row["condition"], {"": row["condition"]})
             cells[f"{row['driver']} [m/s]"] = number(row["mean_speed"]["mean"], 2)
@@ -188,7 +202,7 @@ def _figure_10(studies: StudyFolder, seeds: int, folder: Path, workers: int) -> 
 
 def _carried_over_table(folder: Path) -> pd.DataFrame:
     """Return the mean speed by driver and traffic: over trainings, with the smallest and the largest."""
-    rows = pd.json_normalize(json.loads((folder / "carried-over.json").read_text()))
+    rows = pd.json_normalize(read_part(folder, "carried-over"))
     rows["trained as"] = rows["driver"].str.rstrip(" 0123456789")
     speeds = rows.pivot_table("mean_speed.mean", "road", "trained as", _mean_and_range, sort=False)
     return speeds.rename_axis(index="", columns=None).reset_index()
@@ -207,12 +221,8 @@ def people_on_ring(
 ) -> None:
     """Write `ring.json` and `ring.png` into `folder`: people alone, with PI, and with a trained controller.
 
-    Args:
-        folder: for the results.
-        populations: files of `unjam fit-drivers`, by the label that they get.
-        controller: run folder or .unjam file of a controller for the ring.
-        workers: processes.
-        on_progress: told the name of each finished group of episodes.
+    Populations are files of `unjam fit-drivers` by their label; the controller is a run folder or a .unjam
+    file; `on_progress` is told the name of each finished group of episodes.
     """
     make_folder(folder)
     about, rows = manifest(), []
@@ -257,3 +267,33 @@ FIGURE_10 = Study(
     minutes=3.0,
     tables={"carried over": _carried_over_table},
 )
+
+
+def wave_speed(episode: Episode) -> float:
+    """Return how fast the pattern of speeds travels along a closed road [m/s]; NaN where there is no wave.
+
+    Negative: against the direction of travel, as real stop-and-go waves do. It is the shift at which the
+    speeds along the road are most like those `LATER` seconds before, averaged over the second half of the
+    episode: the peak of their circular cross-correlation.
+    """
+    half = len(episode.speeds) // 2
+    field = speed_along_road(episode.speeds[half:], episode.positions[half:], episode.loop_length)
+    if field.std(1).mean() < SMALLEST_WAVE:
+        return float("nan")
+    steps = round(LATER / episode.step)
+    spectrum = np.fft.rfft(field - field.mean(1, keepdims=True), axis=1)
+    correlation = np.fft.irfft((spectrum[:-steps].conj() * spectrum[steps:]).mean(0), n=CELLS)
+    shift = (np.argmax(correlation) + CELLS / 2) % CELLS - CELLS / 2
+    return float(shift * episode.loop_length / CELLS / LATER)
+
+
+def speed_along_road(speeds: Floats, positions: Floats, loop_length: float) -> Floats:
+    """Return the speed at each of `CELLS` places of a closed road, shape (moments, CELLS) [m/s].
+
+    Between vehicles it is interpolated. Speeds and positions have the shape (moments, vehicles).
+    """
+    places = np.arange(CELLS) * (loop_length / CELLS)
+    moments = zip(speeds, positions, strict=True)
+    return np.array(
+        [np.interp(places, there % loop_length, speed, period=loop_length) for speed, there in moments]
+    )

@@ -4,7 +4,6 @@ Theorem A1 is about untrained policies, A2 about convergence, A3 about the model
 can be measured of it. Costs are measured of all variants side by side, in one run.
 """
 
-import json
 import tempfile
 from collections.abc import Sequence
 from dataclasses import replace
@@ -27,7 +26,16 @@ from unjam.measures.statistics import estimate_of, over_trainings
 from unjam.reports.figures import LINES, STYLE, new_figure, stacked_bars
 from unjam.reports.results import read_progress, seconds_by_part
 from unjam.studies.comparison import entries
-from unjam.studies.study import PAPERS_ROADS, VARIANTS, PlannedRun, Study, StudyFolder, Table, planned
+from unjam.studies.study import (
+    PAPERS_ROADS,
+    VARIANTS,
+    PlannedRun,
+    Study,
+    StudyFolder,
+    Table,
+    planned,
+    read_part,
+)
 from unjam.training.evaluate import evaluate
 from unjam.training.folder import start_folder
 from unjam.training.seeds import held_out_seeds
@@ -37,7 +45,8 @@ from unjam.worlds.workers import Workers
 ROAD = "ring"
 WITH_MODEL = ("proposed", "no-initial-policy", "mb-trpo", "ours")
 COMPARED = ("trpo", "ppo", "sac", "proposed", "ours")
-RANDOM_POLICIES = 10
+RANDOM_POLICIES, HIDDEN = 10, 64
+"""networks that nobody has trained, and units of their two hidden layers"""
 TOLERANCE = 0.05
 """share of the best known return within which a training counts as converged (A2)"""
 MEASURED = (
@@ -51,11 +60,11 @@ NOT_MEASURED = "validation"
 """the part that is switched off, for it is the same for all"""
 
 
-def random_network(inputs: int, authority: float, seed: int, hidden: int = 64) -> Network:
+def random_network(inputs: int, authority: float, seed: int) -> Network:
     """Return a policy network whose weights nobody has trained, drawn like those of torch's linear layers."""
     generator = np.random.default_rng(np.random.SeedSequence([seed]))
     layers = []
-    for rows, columns in pairwise((inputs, hidden, hidden, 1)):
+    for rows, columns in pairwise((inputs, HIDDEN, HIDDEN, 1)):
         width = rows**-0.5
         weight = generator.uniform(-width, width, (rows, columns))
         layers.append((weight, generator.uniform(-width, width, columns)))
@@ -206,7 +215,7 @@ def draw_time(seconds: dict[str, dict[str, float]]) -> Figure:
 
 def _time_table(folder: Path) -> pd.DataFrame:
     """Return the wall time per 1,000 actual steps by variant and part, and how many times TRPO's it is."""
-    found = json.loads((folder / "time.json").read_text())
+    found = read_part(folder, "time")
     table = []
     for variant, parts in found["median"].items():
         cells = {"": VARIANTS[variant].label}

@@ -14,13 +14,23 @@ from unjam.drivers.driver import Driver
 from unjam.errors import InputError, wrong
 from unjam.files import to_json, write_whole
 from unjam.manifest import manifest
-from unjam.measures.recommendation import Judged, headline, recommended, shown_beside
+from unjam.measures.effect import Judged, headline, recommended, shown_beside
 from unjam.measures.statistics import estimate_of
 from unjam.reports.assessment import ASSESSMENT_FILE, ASSESSMENT_PAGE, write_assessment
 from unjam.scenarios import make_scenario, scenario_recipe
 from unjam.scenarios.scenario import Scenario
-from unjam.training.budget import Budget
-from unjam.training.choice import PEOPLE, Choice, OnLine, Option, Rows, Seed, choose, judge, least_episodes
+from unjam.training.choice import (
+    PEOPLE,
+    Budget,
+    Choice,
+    OnLine,
+    Option,
+    Rows,
+    Seed,
+    choose,
+    judge,
+    least_episodes,
+)
 from unjam.training.evaluate import Evaluation, evaluate_each, save_evaluation
 from unjam.training.folder import make_new_folder
 from unjam.training.seeds import choosing_seeds, held_out_seeds
@@ -134,12 +144,9 @@ def assess(
 ) -> Assessment:
     """Answer a question, and write rows, `assessment.json` and the page into a new folder.
 
-    Args:
-        asked: from `question`.
-        folder: it may not hold anything yet; nothing is written before all is known.
-        workers: drive; the result does not depend on how many, where no minutes are asked for.
-        progress: told now and then how many decisions an episode has made.
-        on_line: gets a line for each batch of episodes.
+    Nothing is written before all is known. The result does not depend on how many workers drive, where no
+    minutes are asked for. `progress` is told now and then how many decisions an episode has made, `on_line`
+    gets a line for each batch of episodes.
 
     Raises:
         InputError: the folder holds something, or no driver can drive this road.

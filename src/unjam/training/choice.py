@@ -4,16 +4,15 @@ Some seeds choose a driver for each share: what is shown to harm, or to be slowe
 share, is set aside early. Those that are chosen are judged on fresh seeds, and a rule says what it means.
 """
 
+import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from math import isfinite
 from typing import Any, NamedTuple
 
 from unjam.measures.drivable import DRIVABLE
-from unjam.measures.effect import LEAST_JUDGED, Effect, effect_of, harm_of
-from unjam.measures.recommendation import Judged, percent
+from unjam.measures.effect import LEAST_JUDGED, Effect, Judged, effect_of, harm_of, percent
 from unjam.measures.statistics import CONFIDENCE, paired_difference, signed
-from unjam.training.budget import Budget
 from unjam.training.evaluate import raise_failure
 from unjam.training.seeds import choosing_seeds, held_out_seeds
 
@@ -46,6 +45,31 @@ Drive = Callable[[Sequence[Option], Sequence[Seed]], dict[Option, Rows]]
 """drives all options on all seeds, and measures"""
 
 
+class Budget:
+    """Counts episodes, and knows by how long those before took whether more fit into the time."""
+
+    def __init__(
+        self, episodes: int, minutes: float | None = None, clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        """Begin to count, and the clock to run."""
+        self.episodes, self.spent = episodes, 0
+        self._seconds, self._clock, self._started = minutes and 60.0 * minutes, clock, clock()
+
+    def spend(self, count: int) -> None:
+        """Note that so many episodes were driven."""
+        self.spent += count
+
+    def allows(self, count: int, part: float = 1.0) -> bool:
+        """Return whether so many episodes more fit into this part of the budget."""
+        wanted = self.spent + count
+        if wanted > part * self.episodes:
+            return False
+        if self._seconds is None or not self.spent:
+            return True
+        each = (self._clock() - self._started) / self.spent
+        return each * wanted <= part * self._seconds
+
+
 @dataclass(frozen=True)
 class Choice:
     """What the seeds that choose have shown."""
@@ -72,12 +96,8 @@ def choose(
 ) -> Choice:
     """Drive people and all options until a driver is known for each share, or half the budget is spent.
 
-    Args:
-        options: shares and drivers.
-        drive: drives and measures.
-        budget: of choosing and judging together.
-        precision: half-width of the interval of travel time that is narrow enough, as a share of people's.
-        on_line: gets a line for each batch.
+    `precision` is the half-width of the interval of travel time that is narrow enough, as a share of
+    people's; `on_line` gets a line for each batch.
 
     Raises:
         UnjamError: people alone cannot be driven, or no option can.

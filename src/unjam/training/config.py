@@ -14,7 +14,7 @@ from pydantic.dataclasses import dataclass
 from unjam.drivers.car_following import Constant
 from unjam.drivers.driver import Driver
 from unjam.drivers.observation import observed
-from unjam.drivers.remembering import Remembering
+from unjam.drivers.wrappers import Remembering
 from unjam.errors import InputError
 from unjam.learners.settings import Agents, PolicySettings
 from unjam.parameters import STRICT, Count, CountOrNone, Positive, build, changed, nested

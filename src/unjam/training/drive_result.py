@@ -1,19 +1,31 @@
-"""What `unjam.drive` returns: rows of metrics by driver, as numbers, tables, and in a notebook."""
+"""What `unjam.drive` returns: rows of metrics by driver, as numbers, tables of pandas, and in a notebook."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+import pandas as pd
 
 from unjam.measures.drivable import verdicts
 from unjam.measures.effect import Effect, beside_people
 from unjam.measures.metrics import METRICS
 from unjam.measures.statistics import Estimate, paired_difference, summarise
-from unjam.measures.table import Rows, baseline_of
-from unjam.reports.summary import frame_of_metrics, frame_of_rows, html_of
+from unjam.measures.table import Rows, baseline_of, headings_of, table_of
+from unjam.reports.figures import data_uri
+from unjam.reports.lanes import space_time_of
+from unjam.reports.results import shown_of
 from unjam.worlds.record import Episode
 
-if TYPE_CHECKING:
-    import pandas as pd
+
+def frame_of_rows(rows_by_driver: Rows) -> pd.DataFrame:
+    """Return a row per episode and driver: `driver`, `seed` in words, `status`, and every metric."""
+    return pd.DataFrame(
+        [
+            {"driver": label, **row, "seed": str(row["seed"])}
+            for label, rows in rows_by_driver.items()
+            for row in rows
+        ]
+    )
 
 
 @dataclass(frozen=True)
@@ -39,20 +51,37 @@ class DriveResult:
         """Return mean and 95 % interval of every metric for a driver."""
         return summarise(self.rows[driver])
 
-    def table(self) -> "pd.DataFrame":
+    def table(self) -> pd.DataFrame:
         """Return a row per metric and, for each driver, its mean and both ends of its 95 % interval.
 
         `result.table().loc["mean_speed", ("pi", "mean")]` is one number.
         """
-        return frame_of_metrics(self.rows)
+        numbers = {
+            (label, part): [getattr(estimate, part) for estimate in self.summary(label).values()]
+            for label in self.rows
+            for part in ("mean", "low", "high")
+        }
+        frame = pd.DataFrame(numbers, index=pd.Index(METRICS, name="metric"))
+        return frame.rename_axis(columns=("driver", None))
 
-    def episodes(self) -> "pd.DataFrame":
+    def episodes(self) -> pd.DataFrame:
         """Return a row per episode and driver, with its seed, its status and every metric."""
         return frame_of_rows(self.rows)
 
     def _repr_html_(self) -> str:
         """What a notebook shows: every metric with its interval, and where each vehicle was at each time."""
-        return html_of(self.rows, self.shown)
+        baseline = baseline_of(self.rows)
+        cells = [
+            [f"{row.label} [{row.unit}]" if row.unit else row.label, *map(str, row.cells)]
+            for row in table_of(self.rows, baseline)
+        ]
+        headings = ["", *headings_of(self.rows, baseline)]
+        table = pd.DataFrame(cells, columns=headings).to_html(index=False, border=0)
+        if not self.shown:
+            return table
+        picture = data_uri(space_time_of([shown_of(label, each) for label, each in self.shown.items()]))
+        about = 'style="max-width: 100%" alt="every vehicle over time, dark is slow"'
+        return f'{table}<img {about} src="{picture}">'
 
     def document(self) -> dict[str, Any]:
         """Return the result as `unjam drive --json` prints it; of several drivers, a list of such."""

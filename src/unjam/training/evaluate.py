@@ -13,6 +13,7 @@ from typing import Any
 from safetensors.numpy import save
 
 from unjam.controller import hash_of_controller, make_driver
+from unjam.controller.domain import notes_on_controllers
 from unjam.drivers.driver import Driver
 from unjam.drivers.from_file import DriverLike, as_driver
 from unjam.drivers.registry import driver_names, free_label, travels
@@ -23,14 +24,12 @@ from unjam.measures.metrics import measure
 from unjam.measures.statistics import summarise
 from unjam.reports.html import write_report
 from unjam.reports.results import ABOUT_SHOWN, packed, shown_of
-from unjam.reports.summary import frame_of_rows
-from unjam.scenarios import make_scenario
+from unjam.scenarios import make_scenario, scenario_recipe
 from unjam.scenarios.scenario import Scenario
 from unjam.training.config import RunConfig
-from unjam.training.drive_result import DriveResult, Rows
+from unjam.training.drive_result import DriveResult, Rows, frame_of_rows
 from unjam.training.executors import error_named
 from unjam.training.folder import make_new_folder
-from unjam.training.notes import notes_on_controllers
 from unjam.training.seeds import held_out_seeds
 from unjam.worlds.episode import can_drive, run_episode
 from unjam.worlds.record import Episode
@@ -283,7 +282,7 @@ def drive(
     seeds = held_out_seeds(episodes) if held_out else [(seed + index,) for index in range(episodes)]
     with Workers(min(workers or os.cpu_count() or 1, episodes * len(drivers))) as pool:
         found = evaluate(made, drivers, seeds, pool, reward, progress)
-    report, notes = None, notes_on_controllers(made, drivers, found.shown)
+    report, notes = None, notes_on_controllers(scenario_recipe(made), drivers, found.shown)
     if folder is not None:
         about = {"scenario": Path(scenario).name, "reward": reward or made.reward, "manifest": manifest()}
         named = {label: label for label in drivers}

@@ -57,14 +57,7 @@ class CommandLine(NamedTuple):
 
 
 def training_command(config: "RunConfig", folder: Path, plan: Path, log: Path) -> CommandLine:
-    """Return the command line that begins a training, or goes on with it.
-
-    Args:
-        config: what to train.
-        folder: of the run.
-        plan: file for the configuration, written here.
-        log: where what it prints is added.
-    """
+    """Return the command line that begins a training or goes on with it; `plan` gets its configuration."""
     from unjam.training.config import to_toml
 
     make_folder(plan.parent)
@@ -122,9 +115,7 @@ class Processes:
 def running(executor: Executor, workers: int) -> Iterator[Callable[[CommandLine], Future[int]]]:
     """Give what starts a command line and promises its exit code; an exception in the block ends them all.
 
-    Args:
-        executor: `ray`: on a Ray cluster whose machines share the folders.
-        workers: how many run at once; on a cluster that has more cores, how many are asked for.
+    At most `workers` run at once; on a Ray cluster, whose machines share the folders, so many are asked for.
 
     Raises:
         MissingPartError: Ray is not installed.

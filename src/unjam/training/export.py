@@ -1,13 +1,13 @@
-"""A controller as a file that can be shipped: the run's, or any driver's. `unjam export`."""
+"""Controllers as files: those that a run keeps in its folders, and what `unjam export` ships."""
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from unjam.controller import SUFFIX, controller_bytes, make_driver
-from unjam.controller.file import GRAPH, SAMPLE, read_controller
-from unjam.controller.sample import sample_bytes
+from unjam.controller.file import GRAPH, SAMPLE, read_controller, sample_bytes
 from unjam.controller.verify import verify_controller
 from unjam.drivers.driver import Driver
 from unjam.drivers.local_state import LocalState
@@ -15,7 +15,7 @@ from unjam.drivers.registry import code_of, recipe_of
 from unjam.drivers.residual import ResidualDriver
 from unjam.drivers.wrappers import Filtered
 from unjam.errors import InputError, wrong
-from unjam.files import check_folder, write_whole
+from unjam.files import check_folder, make_folder, write_whole
 from unjam.measures.metrics import measure
 from unjam.measures.statistics import summarise
 from unjam.reports.results import EVALUATION_FILE, rows_by_driver
@@ -26,8 +26,56 @@ from unjam.training.folder import origin, read_config
 from unjam.training.seeds import held_out_seeds
 from unjam.worlds.workers import EpisodeTask, Workers
 
+if TYPE_CHECKING:
+    from unjam.learners.learner import Tensors
+
+Kind = Literal["best", "kept"]
 SAMPLED = 1000
 """most decisions of the recorded sample"""
+
+
+class KeptControllers:
+    """The content of the controllers that are in a run's folders.
+
+    `best` are those of validations that a longer run makes too; `kept` also those of its last iteration.
+    """
+
+    def __init__(self, folders: Sequence[Path]) -> None:
+        """Prepare for one controller in each of the folders."""
+        self._folders = folders
+        self._contents: dict[Kind, list[bytes]] = {}
+
+    def keep(self, contents: list[bytes], best: bool) -> None:
+        """Write a controller into each folder."""
+        self._contents |= {"kept": contents, **({"best": contents} if best else {})}
+        self._write("kept")
+
+    def tensors(self) -> "Tensors":
+        """Return all of them for a checkpoint."""
+        import torch  # whoever exports a driver does without
+
+        return {
+            f"{kind}/{index}": torch.frombuffer(bytearray(content), dtype=torch.uint8)
+            for kind, contents in self._contents.items()
+            for index, content in enumerate(contents)
+        }
+
+    def restore(self, tensors: "Tensors", ended: bool) -> None:
+        """Take those of a checkpoint out of `tensors`, and write them: `kept` where the training has ended.
+
+        What was in the folders may be of a later iteration, or somebody else's.
+        """
+        for kind in ("best", "kept") if "best/0" in tensors else ():
+            found = [tensors.pop(f"{kind}/{index}") for index in range(len(self._folders))]
+            self._contents[kind] = [each.numpy().tobytes() for each in found]
+        if not ended and "best" in self._contents:
+            self._contents["kept"] = self._contents["best"]
+        self._write("kept")
+
+    def _write(self, kind: Kind) -> None:
+        for folder, content in zip(self._folders, self._contents.get(kind, ()), strict=False):
+            make_folder(folder)
+            write_whole(folder / "controller.unjam", content)
 
 
 @dataclass(frozen=True)

@@ -1,10 +1,9 @@
-"""The folder of a run: begun, read, gone on with, and its checkpoints.
+"""The folder of a run: begun, read, gone on with, and its checkpoints and what they belong to.
 
 Free of torch until there is a checkpoint to write or read, so that what is wrong is told at once. Checkpoints
 are made at the end of iterations: written whole, checked by hash, two generations kept.
 """
 
-import hashlib
 import json
 import shutil
 from collections.abc import Iterable, Sequence
@@ -15,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 from safetensors import SafetensorError
 
 from unjam.controller import make_driver
+from unjam.controller.file import hash_of
 from unjam.drivers.driver import Driver
 from unjam.drivers.observation import feature, observation_size
 from unjam.errors import InputError
@@ -24,18 +24,29 @@ from unjam.processes import LOCK
 from unjam.reports.results import read_progress
 from unjam.scenarios import scenario_recipe
 from unjam.scenarios.scenario import Scenario
-from unjam.training.belonging import check_belongs
 from unjam.training.config import RunConfig, load_config, to_toml
 from unjam.worlds.reward import make_reward
 
 if TYPE_CHECKING:
     from unjam.learners.learner import Tensors
+import logging
+from dataclasses import asdict
+
+from unjam.drivers.from_file import FileReference, is_file_reference
+from unjam.drivers.registry import recipe_of
+from unjam.errors import wrong
+from unjam.kernels import kernels
+from unjam.parameters import flat
+from unjam.scenarios.own_network import OwnNetwork
+from unjam.sumo_files import read_sumo_files
+from unjam.worlds.episode import Task
 
 FORMAT = 4
 """of what a checkpoint holds; one of another unjam is refused"""
 GENERATIONS = 2
 MANIFEST, PROGRESS = "manifest.json", "progress.jsonl"
 STATE, TENSORS = "state.json", "tensors.safetensors"
+LOG = logging.getLogger(__name__)
 
 
 def check_possible(config: RunConfig) -> None:
@@ -215,8 +226,56 @@ def _sweep(folder: Path) -> None:
 
 
 def _hash(state: dict[str, Any], data: bytes) -> str:
-    return hashlib.sha256(json.dumps(state, sort_keys=True).encode() + data).hexdigest()
+    return hash_of(json.dumps(state, sort_keys=True).encode() + data)
 
 
 def _places(folder: Path) -> list[Path]:
     return sorted(place for place in folder.glob("*") if place.is_dir() and place.name.isdigit())
+
+
+def belonging(config: RunConfig) -> dict[str, Any]:
+    """Return what a training's result depends on, as JSON.
+
+    Returns:
+        `settings`: all but steps and workers, by name; `files`: hashes of the expert, and of the user's own
+        code and networks; `packages` and `kernels`: what it computes with.
+    """
+    roads = zip(config.roads().values(), config.make_tasks(), strict=True)
+    files = {name: sha256 for road, task in roads for name, sha256 in _files(road, task).items()}
+    settings = flat(asdict(replace(config, steps=1, workers=1)))
+    found = {"settings": settings, "files": files, "packages": package_versions(), "kernels": kernels()}
+    return json.loads(to_json(found))
+
+
+def check_belongs(before: dict[str, Any], now: dict[str, Any]) -> None:
+    """Compare what a checkpoint belongs to with what would go on; other packages and kernels are only told.
+
+    Raises:
+        InputError: a setting, the expert, or a file of the user's own is another one.
+    """
+    for name, value in now["settings"].items():
+        if name in before["settings"] and before["settings"][name] != value:
+            raise wrong(f"resume: {name}", value, f"{before['settings'][name]!r}, as in the checkpoint")
+    for name in before["files"].keys() | now["files"].keys():
+        if before["files"].get(name) != now["files"].get(name):
+            raise InputError(f"resume: {name} has changed since the checkpoint; allowed: as it was then")
+    for part in ("packages", "kernels"):
+        if before[part] != now[part]:
+            LOG.warning("resume: other %s than the checkpoint's: the result is not what it would be", part)
+
+
+def _files(road: RunConfig, task: Task) -> dict[str, str]:
+    """Return hashes by what they are of."""
+    recipe, arrays = recipe_of(task.expert)
+    weights = b"".join(arrays[name].tobytes() for name in sorted(arrays))
+    found = {f"expert {road.expert}": hash_of(json.dumps(recipe, sort_keys=True).encode() + weights)}
+    paths = [
+        FileReference.of(name).path for name in (road.reward, *road.policy.observe) if is_file_reference(name)
+    ]
+    scenario = task.scenario
+    if isinstance(scenario, OwnNetwork):
+        own = read_sumo_files(Path(scenario.file))
+        paths += [own.path, own.network, *own.additional_files, *own.route_files]
+    if scenario.population:
+        paths.append(Path(scenario.population))
+    return found | {str(path): hash_of(path.read_bytes()) for path in paths}

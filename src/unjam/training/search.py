@@ -136,19 +136,11 @@ def search(
     executor: Executor = "local",
     on_line: OnLine = lambda line: None,
 ) -> list[Trial]:
-    """Train with settings that Optuna proposes, and return all trials, the best first.
+    """Train with settings that Optuna proposes, `workers` at once, and return all trials, the best first.
 
     The folder gets `search.json`, and `best.toml` for `unjam train --config`. A search that was stopped goes
-    on where it was, and one that has ended goes on if `trials` is larger.
-
-    Args:
-        base: what all trials share; checked with `check_space`.
-        space: what is varied.
-        trials: trainings in all, those of an earlier call included.
-        folder: new, or that of a search with the same base and space.
-        workers: trainings at once.
-        executor: where they run.
-        on_line: gets a line when one has ended.
+    on where it was, and one that has ended goes on if `trials`, those of an earlier call included, is larger.
+    `base` and `space` are checked with `check_space`; `on_line` gets a line when a training has ended.
 
     Raises:
         InputError: the folder holds another search.

@@ -21,13 +21,13 @@ from unjam.measures.statistics import Estimate, paired_difference
 from unjam.processes import owned
 from unjam.reports.html import write_report
 from unjam.reports.results import read_progress
-from unjam.training.belonging import belonging
 from unjam.training.config import RunConfig, episodes_of_iteration, to_toml
-from unjam.training.controllers import KeptControllers
 from unjam.training.evaluate import TRAINED, Progress, Rows, judge, raise_failure
 from unjam.training.executors import OnIteration, train_apart
+from unjam.training.export import KeptControllers
 from unjam.training.folder import (
     PROGRESS,
+    belonging,
     check_possible,
     continue_folder,
     gave_up,

@@ -1,16 +1,16 @@
-"""What was logged on a closed road, whoever simulated it, and the record that is made of it."""
+"""Closed roads with one lane: who is whose neighbour, what was logged, and the record that is made of it."""
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from unjam.drivers.local_state import LocalState
 from unjam.physics.kinematics import gap_on_loop, next_position
 from unjam.scenarios.road import ClosedRoad
 from unjam.scenarios.scenario import VEHICLE_LENGTH, Scenario
 from unjam.worlds.audit import SHIELD_ROUNDING, Audit, brakings, following
-from unjam.worlds.neighbours import loop_neighbours, loop_state
 from unjam.worlds.record import Episode, Floats, trajectory
 from unjam.worlds.world import Driven
 
@@ -20,6 +20,67 @@ APPROACH = 50.0
 """way before a crossing on which what SUMO adds is put down to the right of way [m]"""
 NOISE_BLOCK = 100
 """steps for which people's noise is drawn at once; what is left of a block is dropped as CAVs take over"""
+
+
+class Neighbours(NamedTuple):
+    """Places of some vehicles and of those around them, in road order: integers, or arrays of them."""
+
+    own: Any
+    ahead: Any
+    behind: Any
+
+
+def loop_neighbours(chosen: Any, vehicles: int) -> Neighbours:
+    """Return the neighbours of the `chosen` places among `vehicles` on a loop with one lane.
+
+    Nobody overtakes there: each vehicle keeps the neighbours that it starts with.
+    """
+    return Neighbours(chosen, (chosen + 1) % vehicles, (chosen - 1) % vehicles)
+
+
+def loop_state(
+    speeds: Any,
+    positions: Any,
+    near: Neighbours,
+    loop_length: float,
+    crossings: tuple[tuple[float, float], ...] = (),
+) -> LocalState:
+    """Return what the vehicles `near.own` perceive on a closed road; integers there give plain numbers.
+
+    Speeds [m/s] and positions of front bumpers, not wrapped [m], are by place in road order: arrays of shape
+    (vehicles,) or (vehicles, moments), or lists. Where the road crosses itself is from and to [m].
+    """
+    own, ahead, behind = near
+    speed, position = speeds[own], positions[own]
+    state = LocalState(  # names would cost as much as all the rest, in every step of a simulator
+        speed,
+        speeds[ahead],
+        gap_on_loop(position, positions[ahead], loop_length, VEHICLE_LENGTH),
+        speeds[behind],
+        gap_on_loop(positions[behind], position, loop_length, VEHICLE_LENGTH),
+        position % loop_length,
+        loop_length if type(position) is float else np.full(position.shape, loop_length),
+    )
+    if not crossings:
+        return state
+    ways = [(start - position) % loop_length for start, _ in crossings]
+    nearest = min(ways) if type(position) is float else np.minimum.reduce(ways)
+    return state._replace(to_crossing=nearest)
+
+
+def places_along(outline: Floats, positions: Floats, loop_length: float) -> Floats:
+    """Return rows (x, y, heading) of vehicles whose front bumpers are at `positions` along a closed road.
+
+    The outline is rows (coordinate along the road, x, y) [m]; positions are not wrapped [m], any shape.
+
+    Returns:
+        Shape (..., 3): [m], and [rad] against the x axis; a vehicle lies between the places of its bumpers.
+    """
+    (x, y), (rear_x, rear_y) = (
+        [np.interp(along % loop_length, outline[:, 0], outline[:, axis]) for axis in (1, 2)]
+        for along in (positions, positions - VEHICLE_LENGTH)
+    )
+    return np.stack([x, y, np.arctan2(y - rear_y, x - rear_x)], axis=-1)
 
 
 @dataclass(frozen=True)
@@ -58,13 +119,9 @@ class ClosedLog:
     def episode(
         self, moments: tuple[Floats, Floats], facts: dict[str, Any], driven: Driven, rows: Any
     ) -> Episode:
-        """Return the record.
+        """Return the record, of the `moments` of this log, with `facts` that it says besides.
 
-        Args:
-            moments: of this log.
-            facts: what else the record says.
-            driven: what the driver decided.
-            rows: of the CAVs in it, shape (C,); None: decisions are plain numbers.
+        `rows` are those of the CAVs in what was decided, shape (C,); None: decisions are plain numbers.
         """
         road, each = self.road, self.scenario.steps_per_decision
         speeds, positions = (values[:, ::each] for values in moments)

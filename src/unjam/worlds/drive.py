@@ -27,12 +27,8 @@ class Drive:
     ) -> None:
         """Start the world; nothing is decided yet.
 
-        Args:
-            world: where.
-            driver: of every CAV.
-            explore: whether what was learned adds its exploration noise.
-            memory: what the driver remembers already; None: nothing but what the world began with.
-            on_progress: called now and then with the number of decisions made.
+        With `explore`, what was learned adds its noise. Without a `memory` the driver remembers nothing but
+        what the world began with. `on_progress` is called now and then with the number of decisions made.
         """
         self.world, self.driver, self._on_progress = world, driver, on_progress
         self._noise = world.noise if explore else None

@@ -78,17 +78,17 @@ def trajectory(
     terminated: bool,
     driven: Driven,
 ) -> Trajectory:
-    """Return the trajectory of a stay, with what the driver decided in it.
+    """Return the trajectory of a stay, with what the driver decided; arrays as `Trajectory` has them.
 
     Args:
         vehicle: its name.
         number: it was the so many-th CAV to enter, from 0.
         start: decision of the episode at which it began.
         rows: its row among the CAVs at each moment, shape (T + 1,); None: decisions are plain numbers.
-        states: what it perceived, shape (T + 1,).
-        applied: its commands; of humans what they did [m/s2], shape (T,).
-        filtered: most that the safety filter took from each [m/s2], shape (T,).
-        shield: hardest braking that was added to each command [m/s2], shape (T,).
+        states: what it perceived.
+        applied: its commands; of humans what they did.
+        filtered: most that the safety filter took from each.
+        shield: hardest braking that was added to each command.
         terminated: whether a collision ended it.
         driven: all that the driver decided.
     """
@@ -198,13 +198,10 @@ def failed_episode(seed: tuple[int, ...], reason: str, error: str) -> Episode:
 def outcome_of(
     speeds: Floats, trajectories: Sequence[Trajectory], crashed: bool, waiting: Floats | None = None
 ) -> Outcome:
-    """Return what a reward function sees of a whole episode.
+    """Return what a reward function sees of a whole episode; `crashed` where its last decision ended so.
 
-    Args:
-        speeds: of all vehicles, shape (T + 1, N).
-        trajectories: of CAVs.
-        crashed: whether the last decision ended in a collision.
-        waiting: how many wanted to enter and could not, shape (T + 1,); None: nobody.
+    Speeds are of all vehicles, shape (T + 1, N), trajectories of CAVs; `waiting` is how many wanted to enter
+    and could not, shape (T + 1,), None where nobody did.
     """
     steps = len(speeds) - 1
     accelerations, headways = (np.full((steps, len(trajectories)), np.nan) for _ in range(2))

@@ -1,21 +1,24 @@
-"""What a world is: where a driver drives. The simulator, the virtual environment, a recording, a mock."""
+"""What a world is: where a driver drives. Two are here: a recording, and pairs of a CAV and its leader."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol, TypeVar
+from typing import Any, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from unjam.drivers.command import Command, Limits, accelerations
 from unjam.drivers.local_state import LocalState
+from unjam.drivers.safety import Ahead
 from unjam.physics.arrays import Array
+from unjam.physics.kinematics import next_speed
 from unjam.tree import Arrays
 
 Recorded = TypeVar("Recorded", covariant=True)
 
 OnProgress = Callable[[int], None]
 """called now and then with how many decisions have been made"""
+Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -125,3 +128,67 @@ class RecordedWorld:
     def record(self, driven: Driven) -> NDArray[np.float64]:
         """Return what was asked for, within the limits [m/s2], shape (T, n)."""
         return np.array(self._answers)
+
+
+class Pursued(NamedTuple):
+    """What happened to n pairs; T steps."""
+
+    speed: Floats
+    """of the CAVs [m/s], shape (T + 1, n)"""
+    leader_speed: Floats
+    """[m/s], shape (T + 1, n)"""
+    gap: Floats
+    """[m], shape (T + 1, n)"""
+
+
+class PursuitWorld:
+    """n CAVs behind leaders; who follows a CAV is as far behind and as fast as it is."""
+
+    single, kept = False, None
+
+    def __init__(
+        self,
+        start: Ahead,
+        leader_accelerations: Any,
+        limits: Limits,
+        step: float,
+        loop_length: float = np.nan,
+    ) -> None:
+        """Take where the pairs begin, arrays of shape (n,), and what leaders do [m/s2], shape (T, n)."""
+        self.limits, self._step = limits, step
+        self._ahead = [Ahead(*(np.array(values, np.float64) for values in start))]
+        self._leader = np.asarray(leader_accelerations, np.float64)
+        self.rows = self.entered = len(start.speed)
+        self._position, self._loop = np.zeros(self.rows), np.full(self.rows, loop_length)
+
+    def start(self, controlled: bool, on_progress: OnProgress | None = None) -> None:
+        """Begin; nothing was before."""
+
+    @property
+    def ended(self) -> bool:
+        """Whether leaders have nothing more to do."""
+        return len(self._ahead) > len(self._leader)
+
+    def perceive(self) -> LocalState:
+        """Return what the CAVs perceive now, arrays of shape (n,)."""
+        speed, leader, gap = self._ahead[-1]
+        place = self._position if np.isnan(self._loop).all() else self._position % self._loop
+        return LocalState(speed, leader, gap, speed, gap, place, self._loop)
+
+    def advance(self, command: Command | None) -> None:
+        """Make one step of all pairs."""
+        assert command is not None
+        before, step = self._ahead[-1], self._step
+        told = self.limits.keep(np.asarray(command.acceleration))
+        speed = next_speed(before.speed, told, step)
+        leader = next_speed(before.leader_speed, self._leader[len(self._ahead) - 1], step)
+        self._position = self._position + speed * step
+        self._ahead.append(Ahead(speed, leader, before.gap + (leader - speed) * step))
+
+    def noise(self) -> Floats:
+        """Return none: nobody explores here."""
+        return np.zeros(self.rows)
+
+    def record(self, driven: Driven) -> Pursued:
+        """Return what happened."""
+        return Pursued(*(np.array(values) for values in zip(*self._ahead, strict=True)))

@@ -11,10 +11,9 @@ import torch
 from torch import Tensor
 
 from unjam.drivers import Constant, Driver
-from unjam.drivers.actuator import Actuator
 from unjam.drivers.local_state import LocalState
 from unjam.drivers.registry import named_driver
-from unjam.drivers.safety import SafetyFilter
+from unjam.drivers.safety import Actuator, SafetyFilter
 from unjam.errors import InputError
 from unjam.measures.metrics import measure
 from unjam.scenarios import FigureEight, Ring

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from unjam.drivers import IDM, Driver, PISaturation
-from unjam.drivers.actuator import Actuator
 from unjam.drivers.car_following import Constant
-from unjam.drivers.safety import SafetyFilter
+from unjam.drivers.safety import Actuator, SafetyFilter
 from unjam.measures.drivable import DRIVABLE
 from unjam.measures.metrics import measure
 from unjam.scenarios import FigureEight, Merge, Ring, Scenario

@@ -16,8 +16,7 @@ from tests.worlds.test_record import fingerprint
 from unjam.drivers import IDM
 from unjam.scenarios import make_scenario
 from unjam.scenarios.own_network import _tell_dropped
-from unjam.sumo_files import read_sumo_files
-from unjam.sumo_files.options import PASSED, is_passed
+from unjam.sumo_files import PASSED, is_passed, read_sumo_files
 from unjam.worlds.episode import run_episode
 from unjam.worlds.sumo.networks import sumo_program
 from unjam.worlds.sumo.simulation import Simulation

@@ -6,7 +6,7 @@ import pytest
 
 from unjam.drivers import Human
 from unjam.drivers.command import Command
-from unjam.drivers.motorway_experts import Cruise, JamAhead
+from unjam.drivers.road_experts import Cruise, JamAhead
 from unjam.measures.metrics import measure
 from unjam.scenarios import OnRamp
 from unjam.worlds.episode import run_episode

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from unjam.drivers.command import Command
 from unjam.drivers.local_state import EVERYWHERE
 from unjam.scenarios import Ring
-from unjam.worlds.neighbours import loop_neighbours, loop_state
+from unjam.worlds.closed import loop_neighbours, loop_state
 from unjam.worlds.sumo import make_traffic
 from unjam.worlds.sumo.closed import ClosedTraffic
 from unjam.worlds.sumo.simulation import Simulation

@@ -17,10 +17,8 @@ import pytest
 from unjam.errors import DiskError, EpisodeError, MissingPartError
 from unjam.scenarios import Ring
 from unjam.scenarios.road import RoadNetwork
-from unjam.worlds.sumo import cache as cache_module
 from unjam.worlds.sumo import networks
-from unjam.worlds.sumo.cache import cache_folder
-from unjam.worlds.sumo.networks import network_file, sumo_program
+from unjam.worlds.sumo.networks import cache_folder, network_file, sumo_program
 
 
 def road_of(length: int) -> RoadNetwork:
@@ -247,7 +245,7 @@ def test_another_process_notices_too(cache: Path, monkeypatch: pytest.MonkeyPatc
     whole, stamp = made.read_bytes(), made.stat()
     made.write_bytes(whole.replace(b"57.5", b"58.5"))
     os.utime(made, ns=(stamp.st_atime_ns, stamp.st_mtime_ns))
-    monkeypatch.setattr(cache_module, "_whole", {})
+    monkeypatch.setattr(networks, "_whole", {})
     assert edges_of(network_file(road_of(230))) == {f"edge_{index}": 57.5 for index in range(4)}
 
 

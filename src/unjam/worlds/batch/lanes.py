@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 from unjam.physics.arrays import Array, at_least, at_most, namespace
 from unjam.physics.idm import IDMParameters, IDMRows
-from unjam.physics.stopping import stopping_distance
+from unjam.physics.kinematics import stopping_distance
 from unjam.scenarios.ring import EDGES
 from unjam.scenarios.scenario import VEHICLE_LENGTH
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from unjam.drivers.command import Command
 from unjam.drivers.local_state import LocalState
-from unjam.drivers.safety import Ahead
+from unjam.drivers.safety import Ahead, Cars
 from unjam.errors import EpisodeError, InputError
 from unjam.physics.arrays import Array, at_least, at_most, namespace
 from unjam.physics.idm import IDMParameters, IDMRows, parameter_rows
@@ -27,7 +27,6 @@ from unjam.worlds.batch.lanes import CONTACT, Leader, end_of_lane, leaders, touc
 from unjam.worlds.batch.noise import Noise, Numbers, QuickNoise, SeededNoise
 from unjam.worlds.batch.people import people_speed, without_gap
 from unjam.worlds.batch.record import RingLog, Rings, as_numpy
-from unjam.worlds.cars import Cars
 from unjam.worlds.closed import HISTORY
 from unjam.worlds.reward import Outcome, make_reward, time_headway
 from unjam.worlds.sumo.files import obedient_brakes

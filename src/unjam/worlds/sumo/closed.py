@@ -23,8 +23,7 @@ from unjam.physics.kinematics import gap_on_loop, next_speed
 from unjam.scenarios.population import as_calibrated
 from unjam.scenarios.road import ClosedRoad
 from unjam.scenarios.scenario import VEHICLE_LENGTH, Scenario
-from unjam.worlds.closed import HISTORY, NOISE_BLOCK, ClosedLog
-from unjam.worlds.neighbours import loop_neighbours, loop_state, places_along
+from unjam.worlds.closed import HISTORY, NOISE_BLOCK, ClosedLog, loop_neighbours, loop_state, places_along
 from unjam.worlds.record import Episode, Floats
 from unjam.worlds.sumo.simulation import LEAVE_TO_SUMO, Simulation
 from unjam.worlds.sumo.traffic import Scene, Seed, Traffic

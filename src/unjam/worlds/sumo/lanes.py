@@ -14,7 +14,7 @@ from unjam.worlds.audit import SHORT_HEADWAY, Audit, brakings, following
 from unjam.worlds.record import Floats, Trajectory
 from unjam.worlds.sumo.open import OpenTraffic
 from unjam.worlds.sumo.simulation import LEAVE_TO_SUMO
-from unjam.worlds.sumo.traffic import RoadKind
+from unjam.worlds.sumo.traffic import OpenKind
 from unjam.worlds.world import OnProgress
 
 CUT_IN = 3.0
@@ -38,7 +38,7 @@ class Followed(NamedTuple):
     """[m]"""
 
 
-class LaneTraffic(OpenTraffic[RoadKind]):
+class LaneTraffic(OpenTraffic[OpenKind]):
     """What roads with lanes have in common."""
 
     def start(self, controlled: bool, on_progress: OnProgress | None = None) -> None:

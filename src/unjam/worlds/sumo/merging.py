@@ -133,14 +133,6 @@ class MergingTraffic(OpenTraffic[MergingRoad]):
         self._streams = Streams()
         super().start(controlled, on_progress)
 
-    def _is_cav(self, name: str) -> bool:
-        return name in self.road.cav_ids
-
-    @property
-    def expects_cavs(self) -> bool:
-        """Whether a CAV may still enter: not all that ever will have."""
-        return self.entered < len(self.road.cav_ids)
-
     def _moved(self, left: Sequence[str], entered: Sequence[str]) -> None:
         streams, simulation = self._streams, self._simulation
         streams.leave(left)

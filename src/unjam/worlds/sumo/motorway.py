@@ -35,14 +35,6 @@ class MotorwayTraffic(LaneTraffic[MotorwayRoad]):
         self._messages = Messages(road.roadside, ways, road.length, step, self._noise_generator)
         super().start(controlled, on_progress)
 
-    def _is_cav(self, name: str) -> bool:
-        return name in self.road.cav_ids
-
-    @property
-    def expects_cavs(self) -> bool:
-        """Whether a CAV may still enter: not all that ever will have."""
-        return self.entered < len(self.road.cav_ids)
-
     @property
     def _cav_type(self) -> str:
         return CAV_TYPES

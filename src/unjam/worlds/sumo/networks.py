@@ -1,4 +1,4 @@
-"""Networks as SUMO reads them, made once for each content, and what is known of SUMO's programs."""
+"""Networks as SUMO reads them, made once for each content and kept; and where SUMO's programs are."""
 
 import errno
 import hashlib
@@ -17,17 +17,19 @@ from typing import Any
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
+import platformdirs
 
-from unjam.errors import DISK_ERRNOS, EpisodeError, MissingPartError, disk_error
+from unjam.errors import DISK_ERRNOS, EpisodeError, MissingPartError, disk_error, wrong
 from unjam.scenarios.road import Connection, Edge, Node, RoadNetwork
-from unjam.sumo_files import read_lanes
+from unjam.sumo_files import read_lanes, stamp_of
 from unjam.worlds.record import Floats
-from unjam.worlds.sumo.cache import cache_folder, is_as_made, seal
 
 LONG_AGO = 3600.0
 """seconds after which nobody makes a network any more"""
 Attributes = dict[str, Any]
 """of an XML element"""
+_whole: dict[Path, tuple[int, int]] = {}
+"""networks in the cache that this process has found whole, with their stamps"""
 
 
 @cache
@@ -171,3 +173,35 @@ def _netconvert(files: dict[tuple[str, str], str], options: list[str], folder: P
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))  # of which netconvert itself says nothing
     words = sumo_words((done.stderr or done.stdout).splitlines())
     raise EpisodeError(f"netconvert cannot make the road: {words}")
+
+
+def cache_folder() -> Path:
+    """Return where networks are kept: `$UNJAM_CACHE`, or the user's cache folder.
+
+    Raises:
+        InputError: SUMO would take its name for a list, or for a variable.
+    """
+    chosen = os.environ.get("UNJAM_CACHE") or platformdirs.user_cache_dir("unjam")
+    if any(sign in chosen for sign in ",;$%"):
+        raise wrong("UNJAM_CACHE", chosen, "a folder without , ; $ % in its name")
+    return Path(chosen)
+
+
+def seal(content: bytes) -> bytes:
+    """Return the last line of a network in the cache: the hash of what is before it."""
+    return f"<!-- sha256 {hashlib.sha256(content).hexdigest()} -->\n".encode()
+
+
+def is_as_made(network: Path) -> bool:
+    """Return whether a network in the cache is there, and nobody has changed or cut it since it was made."""
+    try:
+        stamp = stamp_of(network)
+        if _whole.get(network) != stamp:
+            content = network.read_bytes()
+            length = len(content) - len(seal(b""))
+            if content[length:] != seal(content[:length]):
+                return False
+            _whole[network] = stamp
+    except OSError:
+        return False
+    return True

@@ -15,7 +15,7 @@ from unjam.drivers.safety import Ahead
 from unjam.physics.kinematics import next_speed
 from unjam.worlds.audit import SHIELD_ROUNDING, Audit, Following, brakings, following
 from unjam.worlds.record import Episode, Floats, Trajectory, trajectory
-from unjam.worlds.sumo.traffic import RoadKind, Scene, Traffic
+from unjam.worlds.sumo.traffic import OpenKind, Scene, Traffic
 from unjam.worlds.world import Driven, OnProgress
 
 
@@ -31,18 +31,22 @@ class Moment(NamedTuple):
     """to the vehicle ahead [m]"""
 
 
-class OpenTraffic(Traffic[RoadKind]):
+class OpenTraffic(Traffic[OpenKind]):
     """What roads with ends have in common.
 
     A vehicle becomes a CAV at the first decision after it entered; until then it drives as people do. Its
-    stay ends with the last decision after which it is still on the road.
+    stay ends with the last decision after which it is still on the road. What comes before `start` each kind
+    of road does in its own way.
     """
-
-    # What each kind of road does in its own way.
 
     def _is_cav(self, name: str) -> bool:
         """Whether a vehicle that has just entered is a CAV."""
-        raise NotImplementedError
+        return name in self.road.cav_ids
+
+    @property
+    def expects_cavs(self) -> bool:
+        """Whether a CAV may still enter: not all that the road names have."""
+        return self.entered < len(self.road.cav_ids)
 
     def _moved(self, left: Sequence[str], entered: Sequence[str]) -> None:
         """Follow how the vehicles moved in the last step, who left and who entered."""
@@ -91,8 +95,6 @@ class OpenTraffic(Traffic[RoadKind]):
     def _ends_with(self, colliding: Sequence[str]) -> bool:
         """Whether a collision of these vehicles ends the episode."""
         return True
-
-    # What all of them do alike.
 
     def start(self, controlled: bool, on_progress: OnProgress | None = None) -> None:
         """Run the warm-up, then hand the CAVs over; drivers remember nothing of it."""
@@ -302,9 +304,9 @@ class OpenTraffic(Traffic[RoadKind]):
                     start=start,
                     rows=np.array([row for _, row in places]),
                     states=LocalState(*(_stay(values, places) for values in states)),
-                    applied=np.array([self._log_applied[time][row] for time, row in places[:-1]]),
-                    filtered=np.array([self._log_filtered[time][row] for time, row in places[:-1]]),
-                    shield=np.array([self._log_shield[time][row] for time, row in places[:-1]]),
+                    applied=_stay(self._log_applied, places[:-1]),
+                    filtered=_stay(self._log_filtered, places[:-1]),
+                    shield=_stay(self._log_shield, places[:-1]),
                     terminated=self.crashed and start + steps == self.decisions,
                     driven=driven,
                 )

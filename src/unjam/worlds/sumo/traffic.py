@@ -7,12 +7,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from unjam.drivers.command import Command, accelerations
+from unjam.drivers.safety import Cars
 from unjam.errors import EpisodeError
 from unjam.physics.arrays import Array
 from unjam.physics.idm import IDMParameters
-from unjam.scenarios.road import Road
+from unjam.scenarios.road import OpenRoad, Road
 from unjam.scenarios.scenario import Scenario
-from unjam.worlds.cars import Cars
 from unjam.worlds.record import Episode, Floats
 from unjam.worlds.sumo.files import files_of
 from unjam.worlds.sumo.simulation import Simulation
@@ -45,6 +45,7 @@ class Scene(NamedTuple):
 
 
 RoadKind = TypeVar("RoadKind", bound=Road)
+OpenKind = TypeVar("OpenKind", bound=OpenRoad)
 
 
 class Traffic(World[Episode], Generic[RoadKind]):
