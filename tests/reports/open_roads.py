@@ -1,5 +1,6 @@
 """Episodes on roads with ends, as pictures show them."""
 
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -8,7 +9,7 @@ import numpy as np
 from tests.worlds.sumo.own_roads import game
 from unjam.controller import make_driver
 from unjam.drivers import Human, PISaturation
-from unjam.reports.results import PICTURED, Shown
+from unjam.reports.results import PICTURED, Shown, shown_of
 from unjam.scenarios import Merge, make_scenario
 from unjam.worlds.episode import run_episode
 from unjam.worlds.record import Episode
@@ -16,19 +17,8 @@ from unjam.worlds.record import Episode
 
 def shown_from(episode: Episode, driver: str) -> Shown:
     """What a folder of results has of an episode."""
-    return Shown(
-        driver=driver,
-        step=episode.step,
-        loop_length=episode.loop_length,
-        crossings=[list(crossing) for crossing in episode.crossings],
-        limit_speed=episode.limit_speed,
-        drawn=episode.drawn,
-        vehicle_ids=list(episode.vehicle_ids),
-        cav_ids=list(episode.cav_ids),
-        branches=list(episode.branches),
-        lane_names=list(episode.lane_names),
-        **{name: getattr(episode, name).astype(np.float32) for name in PICTURED},
-    )
+    arrays = {name: getattr(episode, name).astype(np.float32) for name in PICTURED}
+    return replace(shown_of(driver, episode), **arrays)
 
 
 @cache

@@ -22,7 +22,7 @@ def small(speeds: list[list[float]], lanes: list[list[float]], positions: list[l
         name: np.array(values, np.float32)
         for name, values in (("speeds", speeds), ("lanes", lanes), ("positions", positions))
     }
-    return replace(shown_from(ramp_episode(), "few"), step=1.0, lane_names=["left", "right"], **arrays)
+    return replace(shown_from(ramp_episode(), "few"), step=1.0, lane_names=("left", "right"), **arrays)
 
 
 def test_a_cell_has_the_mean_speed_of_all_who_were_in_it() -> None:
@@ -38,7 +38,7 @@ def test_a_cell_has_the_mean_speed_of_all_who_were_in_it() -> None:
 
 
 def test_lanes_are_those_on_which_vehicles_lie(shown: Shown) -> None:
-    assert shown.lane_names == ["left lane", "right lane", "ramp"]
+    assert shown.lane_names == ("left lane", "right lane", "ramp")
     on_ramp = np.array(shown.branches) == "ramp"
     before = ~np.isnan(shown.positions) & (shown.positions < 0)
     assert set(np.unique(shown.lanes[before & on_ramp])) == {2}
@@ -50,7 +50,7 @@ def test_lanes_are_those_on_which_vehicles_lie(shown: Shown) -> None:
 def test_who_stays_in_a_lane_is_in_the_map_of_it_alone(shown: Shown) -> None:
     figure = lane_maps([shown])
     panels = [axes for axes in figure.axes if axes.get_visible() and axes.get_label() != "<colorbar>"]
-    assert [axes.get_ylabel().split("\n")[0] for axes in panels] == shown.lane_names
+    assert tuple(axes.get_ylabel().split("\n")[0] for axes in panels) == shown.lane_names
     for lane, axes in enumerate(panels):
         (mesh,) = [found for found in axes.collections if isinstance(found, QuadMesh)]
         speeds = shown.speeds[(shown.lanes == lane) & ~np.isnan(shown.positions)]
@@ -79,7 +79,7 @@ def test_roads_without_lanes_or_with_different_ones_are_drawn_as_lines(shown: Sh
 
 def test_of_many_lanes_the_busiest_are_drawn(shown: Shown) -> None:
     lanes = np.where(np.isnan(shown.lanes), np.nan, np.arange(shown.lanes.shape[1]) % 7).astype(np.float32)
-    many = replace(shown, lanes=lanes, lane_names=[str(number) for number in range(7)])
+    many = replace(shown, lanes=lanes, lane_names=tuple(map(str, range(7))))
     labels = [axes.get_ylabel() for axes in lane_maps([many]).axes if axes.get_label() != "<colorbar>"]
     names = [label.split("\n")[0] for label in labels if label]
     assert len(names) == MOST_LANES

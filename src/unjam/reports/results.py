@@ -38,31 +38,12 @@ ABOUT_SHOWN = (
 
 
 @dataclass(frozen=True)
-class Shown:
-    """What pictures show of one driver's episode: as in an `Episode`, but for its driver.
+class Shown(Episode):
+    """What pictures show of one driver's episode; all drivers of a folder share one seed."""
 
-    All drivers of a folder share one seed. T decisions, N vehicles; speeds, positions and gaps have the shape
-    (T + 1, N).
-    """
-
-    driver: str
-    step: float
-    loop_length: float
-    crossings: list[list[float]]
-    limit_speed: float
-    drawn: dict[str, float]
-    vehicle_ids: list[str]
-    cav_ids: list[str]
-    speeds: Floats
-    positions: Floats
-    gaps: Floats
-    outline: Floats
-    branches: list[str]
-    waiting: Floats
-    lines: Floats
-    places: Floats
-    lanes: Floats = field(default_factory=lambda: np.zeros((0, 0), np.float32))
-    lane_names: list[str] = field(default_factory=list)
+    seed: tuple[int, ...] = ()
+    status: str = ""
+    driver: str = ""
 
     @property
     def closed(self) -> bool:
@@ -82,8 +63,7 @@ class Shown:
 
 def shown_of(driver: str, episode: Episode) -> Shown:
     """Return what pictures show of an episode that was just driven."""
-    names = {*ABOUT_SHOWN, *PICTURED} - {"seed"}
-    return Shown(driver, **{name: getattr(episode, name) for name in names})
+    return Shown(**{name: getattr(episode, name) for name in (*ABOUT_SHOWN, *PICTURED)}, driver=driver)
 
 
 def packed(shown: Shown) -> dict[str, Floats]:
@@ -160,7 +140,6 @@ def read_results(folder: Path) -> Results:
         about, arrays = json.loads(path.read_text()), load_file(folder / "shown.safetensors")
         rows, shown = rows_by_driver(about.pop("rows")), {}
         for number, entry in enumerate(about.pop("shown")):
-            entry.pop("seed", None)
             pictured = unpacked(
                 {name: arrays[key] for name in STORED if (key := f"{number}.{name}") in arrays}
             )
