@@ -6,6 +6,7 @@ know. The ceiling leads all to the limit of the length, which no car can know.
 
 from dataclasses import replace
 from functools import partial
+from math import inf, isinf
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,7 @@ from unjam.measures.statistics import crossed_estimate, estimate
 from unjam.measures.table import cell_of
 from unjam.scenarios.ring import Ring
 from unjam.scenarios.scenario import Scenario
-from unjam.studies.study import Study, StudyFolder, planned
+from unjam.studies.study import Study, StudyFolder, planned, read_part
 from unjam.training.evaluate import Rows, evaluate
 from unjam.training.seeds import held_out_seeds
 from unjam.worlds.workers import Workers
@@ -70,54 +71,48 @@ def _write(studies: StudyFolder, seeds: int, folder: Path, workers: int) -> None
 
 def table(road: str, folder: Path) -> pd.DataFrame:
     """Return who earns what on a road, over all lengths, and what each is beyond the tuned expert."""
-    found = pd.read_json(folder / f"{road}.json", typ="series")
-    labels = list(found.iloc[0])
+    rows = [
+        {"driver": label, "seed": seed, "verdict": found["drivable"], **row}
+        for of_length in read_part(folder, road).values()
+        for label, found in of_length.items()
+        for seed, row in enumerate(found["episodes"])
+    ]
+    episodes = pd.DataFrame(rows)
+    labels = list(episodes["driver"].unique())
     trainings = [label for label in labels if label.startswith("training")]
-    shown = [label for label in labels if label not in trainings]
-    rows = [_row(found, label, [label]) for label in shown]
+    groups = {label: [label] for label in labels if label not in trainings}
     if trainings:
-        rows.append(_row(found, f"residual, {len(trainings)} trainings", trainings))
-    return pd.DataFrame(rows)
+        groups[f"residual, {len(trainings)} trainings"] = trainings
+    return pd.DataFrame([_row(episodes, label, members) for label, members in groups.items()])
 
 
-def _of(found: Any, label: str, name: str) -> np.ndarray:
-    """Return a number of a driver's episodes: of each seed the mean over the lengths, shape (seeds,)."""
-    by_length = [[row[name] for row in found[length][label]["episodes"]] for length in found.index]
-    return np.array(by_length, np.float64).mean(0)
-
-
-def _beyond(found: Any, members: list[str], baseline: str, name: str, digits: int) -> str:
-    """Return what drivers, or several trainings, are beyond another driver on the same seeds."""
-    beyond = np.array([_of(found, member, name) - _of(found, baseline, name) for member in members])
-    return str(
-        cell_of(crossed_estimate(beyond) if len(members) > 1 else estimate(beyond[0]), digits, sign="+")
+def _row(episodes: pd.DataFrame, label: str, members: list[str]) -> dict[str, Any]:
+    """Return what a driver, or several trainings together, are worth on a road."""
+    own = episodes[episodes["driver"].isin(members)]
+    mean, closest = (
+        own.mean(numeric_only=True),
+        np.nanmin(np.asarray(own["min_headway"], np.float64), initial=inf),
     )
+    worst = [verdict for verdict in own["verdict"] if verdict != DRIVABLE]
 
+    def beyond(baseline: str, name: str, digits: int) -> str:
+        """Return what they are beyond another driver, on each seed over all lengths."""
+        by_seed = episodes.pivot_table(name, "driver", "seed")
+        values = (by_seed.loc[members] - by_seed.loc[baseline]).to_numpy()
+        found = crossed_estimate(values) if len(members) > 1 else estimate(values[0])
+        return str(cell_of(found, digits, sign="+"))
 
-def _row(found: Any, label: str, members: list[str]) -> dict[str, Any]:
-    mean = partial(_mean_of, found, members)
-    drivable = [found[length][member]["drivable"] for length in found.index for member in members]
-    worst = [each for each in drivable if each != DRIVABLE]
-    headways = [row["min_headway"] for row in _episodes(found, members) if row["min_headway"] is not None]
     return {
         "driver": label,
-        "return": f"{mean('return'):.0f}",
-        "beyond the tuned expert": _beyond(found, members, TUNED, "return", 0),
-        "mean speed [m/s]": f"{mean('mean_speed'):.2f}",
-        "beyond people [m/s]": _beyond(found, members, "human", "mean_speed", 2),
-        "flow [veh/h]": f"{mean('throughput_veh_per_h'):.0f}",
-        "fuel [ml/km]": f"{mean('fuel_ml_per_km'):.0f}",
-        "smallest headway [s]": f"{min(headways):.2f}" if headways else "–",
+        "return": f"{mean['return']:.0f}",
+        "beyond the tuned expert": beyond(TUNED, "return", 0),
+        "mean speed [m/s]": f"{mean['mean_speed']:.2f}",
+        "beyond people [m/s]": beyond("human", "mean_speed", 2),
+        "flow [veh/h]": f"{mean['throughput_veh_per_h']:.0f}",
+        "fuel [ml/km]": f"{mean['fuel_ml_per_km']:.0f}",
+        "smallest headway [s]": "–" if isinf(closest) else f"{closest:.2f}",
         "drivable": (worst[0] or "–") if worst else "yes",
     }
-
-
-def _episodes(found: Any, members: list[str]) -> list[dict[str, Any]]:
-    return [row for length in found.index for member in members for row in found[length][member]["episodes"]]
-
-
-def _mean_of(found: Any, members: list[str], name: str) -> float:
-    return float(np.mean([row[name] for row in _episodes(found, members)]))
 
 
 DRIVABLE_STUDY = Study(
