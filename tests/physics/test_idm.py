@@ -6,14 +6,14 @@ from hypothesis import strategies as st
 
 from unjam.errors import InputError
 from unjam.parameters import build
-from unjam.physics import (
+from unjam.physics.idm import (
     IDMParameters,
     desired_gap,
     equilibrium_gap,
     equilibrium_speed,
     idm_acceleration,
-    next_speed,
 )
+from unjam.physics.kinematics import next_speed
 from unjam.scenarios import Ring
 from unjam.worlds.sumo.files import files_of
 from unjam.worlds.sumo.simulation import Simulation

@@ -3,8 +3,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from unjam.physics import gap_on_loop, next_position, next_speed
-from unjam.physics.kinematics import distance_driven
+from unjam.physics.kinematics import distance_driven, gap_on_loop, next_position, next_speed
 
 
 @given(st.floats(0, 40), st.floats(-20, 20), st.floats(0.01, 1))

@@ -8,10 +8,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from unjam.drivers import LocalState
-from unjam.drivers.check import random_state
+from unjam.drivers.from_file import random_state
 from unjam.drivers.local_state import EVERYWHERE, LARGEST_GAP
 from unjam.drivers.network import Network
-from unjam.physics import IDMParameters
+from unjam.physics.idm import IDMParameters
 from unjam.scenarios import Ring, make_scenario
 from unjam.scenarios.population import Population, write_population
 from unjam.virtual.model import BASES, absent, base_reward, base_step
