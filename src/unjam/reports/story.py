@@ -1,12 +1,11 @@
 """What the report says in words, figures and tables, from the results of one folder or of several."""
 
-import csv
-import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from unjam.measures.effect import beside_people
 from unjam.measures.metrics import METRICS
@@ -226,11 +225,6 @@ def against_people(columns: Sequence[Column]) -> dict[str, Any]:
 
 def episodes_as_csv(columns: Sequence[Column]) -> str:
     """Return all episodes as CSV: a row per driver and seed, a column per metric; NaN is empty."""
-    text = io.StringIO()
-    table = csv.writer(text, lineterminator="\n")
-    table.writerow(["driver", "seed", "status", *METRICS])
-    for column in columns:
-        for row in column.rows:
-            values = ("" if row[name] != row[name] else row[name] for name in METRICS)
-            table.writerow([column.name, row["seed"], row["status"], *values])
-    return text.getvalue()
+    rows = [{**row, "driver": column.name} for column in columns for row in column.rows]
+    table = pd.DataFrame(rows, columns=["driver", "seed", "status", *METRICS])
+    return table.to_csv(index=False, lineterminator="\n")
