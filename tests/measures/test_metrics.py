@@ -1,6 +1,5 @@
 import warnings
 from collections.abc import Callable
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -13,7 +12,6 @@ from numpy.typing import ArrayLike
 from unjam.drivers import LocalState
 from unjam.measures.metrics import METRICS, measure
 from unjam.scenarios.scenario import VEHICLE_LENGTH
-from unjam.studies.robustness import speed_along_road, wave_speed
 from unjam.worlds.audit import Audit, Following, following
 from unjam.worlds.closed import loop_neighbours, loop_state
 from unjam.worlds.record import Episode, Floats, Trajectory, failed_episode, outcome_of
@@ -488,28 +486,3 @@ def test_an_episode_in_which_nobody_came_is_measured_without_complaint() -> None
             ):
                 assert np.isnan(row[name])
             assert row["throughput_veh_per_h"] == row["backlog_veh"] == 0.0
-
-
-LOOP, STEP = 230.0, 0.1
-
-
-def travelling(speed: float, size: float = 2.0) -> Any:
-    """Vehicles whose speed is that of a pattern that travels at `speed` along the road."""
-    times = np.arange(1200) * STEP
-    positions = np.arange(22) * LOOP / 22 + 3.0 * times[:, None]
-    pattern = np.cos(2 * np.pi * (positions - speed * times[:, None]) / LOOP) ** 3
-    return SimpleNamespace(speeds=4.0 + size * pattern, positions=positions, loop_length=LOOP, step=STEP)
-
-
-@pytest.mark.parametrize("speed", [-5.6, -3.0, 0.0, 4.0])
-def test_the_speed_of_a_travelling_pattern_is_found(speed: float) -> None:
-    assert wave_speed(travelling(speed)) == pytest.approx(speed, abs=0.1)
-
-
-def test_where_nothing_waves_there_is_no_wave() -> None:
-    assert np.isnan(wave_speed(travelling(-5.0, size=0.1)))
-
-
-def test_the_road_closes_on_itself() -> None:
-    field = speed_along_road(np.array([[1.0, 3.0]]), np.array([[10.0, LOOP - 10.0]]), LOOP)
-    assert field[0, 0] == pytest.approx(2.0)
