@@ -9,7 +9,15 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from safetensors import SafetensorError
+
 from unjam.errors import DISK_ERRNOS, DiskError, disk_error
+
+DAMAGED = (
+    *(OSError, ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RecursionError),
+    SafetensorError,
+)
+"""what reading JSON and arrays can raise where they are not what unjam writes"""
 
 
 def write_whole(path: Path, content: bytes | str) -> None:

@@ -10,7 +10,7 @@ from typing import Annotated, Any, NamedTuple
 
 import typer
 
-from unjam.errors import InputError, wrong_name
+from unjam.errors import wrong, wrong_name
 from unjam.learners.settings import AGENTS
 from unjam.parameters import parse_assignments
 from unjam.training.executors import EXECUTORS, Executor
@@ -145,7 +145,7 @@ def parse_range(name: str, text: str | None) -> tuple[int, int] | None:
         return None
     parts = text.split("-")
     if len(parts) > 2 or not all(part.strip().isdigit() for part in parts):
-        raise InputError(f"{name}: {text!r} is not allowed; allowed: metres, like 230 or 220-270")
+        raise wrong(name, text, "metres, like 230 or 220-270")
     return int(parts[0]), int(parts[-1])
 
 

@@ -12,8 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
-from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
 from unjam import __version__
@@ -22,7 +20,8 @@ from unjam.drivers.driver import Driver
 from unjam.drivers.local_state import BY_SECTION, EVERYWHERE, SECTIONS_AHEAD, STATE_UNITS, LocalState
 from unjam.drivers.registry import code_of, driver_from_recipe, recipe_of
 from unjam.errors import InputError
-from unjam.files import to_json, write_whole
+from unjam.files import DAMAGED, to_json, write_whole
+from unjam.physics.arrays import Floats
 from unjam.tree import leaves
 from unjam.worlds.drive import drive
 from unjam.worlds.world import RecordedWorld
@@ -40,13 +39,8 @@ PARTS = (MANIFEST, WEIGHTS, SAMPLE, GRAPH, CERTIFICATE)
 was certified"""
 LARGEST_PART = 64 * 2**20
 """bytes of one part"""
-DAMAGED = (
-    *(zipfile.BadZipFile, zlib.error, SafetensorError, OSError, EOFError, ValueError, KeyError, TypeError),
-    *(AttributeError, ArithmeticError, MemoryError),
-    RuntimeError,  # of a kind that zipfile does not know, or nested without end
-)
-"""what reading can raise where a file is none of ours"""
-Floats = NDArray[np.float64]
+NONE_OF_OURS = (*DAMAGED, zipfile.BadZipFile, zlib.error, EOFError, MemoryError, RuntimeError)
+"""what reading can raise where a file is none; `RuntimeError`: of a kind that zipfile does not know"""
 
 ANSWER = "acceleration"
 """the answer's name in a sample and in a graph"""
@@ -120,7 +114,7 @@ def read_controller(path: Path | str, trust_code: bool = True) -> Controller:
         if unknown:
             raise InputError(f"controller {file.name}: weights {min(unknown)!r} belong to no network")
         return Controller(driver, manifest, parts)
-    except DAMAGED as error:
+    except NONE_OF_OURS as error:
         raise InputError(f"controller {file.name}: not a controller: {error}") from None
 
 

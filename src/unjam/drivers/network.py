@@ -5,12 +5,9 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from unjam.errors import InputError
-from unjam.physics.arrays import Array, namespace
-
-Floats = NDArray[np.float64]
+from unjam.physics.arrays import Array, Floats, namespace
 
 LOG_STD_RANGE = (-20.0, 2.0)
 """bounds of a log standard deviation that the network gives itself: those of SB3's SAC"""

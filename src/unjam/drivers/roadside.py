@@ -11,8 +11,7 @@ from pydantic.dataclasses import dataclass
 
 from unjam.drivers.local_state import SECTION, SECTIONS_AHEAD
 from unjam.parameters import STRICT, NotNegative
-
-Floats = NDArray[np.float64]
+from unjam.physics.arrays import Floats
 
 
 @dataclass(frozen=True, config=STRICT)

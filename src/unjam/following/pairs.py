@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 
 from unjam.drivers.local_state import LARGEST_GAP, LocalState
 from unjam.errors import wrong
+from unjam.physics.arrays import Floats
 from unjam.physics.kinematics import next_position
-
-Floats = NDArray[np.float64]
 
 SPLITS = ("train", "validation", "test")
 DRIVEN = ("speed", "leader_speed", "gap", "leader_path")

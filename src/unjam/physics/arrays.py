@@ -12,9 +12,11 @@ from types import SimpleNamespace
 from typing import Any, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
 Array: TypeAlias = Any
 """A NumPy array, a torch tensor or a float; workers run without torch, so it cannot be named here."""
+Floats = NDArray[np.float64]
 
 
 _FLOATS = SimpleNamespace(

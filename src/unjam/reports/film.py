@@ -7,7 +7,7 @@ from textwrap import fill
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from unjam.errors import InputError, MissingPartError
+from unjam.errors import MissingPartError, wrong
 from unjam.files import check_folder
 from unjam.reports.figures import CAV_COLOUR, INK, colour_table
 from unjam.scenarios.scenario import VEHICLE_LENGTH
@@ -135,9 +135,7 @@ def write_video(episode: Episode, path: Path, title: str, pace: float = 10.0) ->
 def check_format(path: Path) -> None:
     """Raise `InputError` unless `write_video` can write such a file."""
     if path.suffix.lower() not in FORMATS:
-        raise InputError(
-            f"video: {path.name!r} is not allowed; allowed: a name that ends in {', '.join(FORMATS)}"
-        )
+        raise wrong("video", path.name, f"a name that ends in {', '.join(FORMATS)}")
 
 
 def _write_mp4(frames: Iterator[Image.Image], path: Path, rate: float) -> None:

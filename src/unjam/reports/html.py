@@ -15,7 +15,7 @@ from markupsafe import Markup
 from matplotlib.figure import Figure
 
 from unjam import __version__
-from unjam.files import check_folder, write_whole
+from unjam.files import DAMAGED, check_folder, write_whole
 from unjam.measures.statistics import estimate_of
 from unjam.measures.table import headings_of, table_of
 from unjam.reports.figures import (
@@ -29,7 +29,7 @@ from unjam.reports.figures import (
 from unjam.reports.film import split_lines
 from unjam.reports.lanes import drawn_by_lane, space_time_of
 from unjam.reports.model import errors, examples, model_section, trust
-from unjam.reports.results import DAMAGED, Results, Shown, command_to_repeat, damaged, read_results
+from unjam.reports.results import Results, Shown, command_to_repeat, damaged, read_results
 from unjam.reports.story import (
     against_people,
     baseline_of_columns,

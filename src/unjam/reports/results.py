@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from safetensors import SafetensorError
 from safetensors.numpy import load_file
 
 from unjam.errors import InputError
+from unjam.files import DAMAGED
 from unjam.measures.metrics import METRICS
 from unjam.worlds.record import Episode
 
@@ -93,13 +93,6 @@ def unpacked(arrays: dict[str, Any]) -> dict[str, Any]:
             whole[name] = np.full((*there.shape, *array.shape[1:]), np.nan, np.float32)
             whole[name][there] = np.where(array == IN_NO_LANE, np.nan, array) if name == "lanes" else array
     return {**arrays, **whole}
-
-
-DAMAGED = (
-    *(OSError, ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RecursionError),
-    SafetensorError,
-)
-"""what reading results can raise where they are not what unjam writes"""
 
 
 @dataclass(frozen=True)

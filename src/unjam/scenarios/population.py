@@ -12,13 +12,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
 from unjam import __version__
 from unjam.drivers.network import Network, network_arrays, network_from_arrays
 from unjam.errors import InputError
-from unjam.files import to_json, write_whole
+from unjam.files import DAMAGED, to_json, write_whole
 from unjam.parameters import build
 from unjam.physics.arrays import Array, clip, namespace
 from unjam.physics.idm import PARAMETER_NAMES, IDMParameters
@@ -164,15 +163,7 @@ def _read(path: Path, changed: int, size: int) -> Population:
             ),
             about={key: value for key, value in content.items() if key not in WRITTEN},
         )
-    except (
-        OSError,
-        ValueError,
-        KeyError,
-        TypeError,
-        AttributeError,
-        RecursionError,
-        SafetensorError,
-    ) as error:
+    except DAMAGED as error:
         words = f"no {error}" if isinstance(error, KeyError) else " ".join(str(error).split())
         raise InputError(f"population {path.name}: not a population: {words}") from None
 

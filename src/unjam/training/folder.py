@@ -11,14 +11,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from safetensors import SafetensorError
-
 from unjam.controller import make_driver
 from unjam.controller.file import hash_of
 from unjam.drivers.driver import Driver
 from unjam.drivers.observation import feature, observation_size
 from unjam.errors import InputError
-from unjam.files import is_leftover, make_folder, to_json, write_folder, write_whole
+from unjam.files import DAMAGED, is_leftover, make_folder, to_json, write_folder, write_whole
 from unjam.manifest import manifest, package_versions
 from unjam.processes import LOCK
 from unjam.reports.results import read_progress
@@ -207,7 +205,7 @@ def load_checkpoint(folder: Path) -> "tuple[dict[str, Any], Tensors] | None":
             if state.pop("sha256") != _hash(state, data):
                 continue
             found, known = state.pop("format", 1), load(data)
-        except (OSError, ValueError, KeyError, TypeError, AttributeError, SafetensorError):
+        except DAMAGED:
             continue
         if found != FORMAT:
             raise InputError(

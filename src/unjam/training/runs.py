@@ -8,10 +8,11 @@ from pathlib import Path
 from typing import Any, Literal
 
 from unjam.errors import InputError, UnjamError
+from unjam.files import DAMAGED
 from unjam.measures.statistics import Estimate, paired_difference
 from unjam.parameters import flat
 from unjam.processes import is_owned, owned
-from unjam.reports.results import DAMAGED, EVALUATION_FILE, damaged, read_about, read_progress
+from unjam.reports.results import EVALUATION_FILE, damaged, read_about, read_progress
 from unjam.training.config import RunConfig
 from unjam.training.folder import MANIFEST, gave_up, read_config
 

@@ -6,6 +6,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from unjam.physics.arrays import Floats
+
 BEYOND = (3.5, 4.5, 9.0)
 """brakings that are counted [m/s2]: ISO 15622's above 20 m/s, a hard one, and what dry asphalt allows"""
 ROUNDING = 1e-6
@@ -17,8 +19,6 @@ MOVING_SPEED = 1.0
 """speed above which a time headway is a matter of safety [m/s]"""
 SHORT_HEADWAY = 1.0
 """[s]"""
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -9,11 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from unjam.drivers.local_state import LocalState
+from unjam.physics.arrays import Floats
 from unjam.worlds.audit import Audit
 from unjam.worlds.reward import Outcome, time_headway
 from unjam.worlds.world import Driven
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

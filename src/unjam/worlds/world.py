@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from unjam.drivers.command import Command, Limits, accelerations
 from unjam.drivers.local_state import LocalState
 from unjam.drivers.safety import Ahead
-from unjam.physics.arrays import Array
+from unjam.physics.arrays import Array, Floats
 from unjam.physics.kinematics import next_speed
 from unjam.tree import Arrays
 
@@ -18,7 +18,6 @@ Recorded = TypeVar("Recorded", covariant=True)
 
 OnProgress = Callable[[int], None]
 """called now and then with how many decisions have been made"""
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
