@@ -96,6 +96,11 @@ def test_merging_changes_neither_side() -> None:
         ({"tasks": [{"road": {"lenght": 3}}]}, "scenario ring.lenght: unknown name"),
         ({"road.vehicles": 1}, "scenario ring.vehicles: 1 is not allowed"),
         ({"road.length": [250, 230]}, "scenario ring.length: 230 m is not allowed as the largest"),
+        ({"scenario": "merge", "world": "batch"}, "world: batch is not allowed; allowed: sumo, for merge"),
+        (
+            {"world": "batch", "tasks": [{"scenario": "ring"}, {"scenario": "figure-eight"}]},
+            "world: batch is not allowed; allowed: sumo, for figure-eight",
+        ),
     ],
 )
 def test_a_wrong_value_gets_one_line_that_begins_with_its_name(changes: dict[str, Any], words: str) -> None:

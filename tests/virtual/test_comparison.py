@@ -6,8 +6,9 @@ from tests.virtual.little_world import RING, LittleWorld, actual_data
 from unjam.drivers import IDM, ResidualDriver
 from unjam.virtual.comparison import ReturnGap, one_step_errors, open_loop, recorded, replay, return_gap
 from unjam.virtual.data import ActualData
+from unjam.virtual.ensemble import torch_generator
 from unjam.virtual.fitting import fit
-from unjam.virtual.model import NUMBERS, EnvironmentModel, torch_generator
+from unjam.virtual.model import NUMBERS, EnvironmentModel
 from unjam.virtual.rollout import begin, imagine
 from unjam.virtual.settings import VirtualSettings
 

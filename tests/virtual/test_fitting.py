@@ -9,8 +9,9 @@ from tests.virtual.little_world import RING, LittleWorld, actual_data
 from unjam.drivers import IDM, ResidualDriver
 from unjam.errors import UnjamError
 from unjam.virtual.data import ActualData, Transitions
+from unjam.virtual.ensemble import predict
 from unjam.virtual.fitting import Fit, fit, targets_of
-from unjam.virtual.model import NOISE_ROWS, TARGETS, EnvironmentModel, model_inputs, predict
+from unjam.virtual.model import NOISE_ROWS, TARGETS, EnvironmentModel, model_inputs
 from unjam.virtual.settings import VirtualSettings
 
 SETTINGS = VirtualSettings(members=3, hidden=(32,), epochs=25, patience=6, batch=128, rate=1e-2)

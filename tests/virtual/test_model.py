@@ -4,16 +4,8 @@ from torch.testing import assert_close
 
 from unjam.drivers import LocalState
 from unjam.drivers.from_file import random_state
-from unjam.virtual.model import (
-    BLOCK,
-    NUMBERS,
-    TARGETS,
-    EnvironmentModel,
-    model_inputs,
-    predict,
-    random_members,
-    torch_generator,
-)
+from unjam.virtual.ensemble import BLOCK, predict, random_members, torch_generator
+from unjam.virtual.model import NUMBERS, TARGETS, EnvironmentModel, model_inputs
 from unjam.virtual.settings import VirtualSettings
 
 SETTINGS = VirtualSettings(members=3, hidden=(16, 8))

@@ -16,7 +16,8 @@ from unjam.drivers.from_file import FileDriver
 from unjam.drivers.observation import FeatureName, observation_size
 from unjam.errors import UnjamError
 from unjam.virtual.data import ActualData
-from unjam.virtual.model import EnvironmentModel, torch_generator
+from unjam.virtual.ensemble import torch_generator
+from unjam.virtual.model import EnvironmentModel
 from unjam.virtual.rollout import (
     Rollouts,
     begin,

@@ -16,7 +16,8 @@ from unjam.drivers.from_file import random_state
 from unjam.drivers.local_state import LARGEST_GAP
 from unjam.drivers.safety import Ahead
 from unjam.scenarios import Ring
-from unjam.virtual.model import NUMBERS, TARGETS, EnvironmentModel, base_reward, base_step, torch_generator
+from unjam.virtual.ensemble import torch_generator
+from unjam.virtual.model import NUMBERS, TARGETS, EnvironmentModel, base_reward, base_step
 from unjam.virtual.settings import VirtualSettings
 from unjam.virtual.world import BOUNDS, VirtualDynamics, reward_on_tensors
 from unjam.worlds.reward import Outcome, make_reward

@@ -19,8 +19,9 @@ from unjam.learners.settings import PolicySettings
 from unjam.physics.idm import IDMParameters
 from unjam.virtual.comparison import return_gap
 from unjam.virtual.data import ActualData, pack_data, unpack_data
+from unjam.virtual.ensemble import torch_generator
 from unjam.virtual.fitting import fit
-from unjam.virtual.model import EnvironmentModel, torch_generator
+from unjam.virtual.model import EnvironmentModel
 from unjam.virtual.rollout import Rollouts, begin, draw_starts, imagine, return_bound, rollout_length
 from unjam.virtual.settings import VirtualSettings
 from unjam.virtual.world import VirtualDynamics

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, field, replace
 from math import ceil
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import tomli_w
 from pydantic import AfterValidator, Field, model_validator
@@ -23,6 +23,7 @@ from unjam.scenarios.scenario import Scenario
 from unjam.training.presets import preset_values
 from unjam.training.seeds import TRAINING_BELOW
 from unjam.virtual.settings import VirtualSettings
+from unjam.worlds.batch.world import why_not
 from unjam.worlds.episode import Task
 
 
@@ -82,6 +83,9 @@ class RunConfig(Agents):
     seed: Annotated[int, Field(ge=0, lt=TRAINING_BELOW)] = 0
     """of the whole run; numbers from a million on are those of the episodes that judge"""
     workers: Count = 2
+    world: Literal["sumo", "batch"] = "sumo"
+    """where episodes of training and validation are driven: in SUMO, or, on rings, all of an iteration at
+    once in what equals it but for rounding; it pays where iterations are large. SUMO judges in any case"""
     spread: bool = True
     """whether the episodes of an iteration, and of a validation, cover the range of what they draw (the
     ring's lengths) evenly"""
@@ -97,7 +101,9 @@ class RunConfig(Agents):
     @model_validator(mode="after")
     def _possible(self) -> "RunConfig":
         for road in (self, *self.roads().values()):
-            road.make_scenario()
+            scenario = road.make_scenario()
+            if self.world == "batch" and (road is not self or not self.tasks) and (why := why_not(scenario)):
+                raise ValueError(f"world: batch is not allowed; allowed: sumo, for {why}")
         return self
 
     def roads(self) -> dict[str, "RunConfig"]:

@@ -26,7 +26,8 @@ from unjam.scenarios.ring import Ring
 from unjam.scenarios.scenario import Scenario
 from unjam.training.executors import OnLine
 from unjam.virtual.data import ActualData
-from unjam.virtual.model import EnvironmentModel, torch_generator
+from unjam.virtual.ensemble import torch_generator
+from unjam.virtual.model import EnvironmentModel
 from unjam.virtual.rollout import begin, draw_starts, imagine
 from unjam.virtual.settings import VirtualSettings
 from unjam.virtual.world import VirtualDynamics, on_device

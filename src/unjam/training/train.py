@@ -41,6 +41,7 @@ from unjam.training.folder import (
 )
 from unjam.training.model_facts import write_model_facts
 from unjam.training.seeds import VALIDATE
+from unjam.worlds.batch.run import run_batches
 from unjam.worlds.workers import EpisodeTask, Workers
 
 MEANS = (
@@ -280,7 +281,7 @@ class Trainer:
             for part in range(count):
                 scenario = task.scenario.part(part, count) if self.config.spread else task.scenario
                 wanted.append(EpisodeTask(scenario, driver, (*seed, len(wanted)), task.reward, explore))
-        episodes = self.workers.run(wanted)
+        episodes = run_batches(wanted) if self.config.world == "batch" else self.workers.run(wanted)
         raise_failure([measure(episode) for episode in episodes if not episode.ok])
         ends = np.cumsum(counts)
         return [episodes[end - count : end] for end, count in zip(ends, counts, strict=True)]

@@ -13,8 +13,9 @@ from unjam.drivers.driver import Driver, Memory
 from unjam.drivers.local_state import LocalState
 from unjam.scenarios.scenario import Scenario
 from unjam.virtual.data import ActualData, Transitions
-from unjam.virtual.fitting import OneStepErrors, answers_of, targets_of
-from unjam.virtual.model import NUMBERS, EnvironmentModel, model_inputs, torch_generator
+from unjam.virtual.ensemble import torch_generator
+from unjam.virtual.fitting import OneStepErrors, targets_of
+from unjam.virtual.model import NUMBERS, EnvironmentModel, model_inputs
 from unjam.virtual.rollout import ImaginedWorld, Rollouts, Starts
 from unjam.virtual.world import VirtualDynamics, on_device
 from unjam.worlds.drive import Drive
@@ -105,7 +106,7 @@ def one_step_errors(
     """Return the errors of base and model in predicting each of the actual decisions."""
     wanted, changed = (targets_of(actual, base, scenario, reward) for base in (model.base, "none"))
     inputs = torch.as_tensor(model_inputs(actual.states, actual.applied, actual.drawn))
-    answers = answers_of(model, inputs.to(model.input_mean.device))
+    answers = model.answers(inputs.to(model.input_mean.device))
     return OneStepErrors(wanted, answers * model.learned.cpu().numpy(), changed)  # elsewhere the base is used
 
 

@@ -8,12 +8,10 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
-from torch import Tensor
 
-from unjam.errors import UnjamError
 from unjam.scenarios.scenario import Scenario
 from unjam.virtual.data import Transitions
+from unjam.virtual.ensemble import SMALLEST_CHANGE, teach
 from unjam.virtual.model import (
     NOISE_ROWS,
     NUMBERS,
@@ -26,9 +24,6 @@ from unjam.virtual.model import (
 from unjam.virtual.settings import VirtualSettings
 from unjam.worlds.record import Floats
 from unjam.worlds.reward import make_reward
-
-SMALLEST_CHANGE = 1e-4
-"""what varies by less than this is as good as constant [m/s, m, reward]"""
 
 
 class OneStep(NamedTuple):
@@ -112,33 +107,21 @@ def fit(
     device = model.input_mean.device
     inputs = torch.as_tensor(model_inputs(actual.states, actual.applied, actual.drawn)).to(device)
     targets = torch.as_tensor(targets_of(actual, model.base, scenario, reward)).to(device)
-    training = _some(~actual.held_out, settings.fit_rows, generator)
-    holdout = _some(actual.held_out, max(1, round(settings.fit_rows * settings.holdout)), generator)
-    model.normalise(inputs[training], targets[training], SMALLEST_CHANGE)
     model.reward_range.copy_(torch.stack([targets[:, -1].min(), targets[:, -1].max()]))
-
-    bootstrap = training[generator.integers(len(training), size=(model.members, len(training)))]
-    seen, normalised = model.seen(inputs), ((targets - model.target_mean) / model.target_scale).float()
-    learned_from, judged_by = ((seen[rows], normalised[rows]) for rows in (bootstrap, holdout))
-    last_loss, epochs = _descend(model, learned_from, judged_by, settings, generator)
-
-    wanted, predicted = targets[holdout].cpu().numpy(), answers_of(model, inputs[holdout])
-    learned = np.square(wanted - predicted).mean((0, 1)) < np.square(wanted).mean(0)
-    predicted = predicted * learned  # where the base is better, it is used alone
-    error = wanted - predicted.mean(0)
+    found = teach(model, inputs, targets, actual.held_out, settings, generator)
+    error = found.wanted - found.predicted.mean(0)
     noise = error[generator.integers(len(error), size=NOISE_ROWS)] - error.mean(0)
-    model.learned.copy_(torch.as_tensor(learned))
     model.noise.copy_(torch.as_tensor(noise))
 
-    change = targets_of(actual.chosen(holdout), "none", scenario, reward)
-    steps = OneStepErrors(wanted, predicted, change).by_number()
+    change = targets_of(actual.chosen(found.holdout), "none", scenario, reward)
+    steps = OneStepErrors(found.wanted, found.predicted, change).by_number()
     errors = {
         "unexplained": unexplained([steps[name] for name in NUMBERS]),
-        "total_variation": total_variation(predicted[:, :, :-1], error[:, :-1].std(0)),
-        "released": last_loss,
+        "total_variation": total_variation(found.predicted[:, :, :-1], error[:, :-1].std(0)),
+        "released": found.loss,
     }
-    names = tuple(itertools.compress(TARGETS, learned))
-    return Fit(errors, steps, names, len(training), len(holdout), epochs)
+    names = tuple(itertools.compress(TARGETS, model.learned.tolist()))
+    return Fit(errors, steps, names, found.rows, len(found.holdout), found.epochs)
 
 
 def targets_of(actual: Transitions, base: str, scenario: Scenario, reward: str) -> Floats:
@@ -151,16 +134,6 @@ def targets_of(actual: Transitions, base: str, scenario: Scenario, reward: str) 
     known_reward = base_reward(base, earned, actual.following, actual.applied, actual.crashed)
     residual = [getattr(actual.following, name) - getattr(known, name) for name in NUMBERS]
     return np.column_stack([*residual, actual.reward - known_reward])
-
-
-@torch.no_grad()
-def answers_of(model: EnvironmentModel, inputs: Tensor) -> Floats:
-    """Return what each member answers to the same rows, SI units, shape (members, rows, 6).
-
-    Also where the base is better.
-    """
-    answers = model(model.seen(inputs)) * model.target_scale + model.target_mean
-    return answers.double().cpu().numpy()
 
 
 def root_mean_square(values: Floats) -> float:
@@ -194,54 +167,3 @@ def total_variation(predicted: Floats, noise: Floats) -> float:
     variance = predicted.var(0, ddof=1) / np.square(noise.clip(SMALLEST_CHANGE))
     distance = torch.as_tensor(np.sqrt(variance.sum(-1)))
     return float(torch.erf(distance / (2.0 * sqrt(2.0))).mean())
-
-
-def _some(chosen: NDArray[np.bool_], most: int, generator: np.random.Generator) -> NDArray[np.int64]:
-    """Return the indices of at most so many of the chosen rows."""
-    rows = np.flatnonzero(chosen)
-    return generator.permutation(rows)[:most]
-
-
-def _descend(
-    model: EnvironmentModel,
-    training: tuple[Tensor, Tensor],
-    holdout: tuple[Tensor, Tensor],
-    settings: VirtualSettings,
-    generator: np.random.Generator,
-) -> tuple[float, int]:
-    """Train until the holdout does not improve; return the last training loss and the passes made."""
-    seen, wanted = training
-    device, rows = seen.device, seen.shape[1]
-    parameters = [*model.weights, *model.biases]
-    optimizer = torch.optim.Adam(parameters, lr=settings.rate, fused=True)
-    best = [parameter.detach().clone() for parameter in parameters]
-    best_loss, waited, passes, last_loss = _losses(model, *holdout), 0, 0, float("nan")
-    while passes < settings.epochs and waited < settings.patience:
-        order = torch.as_tensor(generator.permutation(rows)).to(device)
-        total = torch.zeros((), device=device)
-        for batch in order.split(settings.batch):
-            loss = (model(seen[:, batch]) - wanted[:, batch]).square().mean((1, 2)).sum()
-            optimizer.zero_grad()
-            loss.backward()
-            optimizer.step()
-            total += loss.detach() * len(batch)
-        passes += 1
-        last_loss = total.item() / (rows * model.members)
-        found = _losses(model, *holdout)
-        if not (np.isfinite(last_loss) and found.isfinite().all()):
-            raise UnjamError(f"virtual environment: the loss in pass {passes} of its fit is not finite")
-        better = found < best_loss
-        best_loss = torch.where(better, found, best_loss)
-        waited = 0 if better.any() else waited + 1
-        for kept, parameter in zip(best, parameters, strict=True):
-            kept.copy_(torch.where(better[:, None, None], parameter.detach(), kept))
-    with torch.no_grad():
-        for kept, parameter in zip(best, parameters, strict=True):
-            parameter.copy_(kept)
-    return last_loss, passes
-
-
-@torch.no_grad()
-def _losses(model: EnvironmentModel, seen: Tensor, wanted: Tensor) -> Tensor:
-    """Return each member's mean squared error, shape (members,)."""
-    return (model(seen) - wanted).square().mean((1, 2))

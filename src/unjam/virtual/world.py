@@ -15,6 +15,7 @@ from unjam.drivers.safety import Ahead
 from unjam.physics.kinematics import distance_driven
 from unjam.scenarios.scenario import Scenario
 from unjam.tree import mapped
+from unjam.virtual.ensemble import predict, random_members
 from unjam.virtual.model import (
     NOISE_ROWS,
     NUMBERS,
@@ -24,8 +25,6 @@ from unjam.virtual.model import (
     base_step,
     largest_gap,
     model_inputs,
-    predict,
-    random_members,
 )
 from unjam.worlds.reward import Outcome, Reward, make_reward
 

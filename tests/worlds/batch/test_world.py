@@ -19,7 +19,7 @@ from unjam.measures.metrics import measure
 from unjam.scenarios import FigureEight, Ring
 from unjam.scenarios.population import Population, write_population
 from unjam.training.speed import neural_driver
-from unjam.worlds.batch.run import begin, run_batch
+from unjam.worlds.batch.run import begin, run_batch, run_batches
 from unjam.worlds.batch.world import RingBatch, why_not
 from unjam.worlds.drive import driven_to_the_end
 from unjam.worlds.episode import run_episode
@@ -231,6 +231,21 @@ def test_rings_differ_in_their_lengths_alone() -> None:
     other = [*tasks(SHORT, driver, (1,)), *tasks(SHORT, named_driver("idm", 0.1), (2,))]
     with pytest.raises(InputError, match="differ in driver"):
         run_batch(other)
+
+
+def test_rings_of_many_kinds_come_back_in_their_order() -> None:
+    pi, idm = (named_driver(name, 0.1) for name in ("pi", "idm"))
+    asked = [
+        EpisodeTask(SHORT.part(1, 2), pi, (1,)),
+        EpisodeTask(replace(SHORT, cavs=2), pi, (2,)),
+        EpisodeTask(SHORT.part(0, 2), pi, (3,)),
+        EpisodeTask(SHORT.part(0, 2), idm, (4,)),
+    ]
+    found = run_batches(asked)
+    assert [episode.seed for episode in found] == [(1,), (2,), (3,), (4,)]
+    for episode, task in zip(found, asked, strict=True):
+        (alone,) = run_batch([task])
+        assert np.array_equal(episode.speeds, alone.speeds)
 
 
 class Broken(Driver):

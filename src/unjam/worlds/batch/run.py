@@ -1,6 +1,7 @@
 """Episodes of many rings at once, instead of one after the other in SUMO."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import cast
 
 import numpy as np
@@ -18,6 +19,9 @@ from unjam.worlds.episode import rewarded
 from unjam.worlds.record import Episode
 from unjam.worlds.reward import make_reward
 from unjam.worlds.workers import EpisodeTask
+
+MOST = 128
+"""rings that are stepped at once at most, where whole episodes are kept: some 130 MB for 22 vehicles each"""
 
 
 def begin(world: RingBatch, driver: Driver, numbers: Numbers = np.asarray, explore: bool = False) -> Drive:
@@ -47,13 +51,34 @@ def run_batch(tasks: Sequence[EpisodeTask], numbers: Numbers = np.asarray) -> li
         InputError: the tasks differ in more, or `batch.world.why_not` says why they cannot be run so.
     """
     first = tasks[0]
-    if any(
-        (each.driver, each.reward, each.explore) != (first.driver, first.reward, first.explore)
-        for each in tasks
-    ):
+    if any(_driven(each) != _driven(first) for each in tasks):
         raise InputError("batch: the tasks differ in driver, reward or exploration, or want fuel")
     scenarios, seeds = [cast(Ring, each.scenario) for each in tasks], [each.seed for each in tasks]
     world = RingBatch(scenarios, seeds, numbers, first.reward)
     rings: Rings = driven_to_the_end(begin(world, first.driver, numbers, first.explore))
     earned = make_reward(first.reward or first.scenario.reward)
     return [rewarded(episode, earned) for episode in rings.episodes]
+
+
+def run_batches(tasks: Sequence[EpisodeTask]) -> list[Episode]:
+    """Return the episodes of tasks on rings of any kinds, in their order; those that are alike at once."""
+    batches: list[dict[int, EpisodeTask]] = []
+    for index, task in enumerate(tasks):
+        fits = (batch for batch in batches if len(batch) < MOST and _alike(task, next(iter(batch.values()))))
+        batch = next(fits, None)
+        if batch is None:
+            batches.append(batch := {})
+        batch[index] = task
+    found: dict[int, Episode] = {}
+    for batch in batches:
+        found |= zip(batch, run_batch(list(batch.values())), strict=True)
+    return [found[index] for index in range(len(tasks))]
+
+
+def _driven(task: EpisodeTask) -> tuple[Driver, str, bool]:
+    return task.driver, task.reward, task.explore
+
+
+def _alike(one: EpisodeTask, other: EpisodeTask) -> bool:
+    ring, length = cast(Ring, one.scenario), cast(Ring, other.scenario).length
+    return _driven(one) == _driven(other) and replace(ring, length=length) == other.scenario
