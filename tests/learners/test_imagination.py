@@ -15,7 +15,7 @@ from unjam.drivers.observation import observation_size
 from unjam.drivers.residual import ResidualDriver
 from unjam.learners.algorithm_1 import Collected, Iteration, algorithm_1, begin_training
 from unjam.learners.experience import join
-from unjam.learners.imagination import Imagination, rollout_experience
+from unjam.learners.imagination import RowImagination, rollout_experience
 from unjam.learners.learner import Update
 from unjam.learners.settings import (
     AGENTS,
@@ -190,7 +190,7 @@ def test_the_advantage_at_the_cut_goes_on_with_the_value_of_where_it_ended(share
 def test_rollouts_begin_in_the_newest_episodes_and_are_as_many_as_asked(
     shared: Simulation,
 ) -> None:
-    imagination = Imagination(replace(VIRTUAL, virtual_ratio=3.0), TASK, POLICY, 0)
+    imagination = RowImagination(replace(VIRTUAL, virtual_ratio=3.0), TASK, POLICY, 0)
     network = random_network(INPUTS, scale=0.1)
     driver = ResidualDriver(PISaturation(), network, 1.0, POLICY.observe, 10)
     for iteration in (1, 2):
@@ -198,7 +198,7 @@ def test_rollouts_begin_in_the_newest_episodes_and_are_as_many_as_asked(
             run_episode(RING, driver, (9, iteration, n), explore=True, simulation=shared) for n in (0, 1)
         ]
         imagination.learn(episodes, iteration)
-    rollouts = cast(Rollouts, imagination.imagine(network, 2))
+    rollouts = cast(Rollouts, imagination.rollouts(network, 2))
     assert imagination.k_star == 30
     assert rollouts.rewards.numel() == 3 * 240 / 10
     assert set(rollouts.start[:, 0]) == {2, 3}
@@ -245,7 +245,7 @@ def test_what_is_told_of_the_virtual_environment_is_whole(shared: Simulation) ->
 
 
 def test_what_is_known_of_people_survives_a_stop(shared: Simulation) -> None:
-    one, other = (Imagination(VIRTUAL, TASK, POLICY, 0) for _ in range(2))
+    one, other = (RowImagination(VIRTUAL, TASK, POLICY, 0) for _ in range(2))
     people = IDMParameters(time_headway=1.3, max_acceleration=0.8)
     one.scenario = replace(RING, humans=people)
     one.data.add([run_episode(RING, PISaturation(), (0,), simulation=shared)], RING)

@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -17,8 +18,9 @@ from unjam.drivers.network import Network
 from unjam.drivers.observation import observation_size
 from unjam.errors import UnjamError
 from unjam.learners.experience import Experience, experience_of, join
-from unjam.learners.imagination import Imagination, rollout_experience
+from unjam.learners.imagination import Imagination, RowImagination
 from unjam.learners.learner import AgentSpec, Learner, Tensors, Update, make_learner, policy_distance, under
+from unjam.learners.road_imagination import RoadImagination
 from unjam.learners.settings import LearnerSettings, PolicySettings
 from unjam.virtual.settings import VirtualSettings
 from unjam.worlds.episode import Task
@@ -43,7 +45,7 @@ class Training:
     """of the whole run"""
     learner: Learner
     """pi_theta and its value network"""
-    imaginations: Sequence[Imagination] = ()
+    imaginations: Sequence[Imagination[Any]] = ()
     """the virtual environment of each task, with its D_a; empty: model-free"""
     iteration: int = 0
     """iterations done"""
@@ -95,7 +97,8 @@ def begin_training(
     """Initialise pi_theta, the value network, T and an empty D_a (lines 1 and 2); pi_H is the tasks'."""
     imaginations = []
     if virtual.virtual_ratio > 0:
-        imaginations = [Imagination(virtual, task, policy, seed, index) for index, task in enumerate(tasks)]
+        kind = RoadImagination if virtual.model == "road" else RowImagination
+        imaginations = [kind(virtual, task, policy, seed, index) for index, task in enumerate(tasks)]
     inputs = observation_size(policy.observe, tasks[0].expert)
     drawn = np.zeros((1, len(tasks[0].scenario.drawn_ranges)))
     critic_inputs = seen_by_critic(tasks, policy, 0, drawn).shape[1]
@@ -217,12 +220,10 @@ def virtual_experience(training: Training, part: int, parts: int) -> Experience 
     """Return one of `parts` of what the policy as it is now does in the virtual environments, if anything."""
     network, found = training.learner.network(), []
     for index, imagination in enumerate(training.imaginations):
-        rollouts = imagination.imagine(network, training.iteration, part, parts)
-        if rollouts is not None:
-            drawn = rollouts.drawn.cpu().numpy()
-            extra = seen_by_critic(training.tasks, training.policy, index, drawn)
-            found.append(rollout_experience(rollouts, extra))
-    return join(found) if found else None
+        sees = partial(seen_by_critic, training.tasks, training.policy, index)
+        found.append(imagination.imagine(network, training.iteration, part, parts, sees))
+    imagined = [each for each in found if each is not None]
+    return join(imagined) if imagined else None
 
 
 def seen_by_critic(tasks: Sequence[Task], policy: PolicySettings, index: int, drawn: Floats) -> Floats:

@@ -1,9 +1,9 @@
 """What Algorithm 1 does between actual episodes: fit the virtual environment, and imagine in it."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 from math import ceil
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 import torch
@@ -19,18 +19,20 @@ from unjam.learners.settings import PolicySettings
 from unjam.physics.idm import IDMParameters
 from unjam.virtual.comparison import return_gap
 from unjam.virtual.data import ActualData, pack_data, unpack_data
-from unjam.virtual.ensemble import torch_generator
-from unjam.virtual.fitting import fit
+from unjam.virtual.ensemble import Ensemble, torch_generator
+from unjam.virtual.fitting import Fit, fit
 from unjam.virtual.model import EnvironmentModel
 from unjam.virtual.rollout import Rollouts, begin, draw_starts, imagine, return_bound, rollout_length
 from unjam.virtual.settings import VirtualSettings
 from unjam.virtual.world import VirtualDynamics
 from unjam.worlds.episode import Task
-from unjam.worlds.record import Episode
+from unjam.worlds.record import Episode, Floats
 
 FIT, STARTS, NOISE, EXPLORATION = 2, 3, 4, 5
 """what the random numbers of an iteration are for, in their seeds"""
 DATA = "data/"
+SeenByCritic = Callable[[Floats], Floats]
+"""from what episodes drew, shape (rows, m), to what the critic alone sees of it"""
 
 
 def full_policy(task: Task, policy: PolicySettings, network: Network) -> ResidualDriver:
@@ -39,8 +41,14 @@ def full_policy(task: Task, policy: PolicySettings, network: Network) -> Residua
     return ResidualDriver(task.expert, network, task.scenario.action_limit, policy.observe, hold)
 
 
-class Imagination:
-    """The virtual environment of a run, and the actual data that it learns from."""
+Model = TypeVar("Model", bound=Ensemble)
+
+
+class Imagination(Generic[Model]):
+    """The virtual environment of a run, and the actual data that it learns from.
+
+    What kind of environment it is, its heirs say: what is learned, and how one drives in it.
+    """
 
     def __init__(
         self, settings: VirtualSettings, task: Task, policy: PolicySettings, run_seed: int, index: int = 0
@@ -62,12 +70,29 @@ class Imagination:
         self._policy = policy
         self._run_seed = run_seed
         self._index = (index,) if index else ()
-        drawn = len(task.scenario.drawn_ranges)
-        self.model = EnvironmentModel(settings, drawn, self._seed(FIT), settings.device)
+        self.model = self._new_model()
         self.steps = 0
         """virtual decisions of all iterations so far"""
         self.facts: dict[str, Any] = {}
         """what there is to say of the virtual environment in this iteration"""
+
+    def _new_model(self) -> Model:
+        """Return a model that has learned nothing."""
+        raise NotImplementedError
+
+    def _fit(self, seed: Sequence[int]) -> Fit:
+        """Fit the model to D_a as it is now."""
+        raise NotImplementedError
+
+    def imagine(
+        self, network: Network, iteration: int, part: int, parts: int, seen_by_critic: SeenByCritic
+    ) -> Experience | None:
+        """Return what the policy `network` does in the virtual environment; None where it is not trusted.
+
+        Rollouts begin at random decisions of the newest actual episodes at which a residual was due. In all
+        `parts` of an iteration together they make `virtual_ratio` times as many decisions as those have.
+        """
+        raise NotImplementedError
 
     def _seed(self, *of: int) -> tuple[int, ...]:
         """Return a seed of the run's, the task's own."""
@@ -83,8 +108,7 @@ class Imagination:
         if settings.calibrate and first == 0:
             states = (kept.states for kept in self.data.recordings)
             self.scenario = replace(self.scenario, humans=calibrated_people(states, self.scenario))
-        actual, seed = self.data.transitions(settings.holdout), self._seed(iteration, FIT)
-        found = fit(self.model, actual, settings, self.scenario, self._task.reward, seed)
+        found = self._fit(self._seed(iteration, FIT))
         eps_m = found.errors[settings.error]
         self.k_star = rollout_length(eps_m, settings)
         self.facts = {
@@ -96,35 +120,10 @@ class Imagination:
             "epochs": found.epochs,
         }
 
-    def imagine(self, network: Network, iteration: int, part: int = 0, parts: int = 1) -> Rollouts | None:
-        """Return virtual rollouts with the policy `network`; None where there are none.
-
-        They begin at random decisions of the newest actual episodes at which a residual was due. In all
-        `parts` of an iteration together they make `virtual_ratio` times as many decisions as those have.
-        """
-        driver = full_policy(self._task, self._policy, network)
-        driven = self.k_star // driver.hold * driver.hold
-        if driven == 0:
-            return None
+    def _starts(self, parts: int, seed: tuple[int, ...], driven: int) -> NDArray[np.int64]:
+        """Return where a part of an iteration's rollouts of so many decisions begin, as `draw_starts`."""
         count = ceil(self.settings.virtual_ratio * self._actual / parts / driven)
-        seeds = [self._seed(iteration, purpose, part) for purpose in (STARTS, NOISE, EXPLORATION)]
-        choices = draw_starts(self.data, count, 1, seeds[0], self._first)
-        if len(choices) == 0:
-            return None
-        noise, exploration = (torch_generator(seed, self.settings.device) for seed in seeds[1:])
-        world = VirtualDynamics(self.model, self.scenario, self._task.reward, noise, self.settings.noise)
-        starts = begin(self.data, choices, self._task.expert, self.settings.device)
-        rollouts = imagine(driver, world, starts, driven, exploration)
-        self.steps += rollouts.decisions
-        if part == 0:  # the policy that drove the actual episodes: returns can be compared
-            gap = return_gap(rollouts, self.data, driven)
-            self.facts |= {
-                "return_virtual": gap and gap.virtual,
-                "return_actual": gap and gap.actual,
-                "crash_share": float(rollouts.terminated.double().mean()),
-                "bounded": rollouts.bounded,
-            }
-        return rollouts
+        return draw_starts(self.data, count, 1, seed, self._first)
 
     def bound(self, eps_pi: float, gamma: float) -> float:
         """Return the bound C for this iteration; `gamma` is that from choice to choice."""
@@ -157,6 +156,52 @@ class Imagination:
         self.steps = facts["steps"]
         self.scenario = replace(self.scenario, humans=IDMParameters(**facts["people"]))
         self.model.load_state_dict({n: t for n, t in tensors.items() if not n.startswith(DATA)})
+
+
+class RowImagination(Imagination[EnvironmentModel]):
+    """The paper's: a row is a CAV with its leader and its follower."""
+
+    def _new_model(self) -> EnvironmentModel:
+        drawn = len(self._task.scenario.drawn_ranges)
+        return EnvironmentModel(self.settings, drawn, self._seed(FIT), self.settings.device)
+
+    def _fit(self, seed: Sequence[int]) -> Fit:
+        actual = self.data.transitions(self.settings.holdout)
+        return fit(self.model, actual, self.settings, self.scenario, self._task.reward, seed)
+
+    def imagine(
+        self, network: Network, iteration: int, part: int, parts: int, seen_by_critic: SeenByCritic
+    ) -> Experience | None:
+        """Return what the policy `network` does with rows; None where there are none."""
+        rollouts = self.rollouts(network, iteration, part, parts)
+        if rollouts is None:
+            return None
+        return rollout_experience(rollouts, seen_by_critic(rollouts.drawn.cpu().numpy()))
+
+    def rollouts(self, network: Network, iteration: int, part: int = 0, parts: int = 1) -> Rollouts | None:
+        """Return the virtual rollouts of rows; None where there are none."""
+        driver = full_policy(self._task, self._policy, network)
+        driven = self.k_star // driver.hold * driver.hold
+        if driven == 0:
+            return None
+        seeds = [self._seed(iteration, purpose, part) for purpose in (STARTS, NOISE, EXPLORATION)]
+        choices = self._starts(parts, seeds[0], driven)
+        if len(choices) == 0:
+            return None
+        noise, exploration = (torch_generator(seed, self.settings.device) for seed in seeds[1:])
+        world = VirtualDynamics(self.model, self.scenario, self._task.reward, noise, self.settings.noise)
+        starts = begin(self.data, choices, self._task.expert, self.settings.device)
+        rollouts = imagine(driver, world, starts, driven, exploration)
+        self.steps += rollouts.decisions
+        if part == 0:  # the policy that drove the actual episodes: returns can be compared
+            gap = return_gap(rollouts, self.data, driven)
+            self.facts |= {
+                "return_virtual": gap and gap.virtual,
+                "return_actual": gap and gap.actual,
+                "crash_share": float(rollouts.terminated.double().mean()),
+                "bounded": rollouts.bounded,
+            }
+        return rollouts
 
 
 def rollout_experience(rollouts: Rollouts, critic_inputs: NDArray[np.floating]) -> Experience:

@@ -63,6 +63,10 @@ def check_possible(config: RunConfig) -> None:
         make_reward(road.reward or scenario.reward)
         for name in road.evaluation.baselines:
             make_driver(name, scenario.decision_step)
+        if config.virtual.model == "road" and config.virtual.virtual_ratio > 0:
+            from unjam.virtual.roads import check_roads  # which needs torch
+
+            check_roads(scenario)
     config.make_tasks()
 
 

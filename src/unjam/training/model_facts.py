@@ -13,7 +13,7 @@ import torch
 
 from unjam.errors import InputError
 from unjam.files import to_json, write_whole
-from unjam.learners.imagination import Imagination
+from unjam.learners.imagination import RowImagination
 from unjam.learners.learner import under
 from unjam.reports.results import MODEL_FILE, read_model, read_progress
 from unjam.scenarios.scenario import Scenario
@@ -55,6 +55,8 @@ def newest_model_facts(folder: Path, config: RunConfig) -> dict[str, Any]:
         raise InputError(
             f"run: {str(folder)!r} has no virtual environment: its virtual.virtual_ratio is 0; allowed: > 0"
         )
+    if config.virtual.model == "road":
+        raise InputError(f"run: {str(folder)!r} imagines whole roads; allowed: one with virtual.model=row")
     kept, progress = read_model(folder), read_progress(folder)
     if kept is None or not progress or kept.get("iteration") != progress[-1]["iteration"]:
         write_model_facts(folder, config)
@@ -84,7 +86,7 @@ def measure_model(folder: Path, config: RunConfig) -> dict[str, Any]:
     state, tensors = checkpoint
     settings = replace(config.virtual, device="cpu")
     (task,) = config.make_tasks()
-    imagination = Imagination(settings, task, config.policy, config.seed)
+    imagination = RowImagination(settings, task, config.policy, config.seed)
     imagination.restore(state[imagination.name], under(f"{imagination.name}/", tensors))
     scenario = imagination.scenario
     generator = np.random.default_rng(config.seed)
@@ -137,7 +139,9 @@ def decisions_ahead(stays: Sequence[int]) -> int:
     return min(LONGEST, max(1, int(np.median(stays)) // 2))
 
 
-def _replayed(imagination: Imagination, scenario: Scenario, generator: np.random.Generator) -> dict[str, Any]:
+def _replayed(
+    imagination: RowImagination, scenario: Scenario, generator: np.random.Generator
+) -> dict[str, Any]:
     """Return how recorded accelerations end in the virtual environment, without noise, and some examples."""
     data, model = imagination.data, imagination.model
     held_out = data.held_out(imagination.settings.holdout)
@@ -182,7 +186,7 @@ def _replayed(imagination: Imagination, scenario: Scenario, generator: np.random
     }
 
 
-def _bounds(imagination: Imagination, newest: dict[str, Any], gamma: float) -> dict[str, Any] | None:
+def _bounds(imagination: RowImagination, newest: dict[str, Any], gamma: float) -> dict[str, Any] | None:
     """Return the bound C by the length of rollouts for the newest row of progress; None without an eps_m."""
     eps_m = newest["virtual"]["eps_m_by_estimator"]["total_variation"]
     if eps_m is None:

@@ -3,9 +3,14 @@
 Sources: SUMO's MSCFModel_IDM (`_v`), MSCFModel (`finalizeSpeed`) and MSVehicle (`executeMove`).
 """
 
+from collections.abc import Callable
+
 from unjam.physics.arrays import Array, at_least, at_most
 from unjam.physics.idm import PARAMETER_NAMES, IDMParameters, IDMRows, by_squaring, idm_acceleration
 from unjam.physics.kinematics import next_speed
+
+People = Callable[[Array, Array, Array], Array]
+"""speeds, leaders' speeds and gaps to them, shape (vehicles, W), to the speeds after a step without noise"""
 
 SMALLEST_GAP = 1e-3
 """gap below which `_v` takes this one, SUMO's NUMERICAL_EPS [m]"""

@@ -6,7 +6,7 @@ from typing import cast
 
 import numpy as np
 
-from unjam.drivers.driver import Driver
+from unjam.drivers.driver import Driver, Memory
 from unjam.drivers.residual import AGE
 from unjam.errors import InputError
 from unjam.scenarios.ring import Ring
@@ -24,7 +24,13 @@ MOST = 128
 """rings that are stepped at once at most, where whole episodes are kept: some 130 MB for 22 vehicles each"""
 
 
-def begin(world: RingBatch, driver: Driver, numbers: Numbers = np.asarray, explore: bool = False) -> Drive:
+def begin(
+    world: RingBatch,
+    driver: Driver,
+    numbers: Numbers = np.asarray,
+    explore: bool = False,
+    memory: Memory | None = None,
+) -> Drive:
     """Return a driver who has just begun in a batch, and remembers in its arrays.
 
     Args:
@@ -32,8 +38,9 @@ def begin(world: RingBatch, driver: Driver, numbers: Numbers = np.asarray, explo
         driver: of every CAV; where arrays are tensors, one who takes them.
         numbers: makes the world's arrays.
         explore: whether what was learned adds its exploration noise.
+        memory: what the driver remembers already; None: nothing but what the world began with.
     """
-    driving = Drive(world, driver, explore)
+    driving = Drive(world, driver, explore, memory)
     driving.memory = mapped(numbers, driving.memory)
     if AGE in driving.memory:
         driving.memory[AGE] = 0.0  # all rows began together: no network is asked while residuals are held

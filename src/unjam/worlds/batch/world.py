@@ -25,7 +25,7 @@ from unjam.scenarios.scenario import VEHICLE_LENGTH, Scenario
 from unjam.worlds.audit import MOVING_SPEED
 from unjam.worlds.batch.lanes import CONTACT, Leader, end_of_lane, leaders, touching
 from unjam.worlds.batch.noise import Noise, Numbers, QuickNoise, SeededNoise
-from unjam.worlds.batch.people import people_speed, without_gap
+from unjam.worlds.batch.people import People, people_speed, without_gap
 from unjam.worlds.batch.record import RingLog, Rings, as_numpy
 from unjam.worlds.closed import HISTORY
 from unjam.worlds.reward import Outcome, make_reward, time_headway
@@ -67,6 +67,7 @@ class RingBatch:
         reward: str = "",
         keep: bool = True,
         draw: Callable[[tuple[int, ...]], Array] | None = None,
+        people: People | None = None,
     ) -> None:
         """Put the vehicles on the roads; nothing moves yet.
 
@@ -77,6 +78,7 @@ class RingBatch:
             reward: name; empty: the scenario's own.
             keep: whether all is kept for episodes, some 16 bytes for each vehicle and step in float64.
             draw: of all noise, for arrays of a shape; None: each ring draws what SUMO's episode would.
+            people: how they drive, where it is not as SUMO's IDM does.
 
         Raises:
             InputError: a scenario cannot be stepped so, or they are not alike.
@@ -105,7 +107,7 @@ class RingBatch:
         self._gap = numbers(gap_on_loop(start, np.roll(start, -1, 0), loops, VEHICLE_LENGTH))
         self._position = numbers(start)
         self._speed = numbers(np.zeros((vehicles + 1, worlds)))
-        self._people = _people(roads, scenario, numbers)
+        self._people, self._drives = _people(roads, scenario, numbers), people
         self._scale = numbers(np.full((vehicles, 1), scenario.noise_per_step * scenario.simulation_step))
         self._cars = Cars(scenario.safety, scenario.actuator, scenario.simulation_step)
         self._brakes = obedient_brakes(scenario) * scenario.simulation_step
@@ -127,6 +129,14 @@ class RingBatch:
         self._running, self._made = ring + 1.0, ring
         self._sums, self._driven, self._crashed = dict[str, Array](), ring, ring > 0.0
         self._headway, self._braking = each_cav + np.inf, each_cav
+
+    def place(self, speeds: Array, positions: Array) -> None:
+        """Put the vehicles elsewhere before the start: speeds and positions [m/s, m], shape (vehicles, W)."""
+        self._speed = self._numbers(np.concatenate([speeds, speeds[:1]]))
+        self._position = self._numbers(positions)
+        gap = gap_on_loop(positions, np.roll(positions, -1, 0), as_numpy(self._loop), VEHICLE_LENGTH)
+        self._gap = self._numbers(gap)
+        self._forget()
 
     def start(self, controlled: bool, on_progress: OnProgress | None = None) -> LocalState | None:
         """Run the warm-up, then hand the CAVs over, unless they stay human (`controlled` false).
@@ -216,6 +226,8 @@ class RingBatch:
     def _people_speed(self, speed: Array, ahead: Leader) -> Array:
         """Return the speeds after this step of all vehicles, if people drive them, shape (vehicles, W)."""
         people, step = self._people, self.scenario.simulation_step
+        if self._drives is not None:
+            return self._drives(speed, *ahead)
         if self._quick:
             return people_speed(speed, *ahead, people, step)
         seen = leaders(speed, self._position, ahead, self._loop, people, step)

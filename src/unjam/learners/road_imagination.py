@@ -1,0 +1,169 @@
+"""Imagining whole roads: everybody drives on, from recorded moments, and waves come and go."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any, cast
+
+import numpy as np
+import torch
+
+from unjam.drivers.driver import Memory
+from unjam.drivers.network import Network
+from unjam.drivers.residual import AGE, EXPERT, RESIDUAL
+from unjam.learners.experience import Experience, experience_of
+from unjam.learners.imagination import (
+    EXPLORATION,
+    FIT,
+    NOISE,
+    STARTS,
+    Imagination,
+    SeenByCritic,
+    full_policy,
+)
+from unjam.scenarios.ring import Ring
+from unjam.tree import mapped, pack, unpack
+from unjam.virtual.data import remembered
+from unjam.virtual.ensemble import torch_generator
+from unjam.virtual.fitting import Fit
+from unjam.virtual.roads import Moments, RoadModel, check_roads, fit_roads, moments_of, people_of
+from unjam.worlds.batch.run import begin
+from unjam.worlds.batch.world import RingBatch
+from unjam.worlds.drive import driven_to_the_end
+from unjam.worlds.episode import rewarded
+from unjam.worlds.record import Episode
+from unjam.worlds.reward import make_reward
+
+MOMENTS = "moments/"
+
+
+class RoadImagination(Imagination[RoadModel]):
+    """The virtual environment of a run as whole rings, and the actual data that it learns from."""
+
+    def __init__(self, *arguments: Any) -> None:
+        """Begin with the base alone, and without data; arguments are those of `Imagination`.
+
+        Raises:
+            InputError: whole roads cannot be imagined on the task's road.
+        """
+        super().__init__(*arguments)
+        check_roads(self.scenario)
+        self.moments: list[Moments] = []
+        """of the episodes in D_a, oldest first"""
+
+    def _new_model(self) -> RoadModel:
+        return RoadModel(self.settings, self._seed(FIT))
+
+    def learn(self, episodes: Sequence[Episode], iteration: int) -> None:
+        """Add actual episodes to D_a, fit the model to it, and find the rollout length of Eq. 15."""
+        first = self.data.episodes
+        self.moments += [moments_of(episode, first + place) for place, episode in enumerate(episodes)]
+        super().learn(episodes, iteration)
+
+    def _fit(self, seed: Sequence[int]) -> Fit:
+        oldest = self.data.recordings[0].episode
+        self.moments = [kept for kept in self.moments if kept.episode >= oldest]
+        return fit_roads(self.model, self.moments, self.settings, self.scenario, seed)
+
+    def imagine(
+        self, network: Network, iteration: int, part: int, parts: int, seen_by_critic: SeenByCritic
+    ) -> Experience | None:
+        """Return what the policy `network` does on imagined roads; None where they are not trusted."""
+        hold = full_policy(self._task, self._policy, network).hold
+        driven = self.k_star // hold * hold
+        if driven == 0:
+            return None
+        starts, *others = (self._seed(iteration, each, part) for each in (STARTS, NOISE, EXPLORATION))
+        cavs = len(self.scenario.possible_cavs())  # rows of each road
+        choices = self._starts(parts * cavs, starts, driven)
+        if len(choices) == 0:
+            return None
+        episodes = self._driven(network, choices, driven, others)
+        self.steps += sum(episode.steps for episode in episodes)
+        if part == 0:
+            self._compare(episodes, choices, driven)
+        places = [place for place, _ in choices]
+        pairs = [
+            (trajectory, self.data.recordings[place].drawn)
+            for place, episode in zip(places, episodes, strict=True)
+            for trajectory in episode.trajectories
+        ]
+        drawn = np.array([each for _, each in pairs])
+        return experience_of([trajectory for trajectory, _ in pairs], seen_by_critic(drawn))
+
+    def _driven(
+        self, network: Network, choices: Any, driven: int, seeds: Sequence[tuple[int, ...]]
+    ) -> list[Episode]:
+        """Return what follows the moments `choices`, rows (recording, decision), in so many decisions."""
+        ring, model = cast(Ring, self.scenario), self.model
+        by_episode = {kept.episode: kept for kept in self.moments}
+        kept = [by_episode[self.data.recordings[place].episode] for place, _ in choices]
+        at = [decision // each.every for each, (_, decision) in zip(kept, choices, strict=True)]
+        noise = float(model.noise) / ring.simulation_step / replace(ring, noise=1.0).noise_per_step
+        common = replace(
+            ring, horizon=driven, warmup=0, noise=noise if self.settings.noise else 0.0, population=""
+        )
+        rings = [replace(common, length=(round(each.length),) * 2) for each in kept]
+        members, draws = seeds
+        world = RingBatch(
+            rings,
+            [(0,)] * len(rings),
+            reward=self._task.reward,
+            draw=np.random.default_rng(list(draws)).standard_normal,
+            people=people_of(model, ring, torch_generator(members, "cpu")),
+        )
+        here = list(zip(kept, at, strict=True))
+        world.place(
+            np.stack([each.speeds[row] for each, row in here], 1),
+            np.stack([each.positions[row] for each, row in here], 1),
+        )
+        driver = full_policy(self._task, self._policy, network)
+        memory: Memory = {EXPERT: self._memory(choices, len(world.roads[0].cav_ids))}
+        if driver.hold > 1:
+            nothing = np.zeros(world.rows)
+            memory |= {RESIDUAL: nothing, AGE: nothing}
+        found = driven_to_the_end(begin(world, driver, explore=True, memory=memory))
+        earned = make_reward(self._task.reward or ring.reward)
+        return [rewarded(episode, earned) for episode in found.episodes]
+
+    def _memory(self, choices: Any, cavs: int) -> Memory:
+        """Return what the expert remembered at `choices`: all rows of the first CAV, then of the second."""
+        first: dict[int, int] = {}
+        for place, recording in enumerate(self.data.recordings):
+            first.setdefault(recording.episode, place)
+        firsts = np.array([first[self.data.recordings[place].episode] for place, _ in choices])
+        each = [
+            remembered(
+                self._task.expert, self.data.recordings, np.column_stack([firsts + cav, choices[:, 1]])
+            )
+            for cav in range(cavs)
+        ]
+        return mapped(lambda *values: np.concatenate(values), each[0], *each[1:])
+
+    def _compare(self, episodes: Sequence[Episode], choices: Any, driven: int) -> None:
+        """Note what the policy that drove the actual episodes earned here, and there."""
+        earned = [episode.reward.sum() for episode in episodes]
+        rewards = [self.data.recordings[place].reward[at : at + driven] for place, at in choices]
+        pairs = [
+            (one, other.sum()) for one, other in zip(earned, rewards, strict=True) if len(other) == driven
+        ]
+        virtual, actual = np.array(pairs).mean(0).tolist() if pairs else (None, None)
+        crashed = [episode.status == "collision" for episode in episodes]
+        self.facts |= {
+            "return_virtual": virtual,
+            "return_actual": actual,
+            "crash_share": float(np.mean(crashed)),
+            "bounded": {},
+        }
+
+    def state(self) -> tuple[dict[str, Any], dict[str, torch.Tensor]]:
+        """Return all that a run must keep of it to go on, as JSON and tensors."""
+        facts, tensors = super().state()
+        kept, arrays = pack(self.moments)
+        tensors |= {f"{MOMENTS}{name}": torch.from_numpy(np.array(array)) for name, array in arrays.items()}
+        return {**facts, "moments": kept}, tensors
+
+    def restore(self, facts: dict[str, Any], tensors: dict[str, torch.Tensor]) -> None:
+        """Go on from what `state` returned."""
+        arrays = {n.removeprefix(MOMENTS): t.numpy() for n, t in tensors.items() if n.startswith(MOMENTS)}
+        self.moments = unpack(list[Moments], facts["moments"], arrays)
+        super().restore(facts, {n: t for n, t in tensors.items() if not n.startswith(MOMENTS)})

@@ -1,0 +1,183 @@
+"""Whole roads as the virtual environment: how everybody drove, and how people are taken to drive on.
+
+People differ from the base in the same way, whoever they are and wherever they drive: one ensemble learns it
+from all of them. Their noise is known from the record: it changes speeds after everybody has moved, so that
+the way that a vehicle made tells how fast it meant to drive. What is left of an error is ignorance.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from math import nan, sqrt
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from unjam.drivers.local_state import LARGEST_GAP, LocalState
+from unjam.errors import InputError
+from unjam.physics.arrays import Array
+from unjam.physics.kinematics import gap_on_loop, next_speed
+from unjam.scenarios.ring import Ring
+from unjam.scenarios.scenario import VEHICLE_LENGTH, Scenario
+from unjam.virtual.data import is_held_out
+from unjam.virtual.ensemble import SMALLEST_CHANGE, Ensemble, predict, random_members, teach
+from unjam.virtual.fitting import Fit, OneStep, root_mean_square
+from unjam.virtual.model import BASES
+from unjam.virtual.settings import VirtualSettings
+from unjam.worlds.batch.people import People, people_speed
+from unjam.worlds.batch.world import why_not
+from unjam.worlds.record import Episode, Floats
+
+INPUTS = 4
+"""of the networks: speed, the leader's, the gap, and the speed after the step as the base has it"""
+MOVES = 0.5
+"""speed from which noise is not cut off at standstill [m/s]"""
+
+
+@dataclass(frozen=True)
+class Moments:
+    """Everybody on a closed road, at each decision of an episode at which a residual was due.
+
+    M moments, N vehicles in the order of the road.
+    """
+
+    episode: int
+    """number of the episode"""
+    every: int
+    """decisions from one moment to the next"""
+    length: float
+    """of the road [m]"""
+    people: Floats
+    """1 for people, 0 for CAVs, shape (N,)"""
+    speeds: Floats
+    """[m/s], shape (M, N)"""
+    positions: Floats
+    """front bumpers, not wrapped [m], shape (M, N)"""
+    moved: Floats
+    """how fast each moved in the decision that followed, before noise [m/s], shape (M, N)"""
+    after: Floats
+    """how fast each was then [m/s], shape (M, N)"""
+
+
+def check_roads(scenario: Scenario) -> None:
+    """Raise `InputError` where whole roads cannot be imagined on a scenario."""
+    why = why_not(scenario)
+    if isinstance(scenario, Ring) and scenario.steps_per_decision > 1:
+        why = f"{scenario.title}: steps_per_decision is {scenario.steps_per_decision}"
+    if why:
+        raise InputError(f"virtual.model: road is not allowed; allowed: row, for {why}")
+
+
+def moments_of(episode: Episode, number: int) -> Moments:
+    """Return what is kept of an actual episode, the so many-th."""
+    every = episode.trajectories[0].hold
+    at = np.arange(0, episode.steps, every)
+    return Moments(
+        episode=number,
+        every=every,
+        length=episode.loop_length,
+        people=np.array([float(name not in episode.cav_ids) for name in episode.vehicle_ids]),
+        speeds=episode.speeds[at],
+        positions=episode.positions[at],
+        moved=(episode.positions[at + 1] - episode.positions[at]) / episode.step,
+        after=episode.speeds[at + 1],
+    )
+
+
+class RoadModel(Ensemble):
+    """What people do beside the base, and how noisy they are."""
+
+    noise: Tensor
+
+    def __init__(self, settings: VirtualSettings, seed: Sequence[int]) -> None:
+        """Begin with the base alone."""
+        super().__init__(settings, INPUTS, 1, seed)
+        self.base = settings.base
+        self.register_buffer("noise", torch.zeros((), dtype=torch.float64))
+
+
+def known_speed(base: str, scenario: Scenario) -> People:
+    """Return how people drive as far as a base in `BASES` knows."""
+    make, step = BASES[base], scenario.simulation_step
+    if base == "idm":
+        return partial(people_speed, people=scenario.humans, step=step)
+    if make is None:
+        return lambda speed, leader_speed, gap: speed
+    person = make(scenario)
+
+    def driven(speed: Array, leader_speed: Array, gap: Array) -> Array:
+        state = LocalState(speed, leader_speed, gap, speed, LARGEST_GAP, nan, nan)
+        return next_speed(speed, person.act(state, {})[0], step)
+
+    return driven
+
+
+def _inputs(speed: Array, leader_speed: Array, gap: Array, known: Array) -> Tensor:
+    """Return what the networks see of vehicles of any shape, one row each."""
+    return torch.from_numpy(np.stack([each.ravel() for each in (speed, leader_speed, gap, known)], 1))
+
+
+def people_of(model: RoadModel, scenario: Scenario, generator: torch.Generator) -> People:
+    """Return how people drive in the virtual environment: the base, and what a random network adds to it."""
+    known = known_speed(model.base, scenario)
+    if not model.learned.any():
+        return known
+    layers = model.layers()
+
+    def driven(speed: Floats, leader_speed: Floats, gap: Floats) -> Floats:
+        base = known(speed, leader_speed, gap)
+        members = random_members(model.members, speed.size, generator)
+        residual = predict(layers, _inputs(speed, leader_speed, gap, base).float(), members)
+        return np.maximum(base + residual.numpy().reshape(speed.shape), 0.0)
+
+    return driven
+
+
+def fit_roads(
+    model: RoadModel,
+    kept: Sequence[Moments],
+    settings: VirtualSettings,
+    scenario: Scenario,
+    seed: Sequence[int],
+) -> Fit:
+    """Teach `model` what the base leaves of how people moved, and measure their noise.
+
+    The errors, of the speed alone: `unexplained` is the squared error on the holdout over the variance of
+    what there was to predict, `total_variation` that between the next speed as a member has it and as it
+    truly was drawn, with the noise known from the record: erf(|predicted - true mean| / (2 sqrt 2 sigma)).
+
+    Raises:
+        UnjamError: a loss is not finite.
+    """
+    generator = np.random.default_rng(np.random.SeedSequence(list(seed)))
+    known, columns = known_speed(model.base, scenario), []
+    for moments in kept:
+        ahead = np.roll(moments.positions, -1, 1)
+        gap = gap_on_loop(moments.positions, ahead, moments.length, VEHICLE_LENGTH)
+        seen = moments.speeds, np.roll(moments.speeds, -1, 1), gap
+        held = np.full(gap.shape, is_held_out(moments.episode, settings.holdout))
+        each = (*seen, known(*seen), moments.moved, moments.after, held)
+        columns.append(np.stack([values[:, moments.people > 0.0].ravel() for values in each]))
+    speed, leader_speed, gaps, base, moved, after, held = np.concatenate(columns, 1)
+    held_out = held > 0.0
+    if held_out.all() or not held_out.any():  # too few episodes: the last part of what was seen
+        held_out = np.arange(len(held)) >= (1.0 - settings.holdout) * len(held)
+    moves = moved > MOVES
+    sigma = float((after - moved)[moves].std()) if moves.any() else 0.0
+    model.noise.fill_(sigma)
+    targets = torch.from_numpy((moved - base)[:, None])
+    found = teach(model, _inputs(speed, leader_speed, gaps, base), targets, held_out, settings, generator)
+    if root_mean_square(found.wanted) < SMALLEST_CHANGE:  # the base knows all: what is left is rounding
+        model.learned.zero_()
+    wrong = found.wanted - found.predicted
+    change = (moved - speed)[found.holdout]
+    step = OneStep(root_mean_square(found.wanted), root_mean_square(wrong), float(change.std()))
+    distance = torch.as_tensor(np.abs(wrong)) / (2.0 * sqrt(2.0) * max(sigma, SMALLEST_CHANGE))
+    errors = {
+        "unexplained": (step.model / max(step.change, SMALLEST_CHANGE)) ** 2,
+        "total_variation": float(torch.erf(distance).mean()),
+        "released": found.loss,
+    }
+    learned = ("speed",) if model.learned.any() else ()
+    return Fit(errors, {"speed": step}, learned, found.rows, len(found.holdout), found.epochs)

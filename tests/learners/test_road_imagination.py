@@ -1,0 +1,88 @@
+"""Whole roads that are imagined: they are what would have happened."""
+
+import itertools
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from unjam.drivers import PISaturation
+from unjam.drivers.network import Network
+from unjam.drivers.observation import observation_size
+from unjam.learners.imagination import full_policy
+from unjam.learners.road_imagination import RoadImagination
+from unjam.learners.settings import PolicySettings
+from unjam.scenarios import Ring
+from unjam.virtual.settings import VirtualSettings
+from unjam.worlds.batch.run import run_batch
+from unjam.worlds.episode import Task
+from unjam.worlds.record import Episode
+from unjam.worlds.workers import EpisodeTask
+
+DECISIONS = 100
+RING = Ring(length=(220, 240), vehicles=20, cavs=2, horizon=400, warmup=0)
+POLICY = PolicySettings(hidden=(8,))
+VIRTUAL = VirtualSettings(model="road", k_max=DECISIONS, virtual_ratio=1.0)
+
+
+def network_of(exploration_std: float) -> Network:
+    generator = np.random.default_rng(3)
+    sizes = [observation_size(POLICY.observe, PISaturation()), 8, 1]
+    layers = [
+        (0.3 * generator.normal(size=(before, after)), 0.1 * generator.normal(size=after))
+        for before, after in itertools.pairwise(sizes)
+    ]
+    return Network(tuple(layers), 1.0, exploration_std)
+
+
+def imagined(ring: Ring, network: Network) -> tuple[RoadImagination, list[Episode]]:
+    """What a virtual environment has learned from four episodes, and these."""
+    task = Task(ring, PISaturation())
+    imagination = RoadImagination(VIRTUAL, task, POLICY, 0)
+    driver = full_policy(task, POLICY, network)
+    episodes = run_batch([EpisodeTask(ring, driver, (seed,), explore=True) for seed in range(4)])
+    imagination.learn(episodes, 1)
+    return imagination, episodes
+
+
+@pytest.mark.parametrize("warmup", [0, 300])
+def test_without_noise_it_is_what_happened(warmup: int) -> None:
+    network = network_of(0.0)
+    imagination, episodes = imagined(replace(RING, noise=0.0, warmup=warmup), network)
+    choices = np.array([[0, 0], [1, 130], [4, 20], [7, 290]])  # rows (recording, decision), two each
+    found = imagination._driven(network, choices, DECISIONS, [(1,), (2,)])
+    for episode, (recording, decision) in zip(found, choices, strict=True):
+        actual = episodes[recording // 2]
+        during = slice(decision, decision + DECISIONS + 1)
+        np.testing.assert_allclose(episode.speeds, actual.speeds[during], atol=1e-6)
+        np.testing.assert_allclose(episode.gaps, actual.gaps[during], atol=1e-5)
+        np.testing.assert_allclose(episode.reward, actual.reward[during][:DECISIONS], atol=1e-6)
+
+
+def test_with_noise_returns_are_those_of_the_road() -> None:
+    imagination, _ = imagined(RING, network_of(0.05))
+    found = imagination.imagine(network_of(0.05), 1, 0, 1, lambda drawn: drawn)
+    assert found is not None
+    assert len(found.rewards) == 2 * 4 * 400 / 10
+    assert found.observations.shape[1] == observation_size(POLICY.observe, PISaturation()) + 1
+    facts = imagination.facts
+    assert facts["return_virtual"] == pytest.approx(facts["return_actual"], rel=0.1)
+    assert facts["k_star"] == DECISIONS
+    assert imagination.steps == 4 * 400
+
+
+def test_a_model_that_is_not_trusted_imagines_nothing() -> None:
+    imagination, _ = imagined(RING, network_of(0.0))
+    imagination.k_star = 9
+    assert imagination.imagine(network_of(0.0), 1, 0, 1, lambda drawn: drawn) is None
+
+
+def test_it_survives_a_stop() -> None:
+    one, _ = imagined(RING, network_of(0.05))
+    other = RoadImagination(VIRTUAL, Task(RING, PISaturation()), POLICY, 0)
+    facts, tensors = one.state()
+    other.restore(json.loads(json.dumps(facts)), tensors)
+    assert len(other.moments) == 4
+    np.testing.assert_array_equal(other.moments[2].speeds, one.moments[2].speeds)
+    assert float(other.model.noise) == float(one.model.noise) > 0.0
