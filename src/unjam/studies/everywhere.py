@@ -71,14 +71,18 @@ def _write(studies: StudyFolder, seeds: int, folder: Path, workers: int) -> None
     with Workers(workers) as pool:
         for number, name, road, scenario in sorted(made, key=lambda each: not each[3].closed):  # quick first
             file = folder / f"{number:02d}.json"
-            if file.is_file():
-                continue
             group = next(group for group, kinds in GROUPS.items() if road.scenario in kinds)
-            tuned = {expert: expert for expert in TUNED[group]}
-            tried = _driven(scenario, tuned, tuning_seeds(EPISODES, 1000), pool)
-            best = max(tried, key=lambda expert: float(np.nanmean([worth(row) for row in tried[expert]])))
-            found = _driven(scenario, {PEOPLE: PEOPLE, best: best, **JUDGED}, held_out_seeds(EPISODES), pool)
-            write_whole(file, to_json({"road": name, "part": road.part, "best": best, "rows": found}))
+            found: dict[str, Any] = json.loads(file.read_text()) if file.is_file() else {}
+            if not found:
+                tuned = {expert: expert for expert in TUNED[group]}
+                tried = _driven(scenario, tuned, tuning_seeds(EPISODES, 1000), pool)
+                best = max(tried, key=lambda expert: float(np.nanmean([worth(row) for row in tried[expert]])))
+                found = {"road": name, "part": road.part, "best": best, "rows": {}}
+            asked = {PEOPLE: PEOPLE, found["best"]: found["best"], **JUDGED}
+            missing = {label: driver for label, driver in asked.items() if label not in found["rows"]}
+            if missing:  # also drivers that came later
+                found["rows"] |= _driven(scenario, missing, held_out_seeds(EPISODES), pool)
+                write_whole(file, to_json(found))
 
 
 def gains_of(folder: Path) -> dict[str, dict[str, Any]]:
