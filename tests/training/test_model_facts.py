@@ -10,6 +10,8 @@ from hypothesis import strategies as st
 
 from tests.training.test_run import STEPS, learn_with, small_config
 from unjam.errors import InputError
+from unjam.files import to_json
+from unjam.reports.model import waves
 from unjam.reports.results import MODEL_FILE, read_progress
 from unjam.training import model_facts
 from unjam.training.config import RunConfig
@@ -131,3 +133,32 @@ def test_at_least_half_of_the_stays_are_long_enough_to_be_replayed(stays: list[i
     ahead = decisions_ahead(stays)
     assert 1 <= ahead <= model_facts.LONGEST
     assert np.mean([stay >= ahead for stay in stays]) >= 0.5
+
+
+def test_a_run_that_imagines_whole_roads_shows_waves(tmp_path: Path) -> None:
+    changes = {"virtual__virtual_ratio": 1.0, "virtual__model": "road", "virtual__base": "none"}
+    config = small_config(**changes, virtual__members=2, steps=STEPS)
+    with Workers(1) as workers:
+        learn_with(workers, tmp_path / "run", config)
+    found = json.loads(to_json(measure_model(tmp_path / "run", config)))
+    shapes = [np.shape(found["waves"]["recorded"][name]) for name in ("speeds", "positions")]
+    assert shapes == [(10, 8)] * 2  # a moment a second, for ten seconds
+    assert found["step"] == pytest.approx(1.0)
+    assert len(found["cavs"]) == 1
+    titles = [axes.get_title(loc="left") or axes.get_title() for axes in waves(found).axes[:3]]
+    assert titles == ["recorded", "imagined", "nothing changes"]
+    with pytest.raises(InputError, match="imagines whole roads"):
+        newest_model_facts(tmp_path / "run", config)
+
+
+def test_a_run_that_imagines_whole_roads_goes_on_as_if_it_had_not_been_stopped(tmp_path: Path) -> None:
+    changes = {"virtual__virtual_ratio": 1.0, "virtual__model": "road", "virtual__members": 2}
+    ends = []
+    for stops in ([2 * STEPS], [STEPS, 2 * STEPS]):
+        folder = tmp_path / str(len(stops))
+        for steps in stops:
+            with Workers(1) as workers:
+                learn_with(workers, folder, small_config(**changes, steps=steps), resume=steps != stops[0])
+        ends.append([row["virtual"]["return_virtual"] for row in read_progress(folder)])
+    assert ends[0] == ends[1]
+    assert len(ends[0]) == 2

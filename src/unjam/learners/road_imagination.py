@@ -1,13 +1,15 @@
 """Imagining whole roads: everybody drives on, from recorded moments, and waves come and go."""
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any, cast
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
-from unjam.drivers.driver import Memory
+from unjam.drivers.driver import Driver, Memory
+from unjam.drivers.local_state import LocalState
 from unjam.drivers.network import Network
 from unjam.drivers.residual import AGE, EXPERT, RESIDUAL
 from unjam.learners.experience import Experience, experience_of
@@ -22,18 +24,43 @@ from unjam.learners.imagination import (
 )
 from unjam.scenarios.ring import Ring
 from unjam.tree import mapped, pack, unpack
-from unjam.virtual.data import remembered
+from unjam.virtual.data import is_held_out, remembered
 from unjam.virtual.ensemble import torch_generator
 from unjam.virtual.fitting import Fit
-from unjam.virtual.roads import Moments, RoadModel, check_roads, fit_roads, moments_of, people_of
+from unjam.virtual.roads import (
+    Moments,
+    RoadModel,
+    check_roads,
+    fit_roads,
+    known_speed,
+    moments_of,
+    people_of,
+)
+from unjam.worlds.batch.people import People
 from unjam.worlds.batch.run import begin
 from unjam.worlds.batch.world import RingBatch
 from unjam.worlds.drive import driven_to_the_end
 from unjam.worlds.episode import rewarded
-from unjam.worlds.record import Episode
+from unjam.worlds.record import Episode, Floats
 from unjam.worlds.reward import make_reward
 
 MOMENTS = "moments/"
+
+
+@dataclass(frozen=True)
+class Repeated(Driver):
+    """Accelerations that were recorded, one decision after the other."""
+
+    did: Floats
+    """[m/s2], shape (decisions, CAVs)"""
+
+    def initial_memory(self, n: int) -> Memory:
+        """Return that nothing was decided yet."""
+        return {"decision": np.zeros(n)}
+
+    def act(self, state: LocalState, memory: Memory) -> tuple[Floats, Memory]:
+        """Return those of this decision."""
+        return self.did[int(memory["decision"][0])], {"decision": memory["decision"] + 1.0}
 
 
 class RoadImagination(Imagination[RoadModel]):
@@ -77,7 +104,14 @@ class RoadImagination(Imagination[RoadModel]):
         choices = self._starts(parts * cavs, starts, driven)
         if len(choices) == 0:
             return None
-        episodes = self._driven(network, choices, driven, others)
+        driver = full_policy(self._task, self._policy, network)
+        memory: Memory = {EXPERT: self._memory(choices, cavs)}
+        if driver.hold > 1:
+            nothing = np.zeros(cavs * len(choices))
+            memory |= {RESIDUAL: nothing, AGE: nothing}
+        members, draws = others
+        people = people_of(self.model, self.scenario, torch_generator(members, "cpu"))
+        episodes = self.driven(driver, memory, choices, driven, people, draws)
         self.steps += sum(episode.steps for episode in episodes)
         if part == 0:
             self._compare(episodes, choices, driven)
@@ -90,42 +124,68 @@ class RoadImagination(Imagination[RoadModel]):
         drawn = np.array([each for _, each in pairs])
         return experience_of([trajectory for trajectory, _ in pairs], seen_by_critic(drawn))
 
-    def _driven(
-        self, network: Network, choices: Any, driven: int, seeds: Sequence[tuple[int, ...]]
+    def driven(
+        self,
+        driver: Driver,
+        memory: Memory,
+        choices: NDArray[np.int64],
+        decisions: int,
+        people: People,
+        seed: Sequence[int],
     ) -> list[Episode]:
-        """Return what follows the moments `choices`, rows (recording, decision), in so many decisions."""
-        ring, model = cast(Ring, self.scenario), self.model
+        """Return what follows recorded moments in so many decisions.
+
+        Args:
+            driver: of all CAVs, with its exploration.
+            memory: what it remembers there, all rows of the first CAV, then of the second.
+            choices: the moments, rows (recording, decision).
+            decisions: of each road.
+            people: how they drive.
+            seed: of all noise.
+        """
+        ring = cast(Ring, self.scenario)
         by_episode = {kept.episode: kept for kept in self.moments}
         kept = [by_episode[self.data.recordings[place].episode] for place, _ in choices]
-        at = [decision // each.every for each, (_, decision) in zip(kept, choices, strict=True)]
-        noise = float(model.noise) / ring.simulation_step / replace(ring, noise=1.0).noise_per_step
-        common = replace(
-            ring, horizon=driven, warmup=0, noise=noise if self.settings.noise else 0.0, population=""
-        )
-        rings = [replace(common, length=(round(each.length),) * 2) for each in kept]
-        members, draws = seeds
+        here = [(each, at // each.every) for each, (_, at) in zip(kept, choices, strict=True)]
+        noise = float(self.model.noise) / ring.simulation_step / replace(ring, noise=1.0).noise_per_step
+        noise = noise if self.settings.noise else 0.0
+        common = replace(ring, horizon=decisions, warmup=0, noise=noise, population="")
         world = RingBatch(
-            rings,
-            [(0,)] * len(rings),
+            [replace(common, length=(round(each.length),) * 2) for each in kept],
+            [(0,)] * len(kept),
             reward=self._task.reward,
-            draw=np.random.default_rng(list(draws)).standard_normal,
-            people=people_of(model, ring, torch_generator(members, "cpu")),
+            draw=np.random.default_rng(list(seed)).standard_normal,
+            people=people,
         )
-        here = list(zip(kept, at, strict=True))
         world.place(
             np.stack([each.speeds[row] for each, row in here], 1),
             np.stack([each.positions[row] for each, row in here], 1),
         )
-        driver = full_policy(self._task, self._policy, network)
-        memory: Memory = {EXPERT: self._memory(choices, len(world.roads[0].cav_ids))}
-        if driver.hold > 1:
-            nothing = np.zeros(world.rows)
-            memory |= {RESIDUAL: nothing, AGE: nothing}
         found = driven_to_the_end(begin(world, driver, explore=True, memory=memory))
         earned = make_reward(self._task.reward or ring.reward)
         return [rewarded(episode, earned) for episode in found.episodes]
 
-    def _memory(self, choices: Any, cavs: int) -> Memory:
+    def waves(self) -> tuple[Moments, dict[str, Episode]]:
+        """Return an actual episode that no network learned from, and what is imagined from its start on.
+
+        There CAVs do what they did, and noise is drawn anew: with what was learned, and by the base alone.
+        """
+        share = self.settings.holdout
+        kept = [each for each in self.moments if is_held_out(each.episode, share)] or self.moments
+        moments, recordings = kept[-1], self.data.recordings
+        rows = [place for place, each in enumerate(recordings) if each.episode == moments.episode]
+        did = Repeated(np.stack([recordings[row].applied for row in rows], 1))
+        begun = np.array([[rows[0], 0]])
+        kinds = {
+            "imagined": people_of(self.model, self.scenario, torch_generator((0,), "cpu")),
+            "base": known_speed(self.settings.base, self.scenario),
+        }
+        return moments, {
+            label: self.driven(did, did.initial_memory(len(rows)), begun, len(did.did), people, (1,))[0]
+            for label, people in kinds.items()
+        }
+
+    def _memory(self, choices: NDArray[np.int64], cavs: int) -> Memory:
         """Return what the expert remembered at `choices`: all rows of the first CAV, then of the second."""
         first: dict[int, int] = {}
         for place, recording in enumerate(self.data.recordings):
@@ -139,7 +199,7 @@ class RoadImagination(Imagination[RoadModel]):
         ]
         return mapped(lambda *values: np.concatenate(values), each[0], *each[1:])
 
-    def _compare(self, episodes: Sequence[Episode], choices: Any, driven: int) -> None:
+    def _compare(self, episodes: Sequence[Episode], choices: NDArray[np.int64], driven: int) -> None:
         """Note what the policy that drove the actual episodes earned here, and there."""
         earned = [episode.reward.sum() for episode in episodes]
         rewards = [self.data.recordings[place].reward[at : at + driven] for place, at in choices]

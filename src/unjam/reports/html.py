@@ -28,7 +28,7 @@ from unjam.reports.figures import (
 )
 from unjam.reports.film import split_lines
 from unjam.reports.lanes import drawn_by_lane, space_time_of
-from unjam.reports.model import errors, examples, model_section, trust
+from unjam.reports.model import errors, examples, model_section, trust, waves
 from unjam.reports.results import Results, Shown, command_to_repeat, damaged, read_results
 from unjam.reports.story import (
     against_people,
@@ -132,7 +132,9 @@ def _pictures(results: Sequence[Results], panels: Sequence[Shown]) -> dict[str, 
     if len(results) == 1 and results[0].progress:
         progress, model = results[0].progress, results[0].model
         pictures["time_split"] = time_split(progress)
-        if model is not None:
+        if model is not None and "waves" in model:
+            pictures["model_waves"] = waves(model)
+        elif model is not None:
             pictures["model_examples"] = examples(model)
             pictures["model_errors"] = errors(model)
             pictures["model_trust"] = trust(progress, model)

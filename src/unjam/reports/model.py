@@ -8,8 +8,8 @@ from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from unjam.reports.figures import INK, LINES, MUTED, STYLE, new_figure
-from unjam.reports.results import Results
+from unjam.reports.figures import INK, LINES, MUTED, STYLE, new_figure, space_time
+from unjam.reports.results import Results, Shown
 
 NUMBERS = {
     "speed": ("own speed", "m/s"),
@@ -142,6 +142,15 @@ def model_section(result: Results) -> dict[str, Any] | None:
     facts = result.model
     if facts is None or not result.progress:
         return None
+    if "waves" in facts:
+        known = BASES[facts["base"]][0].removesuffix(" alone")
+        return {
+            "about": (
+                "Between actual episodes the agent also learns on imagined roads, on which everybody drives: "
+                f"people by what is known ({known}), plus an ensemble of {facts['members']} networks for "
+                "what that leaves."
+            )
+        }
     return {
         "about": (
             "Between actual episodes the agent also learns in a virtual environment: "
@@ -157,6 +166,26 @@ def model_section(result: Results) -> dict[str, Any] | None:
             {"label": row["number"], "unit": row["unit"], "cells": cells(row)} for row in error_rows(facts)
         ],
     }
+
+
+def waves(facts: dict[str, Any]) -> Figure:
+    """Draw an actual road beside what is imagined from its start on: waves are dark bands."""
+    found, vehicles = facts["waves"], range(len(facts["waves"]["recorded"]["speeds"][0]))
+    return space_time(
+        [
+            Shown(
+                driver=BASES[facts["base"]][0] if label == "base" else label,
+                step=facts["step"],
+                loop_length=facts["loop_length"],
+                outline=np.zeros((1, 3)),
+                vehicle_ids=tuple(str(vehicle) for vehicle in vehicles),
+                cav_ids=tuple(str(vehicle) for vehicle in facts["cavs"]),
+                speeds=np.array(road["speeds"], np.float64),
+                positions=np.array(road["positions"], np.float64),
+            )
+            for label, road in found.items()
+        ]
+    )
 
 
 @rc_context(STYLE)

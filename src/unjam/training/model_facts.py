@@ -15,6 +15,7 @@ from unjam.errors import InputError
 from unjam.files import to_json, write_whole
 from unjam.learners.imagination import RowImagination
 from unjam.learners.learner import under
+from unjam.learners.road_imagination import RoadImagination
 from unjam.reports.results import MODEL_FILE, read_model, read_progress
 from unjam.scenarios.scenario import Scenario
 from unjam.training.config import RunConfig
@@ -56,7 +57,9 @@ def newest_model_facts(folder: Path, config: RunConfig) -> dict[str, Any]:
             f"run: {str(folder)!r} has no virtual environment: its virtual.virtual_ratio is 0; allowed: > 0"
         )
     if config.virtual.model == "road":
-        raise InputError(f"run: {str(folder)!r} imagines whole roads; allowed: one with virtual.model=row")
+        raise InputError(
+            f"run: {str(folder)!r} imagines whole roads, whose waves its report shows; allowed: one of rows"
+        )
     kept, progress = read_model(folder), read_progress(folder)
     if kept is None or not progress or kept.get("iteration") != progress[-1]["iteration"]:
         write_model_facts(folder, config)
@@ -86,6 +89,10 @@ def measure_model(folder: Path, config: RunConfig) -> dict[str, Any]:
     state, tensors = checkpoint
     settings = replace(config.virtual, device="cpu")
     (task,) = config.make_tasks()
+    if settings.model == "road":
+        roads = RoadImagination(settings, task, config.policy, config.seed)
+        roads.restore(state[roads.name], under(f"{roads.name}/", tensors))
+        return _rounded(_waves(roads))
     imagination = RowImagination(settings, task, config.policy, config.seed)
     imagination.restore(state[imagination.name], under(f"{imagination.name}/", tensors))
     scenario = imagination.scenario
@@ -108,6 +115,24 @@ def measure_model(folder: Path, config: RunConfig) -> dict[str, Any]:
             "bound": _bounds(imagination, newest, config.learner.gamma),
         }
     )
+
+
+def _waves(roads: RoadImagination) -> dict[str, Any]:
+    """Return an actual road and imagined ones, at the moments that were kept of it: speeds and positions."""
+    kept, imagined = roads.waves()
+    recorded = {"speeds": kept.speeds, "positions": kept.positions}
+    drawn = {
+        label: {"speeds": episode.speeds[:: kept.every], "positions": episode.positions[:: kept.every]}
+        for label, episode in imagined.items()
+    }
+    return {
+        "base": roads.settings.base,
+        "members": roads.settings.members,
+        "step": kept.every * roads.scenario.decision_step,
+        "loop_length": kept.length,
+        "cavs": np.flatnonzero(kept.people == 0.0),
+        "waves": {"recorded": recorded, **drawn},
+    }
 
 
 def _by_bins(values: Floats, errors: OneStepErrors) -> dict[str, Any]:
@@ -209,4 +234,6 @@ def _rounded(value: Any) -> Any:
         return {key: _rounded(entry) for key, entry in value.items()}
     if isinstance(value, (list, tuple, np.ndarray)):
         return [_rounded(entry) for entry in value]
+    if isinstance(value, np.integer):
+        return int(value)
     return float(f"{value:.4g}") if isinstance(value, (float, np.floating)) else value

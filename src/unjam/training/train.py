@@ -149,7 +149,7 @@ def _train_owned(
             name: judge(folder / name, road, workers, progress=progress).rows
             for name, road in config.roads().items()
         }
-    if config.virtual.virtual_ratio > 0 and config.virtual.model == "row" and not config.tasks:
+    if config.virtual.virtual_ratio > 0 and not config.tasks:
         write_model_facts(folder, config)
     write_report([folder / name for name in rows], folder / "report.html")
     return rows

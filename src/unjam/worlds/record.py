@@ -105,7 +105,10 @@ def trajectory(
     experts, residuals, seen = zip(*driven.decisions, strict=True)
     steps = range(start, start + len(applied))
     choices = [*steps[:: driven.hold], steps.stop]
-    observations = own([*seen, driven.last_observation], choices).astype(np.float64).reshape(len(choices), -1)
+    looks = [*seen, driven.last_observation]
+    if np.size(looks[steps.stop]) == 0:  # it crashed while others drove on, between two looks of the network
+        choices[-1] = choices[-2]
+    observations = own(looks, choices).astype(np.float64).reshape(len(choices), -1)
     decided = observations, own(experts, steps), own(residuals, steps)
     commanded = applied, filtered, shield
     return Trajectory(*about, *decided, *commanded, driven.memories[number], driven.hold, terminated)
