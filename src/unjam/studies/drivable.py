@@ -31,6 +31,12 @@ LENGTHS = (220, 230, 240, 250, 260, 270)
 SEEDS = 10
 """of each length"""
 TUNED = "tuned PI"
+TUNED_LONGER = "PI, tuned for as long"
+LONGER = (
+    "pi:window=13.31,catch_up_speed=1.193,gap_lower=5.997,gap_upper=58.76,"
+    "safe_gap=1.037,safe_gap_rule=closing,time_constant=0.8318,first_command=own-speed"
+)
+"""what `unjam tune ring --expert pi --steps 12000000` finds: as many steps as a training of the preset has"""
 CEILING = "leads all to the limit"
 KEPT = (
     *("return", "mean_speed", "mean_speed_steady", "throughput_veh_per_h", "fuel_ml_per_km", "drivable"),
@@ -41,7 +47,10 @@ KEPT = (
 
 def drivers_on(ring: Ring, trained: dict[str, Driver]) -> dict[str, Driver]:
     """Return all drivers of a ring of one length, by label."""
-    named = {"human": "human", "PI": "pi", "PI (paper)": "pi:time_constant=0", TUNED: "unjam:ring-tuned"}
+    named = {
+        **{"human": "human", "PI": "pi", "PI (paper)": "pi:time_constant=0"},
+        **{TUNED: "unjam:ring-tuned", TUNED_LONGER: LONGER},
+    }
     made = {label: make_driver(name, ring.decision_step) for label, name in named.items()}
     limit = ring.limit(ring.length[0])
     made[CEILING] = FollowerStopper(desired_speed=limit, gaps=(0.5, 1.0, 1.5), time_constant=3.0)
@@ -70,7 +79,7 @@ def _write(studies: StudyFolder, seeds: int, folder: Path, workers: int) -> None
 
 
 def table(road: str, folder: Path) -> pd.DataFrame:
-    """Return who earns what on a road, over all lengths, and what each is beyond the tuned expert."""
+    """Return who earns what on a road, over all lengths, and what each is beyond both tuned experts."""
     rows = [
         {"driver": label, "seed": seed, "verdict": found["drivable"], **row}
         for of_length in read_part(folder, road).values()
@@ -105,7 +114,8 @@ def _row(episodes: pd.DataFrame, label: str, members: list[str]) -> dict[str, An
     return {
         "driver": label,
         "return": f"{mean['return']:.0f}",
-        "beyond the tuned expert": beyond(TUNED, "return", 0),
+        "beyond the tuned PI": beyond(TUNED, "return", 0),
+        "beyond PI, tuned for as long": beyond(TUNED_LONGER, "return", 0),
         "mean speed [m/s]": f"{mean['mean_speed']:.2f}",
         "beyond people [m/s]": beyond("human", "mean_speed", 2),
         "flow [veh/h]": f"{mean['throughput_veh_per_h']:.0f}",
