@@ -1,9 +1,12 @@
 """Drives each shipped controller on its road beside people alone: what docs/gallery.md shows, and a film.
 
-Ten held-out seeds, four on the on-ramp; ten minutes on two cores. `python results/gallery/gallery.py`.
+Ten held-out seeds, four on the on-ramp; ten minutes on two cores. `python results/gallery/gallery.py`, or with the names of
+those that are to be driven anew.
 """
 
 import json
+import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 from PIL import Image, ImageSequence
@@ -49,11 +52,15 @@ def film(road: str, name: str) -> None:
     frames[0].save(target, save_all=True, append_images=frames[1:], duration=50, loop=0, quality=55)
 
 
-def main() -> None:
-    """Drive, draw and write the cards."""
-    film("ring-jammed", "ring-tuned")
-    cards = {}
-    for name, (road, changes) in ROADS.items():
+def main(names: Sequence[str]) -> None:
+    """Drive, draw and write the cards; what is driven anew has a manifest of its own."""
+    target = HERE / "gallery.json"
+    if not names:
+        film("ring-jammed", "ring-tuned")
+    found = json.loads(target.read_text()) if names else {"manifest": manifest(), "cards": {}}
+    cards = found["cards"]
+    for name in names or ROADS:
+        road, changes = ROADS[name]
         label = f"unjam:{name}"
         count = 4 if road == "on-ramp" else 10
         result = unjam.drive(road, ["human", label], episodes=count, road=changes, workers=2, held_out=True)
@@ -72,10 +79,11 @@ def main() -> None:
             "braking": estimate_of(driven, "cav_max_braking").mean,
             "drivable": verdicts(result.rows)[label],
             "domain": json.loads(certified)["domain"] if certified else None,
+            **({"manifest": manifest()} if names else {}),
         }
         print(name, cards[name]["beside people alone"], flush=True)
-    (HERE / "gallery.json").write_text(to_json({"manifest": manifest(), "cards": cards}, indent=1) + "\n")
+    target.write_text(to_json(found, indent=1) + "\n")
 
 
 if __name__ == "__main__":
-    main()
+    main(sys.argv[1:])
