@@ -1,7 +1,7 @@
 """Drives each shipped controller on its road beside people alone: what docs/gallery.md shows, and a film.
 
-Ten held-out seeds, four on the on-ramp; ten minutes on two cores. `python results/gallery/gallery.py`, or with the names of
-those that are to be driven anew.
+Ten held-out seeds, four on the on-ramp; ten minutes on two cores. `python results/gallery/gallery.py`, or
+with the names of those that are to be driven anew.
 """
 
 import json
