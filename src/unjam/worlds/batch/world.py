@@ -29,7 +29,6 @@ from unjam.worlds.batch.people import People, people_speed, without_gap
 from unjam.worlds.batch.record import RingLog, Rings, as_numpy
 from unjam.worlds.closed import HISTORY
 from unjam.worlds.reward import Outcome, make_reward, time_headway
-from unjam.worlds.sumo.files import obedient_brakes
 from unjam.worlds.world import Driven, OnProgress
 
 LONGEST_STEP = 0.37
@@ -110,7 +109,7 @@ class RingBatch:
         self._people, self._drives = _people(roads, scenario, numbers), people
         self._scale = numbers(np.full((vehicles, 1), scenario.noise_per_step * scenario.simulation_step))
         self._cars = Cars(scenario.safety, scenario.actuator, scenario.simulation_step)
-        self._brakes = obedient_brakes(scenario) * scenario.simulation_step
+        self._brakes = scenario.cav_brakes * scenario.simulation_step
         seeded = [others for _, others in drawn]
         self._noise: Noise = (
             SeededNoise(seeded, vehicles, (scenario.horizon, cavs), numbers)

@@ -5,15 +5,13 @@ from typing import Any, NamedTuple
 
 from unjam.physics.idm import IDMParameters
 from unjam.scenarios.road import BuiltRoad, MotorwayRoad, OwnRoad, Road
-from unjam.scenarios.scenario import VEHICLE_LENGTH, Scenario
+from unjam.scenarios.scenario import OBEDIENT, VEHICLE_LENGTH, Scenario
 from unjam.worlds.sumo.networks import Attributes, document, element, network_file
 
 SMALLEST_CAV_GAP = 0.5
 """gap that SUMO keeps for a CAV [m]"""
 CAV_COLOUR = "215,38,61"
 """red, in SUMO's window"""
-OBEDIENT = 20.0
-"""accelerations of an obedient CAV's type [m/s2]: far beyond what it asks for, so that only safety clips"""
 ACCELERATION = 2.6
 """of commanded people and of cars, SUMO's own [m/s2]"""
 CAV_TYPES = "cav_of_{}"
@@ -183,11 +181,6 @@ def _cav_layer(scenario: Scenario) -> Attributes:
     }
 
 
-def obedient_brakes(scenario: Scenario) -> float:
-    """Return how hard an obedient CAV can brake at all [m/s2]."""
-    return scenario.safety.braking if scenario.safety.active else OBEDIENT
-
-
 def _obedient_layer(scenario: Scenario) -> Attributes:
     """Return the attributes of a type that executes any safe command exactly.
 
@@ -195,7 +188,7 @@ def _obedient_layer(scenario: Scenario) -> Attributes:
     gap is the one that stays out of the way until the command would lead to a crash. Where a filter keeps it
     safe, it has a car's engine and brakes: SUMO only makes it yield, and others expect of it what it can do.
     """
-    brakes = obedient_brakes(scenario)
+    brakes = scenario.cav_brakes
     return {
         "color": CAV_COLOUR,
         "carFollowModel": "Krauss",
