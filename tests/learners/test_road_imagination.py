@@ -11,9 +11,10 @@ from unjam.drivers import PISaturation
 from unjam.drivers.network import Network
 from unjam.drivers.observation import observation_size
 from unjam.learners.imagination import full_policy
-from unjam.learners.road_imagination import Repeated, RoadImagination
+from unjam.learners.road_imagination import RoadImagination
 from unjam.learners.settings import PolicySettings
 from unjam.scenarios import Ring
+from unjam.virtual.comparison import Replayed
 from unjam.virtual.roads import known_speed
 from unjam.virtual.settings import VirtualSettings
 from unjam.worlds.batch.run import run_batch
@@ -51,11 +52,11 @@ def imagined(ring: Ring, network: Network) -> tuple[RoadImagination, list[Episod
 def test_without_noise_it_is_what_happened(warmup: int) -> None:
     imagination, episodes = imagined(replace(RING, noise=0.0, warmup=warmup), network_of(0.0))
     people = known_speed("idm", RING)
-    memory = Repeated(np.zeros((0, 2))).initial_memory(2)
+    memory = Replayed(np.zeros((0, 2))).initial_memory(2)
     for recording, decision in ((0, 0), (2, 130), (4, 20), (6, 290)):  # each with its neighbour, two CAVs
         did = [imagination.data.recordings[row].applied[decision:] for row in (recording, recording + 1)]
         (found,) = imagination.driven(
-            *(Repeated(np.stack(did, 1)), memory, np.array([[recording, decision]])), DECISIONS, people, (1,)
+            *(Replayed(np.stack(did, 1)), memory, np.array([[recording, decision]])), DECISIONS, people, (1,)
         )
         actual, during = episodes[recording // 2], slice(decision, decision + DECISIONS + 1)
         np.testing.assert_allclose(found.speeds, actual.speeds[during], atol=1e-6)

@@ -100,7 +100,8 @@ def test_a_new_model_is_as_wrong_as_its_base() -> None:
 
 def gap_of(driver: ResidualDriver, world: LittleWorld, data: ActualData) -> ReturnGap:
     starts = begin(data, data.choices(20), driver.expert, "cpu")
-    found = return_gap(imagine(driver, world, starts, 20, torch_generator((1,), "cpu")), data, 18)
+    rollouts = imagine(driver, world, starts, 20, torch_generator((1,), "cpu"))
+    found = return_gap(rollouts.rewards.sum(1).double().numpy(), rollouts.start, data, 18)
     assert found is not None
     return found
 

@@ -125,6 +125,15 @@ class Imagination(Generic[Model]):
         count = ceil(self.settings.virtual_ratio * self._actual / parts / driven)
         return draw_starts(self.data, count, 1, seed, self._first)
 
+    def _compare(self, earned: Floats, starts: NDArray[np.int64], driven: int, crashed: float) -> None:
+        """Note what the policy that drove the actual episodes earned here and there, and its crashes."""
+        gap = return_gap(earned, starts, self.data, driven)
+        self.facts |= {
+            "return_virtual": gap and gap.virtual,
+            "return_actual": gap and gap.actual,
+            "crash_share": crashed,
+        }
+
     def bound(self, eps_pi: float, gamma: float) -> float:
         """Return the bound C for this iteration; `gamma` is that from choice to choice."""
         return self.bound_at(self.k_star, eps_pi, self.facts["eps_m_by_estimator"]["total_variation"], gamma)
@@ -193,14 +202,10 @@ class RowImagination(Imagination[EnvironmentModel]):
         starts = begin(self.data, choices, self._task.expert, self.settings.device)
         rollouts = imagine(driver, world, starts, driven, exploration)
         self.steps += rollouts.decisions
-        if part == 0:  # the policy that drove the actual episodes: returns can be compared
-            gap = return_gap(rollouts, self.data, driven)
-            self.facts |= {
-                "return_virtual": gap and gap.virtual,
-                "return_actual": gap and gap.actual,
-                "crash_share": float(rollouts.terminated.double().mean()),
-                "bounded": rollouts.bounded,
-            }
+        if part == 0:
+            earned = rollouts.rewards.sum(1).double().cpu().numpy()
+            self._compare(earned, rollouts.start, driven, float(rollouts.terminated.double().mean()))
+            self.facts["bounded"] = rollouts.bounded
         return rollouts
 
 

@@ -1,7 +1,7 @@
 """Imagining whole roads: everybody drives on, from recorded moments, and waves come and go."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, cast
 
 import numpy as np
@@ -9,7 +9,6 @@ import torch
 from numpy.typing import NDArray
 
 from unjam.drivers.driver import Driver, Memory
-from unjam.drivers.local_state import LocalState
 from unjam.drivers.network import Network
 from unjam.drivers.residual import AGE, EXPERT, RESIDUAL
 from unjam.learners.experience import Experience, experience_of
@@ -22,8 +21,10 @@ from unjam.learners.imagination import (
     SeenByCritic,
     full_policy,
 )
+from unjam.learners.learner import under
 from unjam.scenarios.ring import Ring
 from unjam.tree import mapped, pack, unpack
+from unjam.virtual.comparison import Replayed
 from unjam.virtual.data import is_held_out, remembered
 from unjam.virtual.ensemble import torch_generator
 from unjam.virtual.fitting import Fit
@@ -41,26 +42,10 @@ from unjam.worlds.batch.run import begin
 from unjam.worlds.batch.world import RingBatch
 from unjam.worlds.drive import driven_to_the_end
 from unjam.worlds.episode import rewarded
-from unjam.worlds.record import Episode, Floats
+from unjam.worlds.record import Episode
 from unjam.worlds.reward import make_reward
 
 MOMENTS = "moments/"
-
-
-@dataclass(frozen=True)
-class Repeated(Driver):
-    """Accelerations that were recorded, one decision after the other."""
-
-    did: Floats
-    """[m/s2], shape (decisions, CAVs)"""
-
-    def initial_memory(self, n: int) -> Memory:
-        """Return that nothing was decided yet."""
-        return {"decision": np.zeros(n)}
-
-    def act(self, state: LocalState, memory: Memory) -> tuple[Floats, Memory]:
-        """Return those of this decision."""
-        return self.did[int(memory["decision"][0])], {"decision": memory["decision"] + 1.0}
 
 
 class RoadImagination(Imagination[RoadModel]):
@@ -95,8 +80,8 @@ class RoadImagination(Imagination[RoadModel]):
         self, network: Network, iteration: int, part: int, parts: int, seen_by_critic: SeenByCritic
     ) -> Experience | None:
         """Return what the policy `network` does on imagined roads; None where they are not trusted."""
-        hold = full_policy(self._task, self._policy, network).hold
-        driven = self.k_star // hold * hold
+        driver = full_policy(self._task, self._policy, network)
+        driven = self.k_star // driver.hold * driver.hold
         if driven == 0:
             return None
         starts, *others = (self._seed(iteration, each, part) for each in (STARTS, NOISE, EXPLORATION))
@@ -104,7 +89,6 @@ class RoadImagination(Imagination[RoadModel]):
         choices = self._starts(parts * cavs, starts, driven)
         if len(choices) == 0:
             return None
-        driver = full_policy(self._task, self._policy, network)
         memory: Memory = {EXPERT: self._memory(choices, cavs)}
         if driver.hold > 1:
             nothing = np.zeros(cavs * len(choices))
@@ -114,7 +98,9 @@ class RoadImagination(Imagination[RoadModel]):
         episodes = self.driven(driver, memory, choices, driven, people, draws)
         self.steps += sum(episode.steps for episode in episodes)
         if part == 0:
-            self._compare(episodes, choices, driven)
+            earned = np.array([episode.reward.sum() for episode in episodes])
+            crashed = [episode.status == "collision" for episode in episodes]
+            self._compare(earned, choices, driven, float(np.mean(crashed)))
         places = [place for place, _ in choices]
         pairs = [
             (trajectory, self.data.recordings[place].drawn)
@@ -174,14 +160,16 @@ class RoadImagination(Imagination[RoadModel]):
         kept = [each for each in self.moments if is_held_out(each.episode, share)] or self.moments
         moments, recordings = kept[-1], self.data.recordings
         rows = [place for place, each in enumerate(recordings) if each.episode == moments.episode]
-        did = Repeated(np.stack([recordings[row].applied for row in rows], 1))
+        did = Replayed(np.stack([recordings[row].applied for row in rows], 1))
         begun = np.array([[rows[0], 0]])
         kinds = {
             "imagined": people_of(self.model, self.scenario, torch_generator((0,), "cpu")),
             "base": known_speed(self.settings.base, self.scenario),
         }
         return moments, {
-            label: self.driven(did, did.initial_memory(len(rows)), begun, len(did.did), people, (1,))[0]
+            label: self.driven(
+                did, did.initial_memory(len(rows)), begun, len(did.accelerations), people, (1,)
+            )[0]
             for label, people in kinds.items()
         }
 
@@ -199,22 +187,6 @@ class RoadImagination(Imagination[RoadModel]):
         ]
         return mapped(lambda *values: np.concatenate(values), each[0], *each[1:])
 
-    def _compare(self, episodes: Sequence[Episode], choices: NDArray[np.int64], driven: int) -> None:
-        """Note what the policy that drove the actual episodes earned here, and there."""
-        earned = [episode.reward.sum() for episode in episodes]
-        rewards = [self.data.recordings[place].reward[at : at + driven] for place, at in choices]
-        pairs = [
-            (one, other.sum()) for one, other in zip(earned, rewards, strict=True) if len(other) == driven
-        ]
-        virtual, actual = np.array(pairs).mean(0).tolist() if pairs else (None, None)
-        crashed = [episode.status == "collision" for episode in episodes]
-        self.facts |= {
-            "return_virtual": virtual,
-            "return_actual": actual,
-            "crash_share": float(np.mean(crashed)),
-            "bounded": {},
-        }
-
     def state(self) -> tuple[dict[str, Any], dict[str, torch.Tensor]]:
         """Return all that a run must keep of it to go on, as JSON and tensors."""
         facts, tensors = super().state()
@@ -224,6 +196,6 @@ class RoadImagination(Imagination[RoadModel]):
 
     def restore(self, facts: dict[str, Any], tensors: dict[str, torch.Tensor]) -> None:
         """Go on from what `state` returned."""
-        arrays = {n.removeprefix(MOMENTS): t.numpy() for n, t in tensors.items() if n.startswith(MOMENTS)}
+        arrays = {name: tensor.numpy() for name, tensor in under(MOMENTS, tensors).items()}
         self.moments = unpack(list[Moments], facts["moments"], arrays)
         super().restore(facts, {n: t for n, t in tensors.items() if not n.startswith(MOMENTS)})

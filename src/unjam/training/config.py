@@ -100,9 +100,10 @@ class RunConfig(Agents):
 
     @model_validator(mode="after")
     def _possible(self) -> "RunConfig":
-        for road in (self, *self.roads().values()):
+        self.make_scenario()
+        for road in self.roads().values():
             scenario = road.make_scenario()
-            if self.world == "batch" and (road is not self or not self.tasks) and (why := why_not(scenario)):
+            if self.world == "batch" and (why := why_not(scenario)):
                 raise ValueError(f"world: batch is not allowed; allowed: sumo, for {why}")
         return self
 

@@ -7,16 +7,16 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from unjam.drivers.driver import Driver, Memory
 from unjam.drivers.local_state import LocalState
+from unjam.physics.arrays import Array
 from unjam.scenarios.scenario import Scenario
 from unjam.virtual.data import ActualData, Transitions
 from unjam.virtual.ensemble import torch_generator
 from unjam.virtual.fitting import OneStepErrors, targets_of
 from unjam.virtual.model import NUMBERS, EnvironmentModel, model_inputs
-from unjam.virtual.rollout import ImaginedWorld, Rollouts, Starts
+from unjam.virtual.rollout import ImaginedWorld, Starts
 from unjam.virtual.world import VirtualDynamics, on_device
 from unjam.worlds.drive import Drive
 from unjam.worlds.record import Floats
@@ -59,12 +59,16 @@ def recorded(data: ActualData, choices: NDArray[np.int64], decisions: int) -> di
 class Replayed(Driver):
     """Accelerations that were recorded, one decision after the other."""
 
-    accelerations: Tensor
+    accelerations: Array
     """[m/s2], shape (H, rows)"""
 
-    def act(self, state: LocalState, memory: Memory) -> tuple[Tensor, Memory]:
+    def initial_memory(self, n: int) -> Memory:
+        """Return that nothing was decided yet."""
+        return {"decision": np.zeros(n)}
+
+    def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
         """Return those of this decision."""
-        return self.accelerations[memory["decision"]], {"decision": memory["decision"] + 1}
+        return self.accelerations[int(memory["decision"][0])], {"decision": memory["decision"] + 1.0}
 
 
 @torch.no_grad()
@@ -93,7 +97,7 @@ def replay(
     members = torch.arange(model.members, device=device)
     dynamics = VirtualDynamics(model, scenario, "", generator, noise=False, members=members)
     world = ImaginedWorld(dynamics, starts, decisions, scenario.limits, None)
-    for _ in Drive(world, Replayed(on_device(applied, device)), memory={"decision": 0}):
+    for _ in Drive(world, Replayed(on_device(applied, device))):
         pass
     shape = model.members, len(choices), decisions
     found = {name: torch.stack([getattr(state, name) for state in world.states[1:]], 1) for name in NUMBERS}
@@ -119,15 +123,18 @@ class ReturnGap(NamedTuple):
     """of their difference, rows taken as independent"""
 
 
-def return_gap(rollouts: Rollouts, data: ActualData, decisions: int) -> ReturnGap | None:
-    """Compare what rollouts of so many decisions earned with what was earned from the same actual rows.
+def return_gap(
+    earned: Floats, starts: NDArray[np.int64], data: ActualData, decisions: int
+) -> ReturnGap | None:
+    """Compare what so many virtual decisions earned with what was earned from the same actual rows.
+
+    `earned` has shape (rows,), `starts` where each began, rows (recording, decision).
 
     The comparison is fair where the same policy drove both, with exploration. Returns are sums of the
     rewards, not discounted, until the last decision or a crash. Rows that fewer recorded decisions follow are
     left out; None where nothing is left.
     """
-    earned = rollouts.rewards.sum(1).double().cpu().numpy()
-    actually = [data.recordings[place].reward[at : at + decisions] for place, at in rollouts.start]
+    actually = [data.recordings[place].reward[at : at + decisions] for place, at in starts]
     whole = [len(rewards) == decisions for rewards in actually]
     if not any(whole):
         return None

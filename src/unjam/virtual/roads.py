@@ -170,7 +170,7 @@ def fit_roads(
     found = teach(model, _inputs(speed, leader_speed, gaps, base), targets, held_out, settings, generator)
     if root_mean_square(found.wanted) < SMALLEST_CHANGE:  # the base knows all: what is left is rounding
         model.learned.zero_()
-    wrong = found.wanted - found.predicted
+    wrong = found.wanted - found.predicted * model.learned.numpy()
     change = (moved - speed)[found.holdout]
     step = OneStep(root_mean_square(found.wanted), root_mean_square(wrong), float(change.std()))
     distance = torch.as_tensor(np.abs(wrong)) / (2.0 * sqrt(2.0) * max(sigma, SMALLEST_CHANGE))

@@ -1,7 +1,6 @@
 """Episodes of many rings at once, instead of one after the other in SUMO."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import cast
 
 import numpy as np
@@ -13,7 +12,7 @@ from unjam.scenarios.ring import Ring
 from unjam.tree import mapped
 from unjam.worlds.batch.noise import Numbers
 from unjam.worlds.batch.record import Rings
-from unjam.worlds.batch.world import RingBatch
+from unjam.worlds.batch.world import RingBatch, alike
 from unjam.worlds.drive import Drive, driven_to_the_end
 from unjam.worlds.episode import rewarded
 from unjam.worlds.record import Episode
@@ -87,5 +86,4 @@ def _driven(task: EpisodeTask) -> tuple[Driver, str, bool]:
 
 
 def _alike(one: EpisodeTask, other: EpisodeTask) -> bool:
-    ring, length = cast(Ring, one.scenario), cast(Ring, other.scenario).length
-    return _driven(one) == _driven(other) and replace(ring, length=length) == other.scenario
+    return _driven(one) == _driven(other) and alike(cast(Ring, one.scenario), cast(Ring, other.scenario))

@@ -49,6 +49,11 @@ def why_not(scenario: Scenario) -> str:
     return ""
 
 
+def alike(one: Ring, other: Ring) -> bool:
+    """Return whether rings differ in their lengths alone, so that they can be stepped together."""
+    return replace(one, length=other.length) == other
+
+
 class RingBatch:
     """W rings of the same kind, each with a seed of its own; equal to SUMO's, but for rounding.
 
@@ -86,7 +91,7 @@ class RingBatch:
         for each in scenarios:
             if why := why_not(each):
                 raise InputError(f"batch: {why}")
-            if replace(each, length=scenario.length) != scenario:
+            if not alike(each, scenario):
                 raise InputError("batch: the scenarios differ in more than their lengths")
         drawn = [each.of_seed(seed) for each, seed in zip(scenarios, seeds, strict=True)]
         roads = self.roads = [cast(ClosedRoad, road) for road, _ in drawn]
