@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from unjam.drivers.safety import Actuator, Ahead, SafetyFilter, Underway
+from unjam.drivers.sensors import Readings, Sensors
 from unjam.errors import InputError
 from unjam.parameters import build
 from unjam.physics.kinematics import next_speed, speed_to_stop_within, stopping_distance
@@ -51,9 +52,18 @@ class Pursuit:
     """Rows of cars that their filters alone keep behind leaders, in the simulator's own steps."""
 
     def __init__(
-        self, safety: SafetyFilter, actuator: Actuator | None, step: float, rows: int, seed: int
+        self,
+        safety: SafetyFilter,
+        actuator: Actuator | None,
+        step: float,
+        rows: int,
+        seed: int,
+        sensors: Sensors | None = None,
     ) -> None:
         generator = np.random.default_rng(seed)
+        self.readings = Readings(
+            sensors or Sensors(), safety.leader_braking, step, np.random.SeedSequence(seed)
+        )
         self.safety, self.actuator, self.step, self.generator = safety, actuator, step, generator
         ahead = Ahead(*generator.uniform(0.0, [[35.0], [35.0], [150.0]], (3, rows)))
         start = Underway(np.zeros(rows)) if actuator is None else actuator.start(ahead.speed, step)
@@ -63,9 +73,9 @@ class Pursuit:
 
     def go(self, leader: Any, wanted: Any) -> np.ndarray:
         """Make one step in which leaders accelerate with `leader`; return the cars' accelerations."""
-        step = self.step
+        step, sensed = self.step, self.readings.of_filter("all", self.ahead)
         told = self.safety.keep(
-            np.broadcast_to(wanted, self.ahead.speed.shape), self.ahead, step, self.actuator, self.underway
+            np.broadcast_to(wanted, self.ahead.speed.shape), sensed, step, self.actuator, self.underway
         )
         assert (told >= np.minimum(wanted, -self.safety.braking)).all()
         if self.actuator is not None:
@@ -110,6 +120,33 @@ def test_the_floor_holds_behind_who_brakes_no_harder_than_it_allows_for(
         if number > 10:  # commands given before the start have arrived
             speed, _, gap = pursuit.ahead
             assert (gap >= safety.standstill_gap + safety.time_headway * speed - 1e-9).all()
+
+
+@pytest.mark.parametrize("actuator", ACTUATORS, ids=str)
+@pytest.mark.parametrize("sensors", [Sensors(1.0, 1.0), Sensors(0.5, 0.5, dropout=0.5)], ids=str)
+def test_sensors_that_err_within_their_bounds_and_miss_readings_change_neither_claim(
+    sensors: Sensors, actuator: Actuator | None
+) -> None:
+    allows = SafetyFilter(gap_error=sensors.gap_error, speed_error=sensors.speed_error)
+    for hardest in (allows.leader_braking, allows.headway_braking):
+        pursuit = Pursuit(allows, actuator, 0.1, 4000, 3, sensors)
+        nearest = np.minimum(pursuit.ahead.gap, allows.standstill_gap)
+        leader = np.zeros(len(nearest))
+        for number in range(300):
+            if number % 20 == 0:
+                leader = hardest * pursuit.generator.choice([-1.0, -1.0, -0.3, 0.0, 0.5], len(nearest))
+            pursuit.go(leader, 3.0)
+            speed, _, gap = pursuit.ahead
+            assert (gap >= nearest - 1e-9).all()
+            if number > 10 and hardest == allows.headway_braking:
+                assert (gap >= allows.standstill_gap + allows.time_headway * speed - 1e-9).all()
+
+
+def test_a_filter_that_does_not_know_of_its_sensors_errors_lets_cars_touch() -> None:
+    pursuit = Pursuit(SafetyFilter(), None, 0.1, 4000, 3, Sensors(4.0, 4.0))
+    for _ in range(300):
+        pursuit.go(pursuit.generator.choice([-6.0, 3.0], len(pursuit.ahead.gap)), 3.0)
+    assert (pursuit.ahead.gap < 0.0).any()
 
 
 def test_without_the_filter_the_same_cars_crash() -> None:

@@ -11,6 +11,7 @@ from unjam.drivers.command import Limits
 from unjam.drivers.driver import Driver, Memory, Recipe
 from unjam.drivers.local_state import SPEED_SCALE, LocalState, Observed
 from unjam.drivers.safety import Ahead, SafetyFilter
+from unjam.drivers.sensors import SMALLEST_SEEN_GAP
 from unjam.errors import InputError
 from unjam.parameters import NotNegative, Positive
 from unjam.physics.arrays import Array, at_least, join_columns, namespace, square_root, stack_columns
@@ -20,8 +21,6 @@ KIND = "kind"
 INNER, AGE, SENT = "inner", "age", "sent"
 """names in the memory of a wrapper: the other driver's own; of an impaired one besides: decisions made so
 far; what was said and not yet done"""
-SMALLEST_SEEN_GAP = 0.1
-"""[m], however wrong a sensor is"""
 SPANS = (10.0, 40.0, 160.0)
 """time constants of the means [s]: within a wave, of a wave, of several"""
 SPREAD_SCALE, ROOM_SCALE = 2.0, 20.0

@@ -6,11 +6,12 @@ from functools import cached_property
 from typing import Annotated, ClassVar, Literal, Self
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, model_validator
 from pydantic.dataclasses import dataclass
 
 from unjam.drivers.command import Limits
 from unjam.drivers.safety import Actuator, SafetyFilter
+from unjam.drivers.sensors import Sensors
 from unjam.parameters import STRICT, Count, CountOrNone, NotNegative, Positive
 from unjam.physics.idm import IDMParameters
 from unjam.scenarios.population import Population, read_population
@@ -96,6 +97,8 @@ class Scenario:
     """the filter between driver and road, of every CAV, in every simulation step"""
     actuator: Actuator = field(default_factory=Actuator)
     """how late a CAV does what it is told"""
+    sensors: Sensors = field(default_factory=Sensors)
+    """how wrong what a CAV senses of its neighbours is"""
     bounded: bool = True
     """whether commanded people keep to what brakes and engine can do, in an emergency too"""
     humans: IDMParameters = field(default_factory=IDMParameters)
@@ -116,6 +119,16 @@ class Scenario:
     """`sqrt-step`: noise times sqrt(time step), as Flow; `none`: as the paper says"""
     emission_class: str = "HBEFA4/PC_petrol_Euro-6ab"
     """SUMO's emission class of every vehicle, for fuel"""
+
+    @model_validator(mode="after")
+    def _filter_allows_for_sensors(self) -> Self:
+        for name in ("gap_error", "speed_error"):
+            known, largest = getattr(self.safety, name), getattr(self.sensors, name)
+            if self.safety.active and known < largest:
+                raise ValueError(
+                    f"safety.{name}: {known:g} is not allowed; allowed: >= sensors.{name}, {largest:g}"
+                )
+        return self
 
     @property
     def decision_step(self) -> float:
@@ -191,8 +204,8 @@ class Scenario:
         return self
 
     def of_seed(self, seed: Sequence[int]) -> tuple[Road, Sequence[np.random.SeedSequence]]:
-        """Return the road of an episode's seed, and the seeds of noise, exploration and simulator."""
-        road, *others = np.random.SeedSequence(list(seed)).spawn(4)
+        """Return the road of an episode's seed; and the seeds of noise, exploration, simulator, sensors."""
+        road, *others = np.random.SeedSequence(list(seed)).spawn(5)
         return self.draw(np.random.default_rng(road)), others
 
     def possible_cavs(self) -> tuple[str, ...]:

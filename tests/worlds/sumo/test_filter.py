@@ -8,6 +8,7 @@ import pytest
 from unjam.drivers import IDM, Driver, PISaturation
 from unjam.drivers.car_following import Constant
 from unjam.drivers.safety import Actuator, SafetyFilter
+from unjam.drivers.sensors import Sensors
 from unjam.measures.drivable import DRIVABLE
 from unjam.measures.metrics import measure
 from unjam.scenarios import FigureEight, Merge, Ring, Scenario
@@ -31,6 +32,18 @@ def test_a_reckless_driver_touches_nobody_on_rings_of_all_kinds(
     assert row["drivable"] == DRIVABLE
     assert row["filter_share"] > 0.1
     assert row["min_headway"] > 1.0
+
+
+@pytest.mark.parametrize("late", [Actuator(), Actuator(lag=0.3, delay=0.2)], ids=["at once", "late"])
+def test_sensors_that_err_and_miss_readings_touch_nobody(late: Actuator, simulation: Simulation) -> None:
+    sensors, knows = Sensors(0.5, 0.5, dropout=0.3), SafetyFilter(gap_error=0.5, speed_error=0.5)
+    ring = replace(RAW, cavs=2, sensors=sensors, safety=knows, actuator=late)
+    episode = run_episode(ring, Constant(1.0), (3,), simulation=simulation)
+    row = measure(episode)
+    assert (row["status"], row["collisions"], row["drivable"]) == ("completed", 0.0, DRIVABLE)
+    assert row["min_headway"] > 1.0
+    again = run_episode(ring, Constant(1.0), (3,), simulation=simulation)
+    np.testing.assert_array_equal(episode.speeds, again.speeds)
 
 
 def test_what_is_commanded_is_what_the_filter_lets_pass(simulation: Simulation) -> None:

@@ -44,6 +44,8 @@ def why_not(scenario: Scenario) -> str:
     exact = scenario.actuation == "raw" or (scenario.actuation == "shielded" and scenario.safety.active)
     if not exact:
         return "actuation: SUMO's own check decides what CAVs do; allowed: raw, or a safety filter that acts"
+    if not scenario.sensors.exact:
+        return "sensors: they err, which only SUMO's episodes know"
     if scenario.simulation_step > LONGEST_STEP:
         return f"simulation_step: {scenario.simulation_step:g} s; allowed: <= {LONGEST_STEP:g} s"
     return ""

@@ -101,8 +101,8 @@ class ClosedTraffic(Traffic[ClosedRoad]):
         """Return where the front bumpers of all vehicles are now along the road, not wrapped [m]."""
         return self.road.start_positions + np.array(self._simulation.distances(self.road.vehicle_ids))
 
-    def perceive(self) -> LocalState:
-        """Return what the CAVs perceive now: arrays of shape (CAVs,), or plain numbers of a single one."""
+    def _state(self) -> LocalState:
+        """Return what exact sensors of the CAVs would read now."""
         near = self._near_positions
         if self.single:
             return loop_state(self.speeds, near, self._near_single, *self._loop)
@@ -125,7 +125,7 @@ class ClosedTraffic(Traffic[ClosedRoad]):
     def _drive_cavs(self, wanted: list[float]) -> None:
         """Ask for the speeds that the CAVs' accelerations lead to in this step, once they are filtered."""
         speeds, near, step = self.speeds, self._near_positions, self.scenario.simulation_step
-        loop, last, carry_out = self.road.loop_length, len(speeds) - 1, self._cars.carry_out
+        loop, last, carry_out = self.road.loop_length, len(speeds) - 1, self._carry_out
         told, commanded = [], []
         for name, place, acceleration in zip(self.cavs, self._places, wanted, strict=True):
             speed, leader = speeds[place], place + 1 if place < last else 0

@@ -130,8 +130,8 @@ class OpenTraffic(Traffic[OpenKind]):
         """How many want to enter now and cannot."""
         return self._log_waiting[-1]
 
-    def perceive(self) -> LocalState:
-        """Return what the CAVs perceive now: arrays of shape (CAVs,)."""
+    def _state(self) -> LocalState:
+        """Return what exact sensors of the CAVs would read now."""
         return self._log_states[-1].read_only()
 
     def advance(self, command: Command | None) -> None:
@@ -171,7 +171,7 @@ class OpenTraffic(Traffic[OpenKind]):
         """
         names, found, step = list(wanted), {}, self.scenario.simulation_step
         for name, ahead in zip(names, self._ahead(names), strict=True):
-            told, done = self._cars.carry_out(name, wanted[name], ahead)
+            told, done = self._carry_out(name, wanted[name], ahead)
             taken[name].append(wanted[name] - told)
             found[name] = next_speed(ahead.speed, done, step)
         return found

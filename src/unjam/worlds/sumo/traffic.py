@@ -7,7 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from unjam.drivers.command import Command, accelerations
-from unjam.drivers.safety import Cars
+from unjam.drivers.local_state import LocalState
+from unjam.drivers.safety import Ahead, Cars
+from unjam.drivers.sensors import Readings
 from unjam.errors import EpisodeError
 from unjam.physics.arrays import Array
 from unjam.physics.idm import IDMParameters
@@ -28,7 +30,7 @@ class Seed(NamedTuple):
 
     entropy: tuple[int, ...]
     children: Sequence[np.random.SeedSequence]
-    """of noise, exploration and SUMO"""
+    """of noise, exploration, SUMO and sensors"""
 
 
 class Scene(NamedTuple):
@@ -63,7 +65,7 @@ class Traffic(World[Episode], Generic[RoadKind]):
     ) -> None:
         """Put the vehicles on the road; nothing moves yet."""
         self.seed = seed.entropy
-        noise_seed, exploration_seed, sumo_seed = seed.children
+        noise_seed, exploration_seed, sumo_seed, sensor_seed = seed.children
         self.scenario = scenario
         self.limits = scenario.limits
         self.road = road
@@ -79,7 +81,12 @@ class Traffic(World[Episode], Generic[RoadKind]):
         """whether fuel and, on roads with ends, places are recorded"""
         self.log_fuel: list[list[float]] = []
         self._controlled = False
-        self._cars = Cars(scenario.safety, scenario.actuator, scenario.simulation_step)
+        braking, step = scenario.safety.leader_braking, scenario.simulation_step
+        self._readings = (
+            None if scenario.sensors.exact else Readings(scenario.sensors, braking, step, sensor_seed)
+        )
+        self._cars = Cars(scenario.safety, scenario.actuator, step)
+        self._perceived: tuple[int, LocalState] | None = None
         self._noise_generator = np.random.default_rng(noise_seed)
         self._exploration_generator = np.random.default_rng(exploration_seed)
         self._simulation = simulation
@@ -114,6 +121,23 @@ class Traffic(World[Episode], Generic[RoadKind]):
     def ended(self) -> bool:
         """Whether there was a collision, nobody will be on the road any more, or the horizon is reached."""
         return self.crashed or self.over or self.decisions >= self.scenario.horizon
+
+    def perceive(self) -> LocalState:
+        """Return what the CAVs perceive now: arrays of shape (CAVs,), or plain numbers of a single one."""
+        if self._readings is None:
+            return self._state()
+        if self._perceived is None or self._perceived[0] != self.decisions:
+            self._perceived = self.decisions, self._readings.of_driver(self.cavs, self._state())
+        return self._perceived[1]
+
+    def _state(self) -> LocalState:
+        """Return what exact sensors of the CAVs would read now."""
+        raise NotImplementedError
+
+    def _carry_out(self, name: str, wanted: float, ahead: Ahead) -> tuple[float, float]:
+        """Return what a CAV is told of the acceleration that is wanted, and what it does [m/s2]."""
+        known = ahead if self._readings is None else self._readings.of_filter(name, ahead)
+        return self._cars.carry_out(name, wanted, known)
 
     def noise(self) -> Array:
         """Return standard normal noise for one decision: an array (CAVs,), or a plain number."""
