@@ -33,7 +33,6 @@ ROADS = {
     "ring-jammed-best": ("ring-jammed", {}),
     "figure-eight-tuned": ("figure-eight", {}),
     "figure-eight-best": ("figure-eight", {}),
-    "merge-best": ("merge", {}),
     "on-ramp-tuned": ("on-ramp", {"cav_share": 0.05}),
 }
 """where each controller is shown, and what is changed of the road"""

@@ -2,6 +2,7 @@
 
 from unjam.studies.comparison import FIGURE_5, comparison_of
 from unjam.studies.drivable import DRIVABLE_STUDY
+from unjam.studies.envelope import ENVELOPE
 from unjam.studies.everywhere import EVERYWHERE_STUDY
 from unjam.studies.figure_6 import FIGURE_6
 from unjam.studies.robustness import FIGURE_10, ROBUSTNESS
@@ -47,6 +48,7 @@ STUDIES: dict[str, Study] = {
     ),
     "robustness": ROBUSTNESS,
     "drivable": DRIVABLE_STUDY,
+    "envelope": ENVELOPE,
     "everywhere": EVERYWHERE_STUDY,
 }
 """every study by name"""
