@@ -17,6 +17,8 @@ EXPERTS = [
     "pi",
     "pi:time_constant=0,safe_gap_rule=closing,first_command=zero",
     "pi:window=0.3",
+    "pi-from-gap",
+    "pi-from-gap:fading=2,watched_share=0.3",
     "follower-stopper",
     "follower-stopper:desired_speed=4",
     "acc",

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from tests.conftest import state_of
-from unjam.drivers import LocalState, PISaturation
+from unjam.drivers import LocalState, PIFromGap, PISaturation
 from unjam.drivers.driver import Memory
 from unjam.drivers.from_file import random_state
 
@@ -87,3 +87,27 @@ def test_recalled_warmup_counts_like_own_driving(watched: int) -> None:
         first, recalled = driver.act(state, recalled)
         second, driven = driver.act(state, driven)
         assert first[0] == pytest.approx(second[0], abs=1e-12)
+
+
+def test_from_a_standstill_the_gap_says_how_fast_it_begins_and_that_fades() -> None:
+    state = state_of([0.0], [0.0], [8.0])
+    quick, plain = PIFromGap(people_headway=1.5, people_gap=2.0, fading=3.0), PISaturation()
+    memory, plain_memory, gained = quick.initial_memory(1), plain.initial_memory(1), []
+    for _ in range(40):
+        found, memory = quick.act(state, memory)
+        expected, plain_memory = plain.act(state, plain_memory)
+        gained.append(float(found[0] - expected[0]))
+    assert gained[0] == pytest.approx(0.5 * (8.0 - 2.0) / 1.5 / 3.0)  # half is the last command, over 3 s
+    assert gained[10] > gained[20] > gained[29] > 0.0
+
+
+def test_in_traffic_that_was_watched_it_begins_with_a_share_of_the_mean() -> None:
+    watched = state_of([[4.0, 6.0]], [[5.0, 5.0]], [[9.0, 9.0]])
+    whole, half = (PIFromGap(watched_share=share) for share in (1.0, 0.5))
+    state = state_of([5.0], [5.0], [20.0])
+    found = []
+    for driver in (PISaturation(), whole, half):
+        wanted, _ = driver.act(state, driver.recall(driver.initial_memory(1), watched))
+        found.append(float(wanted[0]))
+    assert found[1] == pytest.approx(found[0])
+    assert found[0] - found[2] == pytest.approx(0.5 * 2.5 / 3.0)

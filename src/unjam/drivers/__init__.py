@@ -6,7 +6,7 @@ from unjam.drivers.driver import Decision, Driver, Memory
 from unjam.drivers.follower_stopper import FollowerStopper
 from unjam.drivers.from_file import DriverLike, as_driver, check_driver
 from unjam.drivers.local_state import LocalState
-from unjam.drivers.pi_saturation import PISaturation
+from unjam.drivers.pi_saturation import PIFromGap, PISaturation
 from unjam.drivers.registry import DRIVERS
 from unjam.drivers.residual import ResidualDriver
 from unjam.drivers.road_experts import JamAbsorber, Pacer
@@ -29,6 +29,7 @@ __all__ = [
     "Limits",
     "LocalState",
     "Memory",
+    "PIFromGap",
     "PISaturation",
     "Pacer",
     "ResidualDriver",

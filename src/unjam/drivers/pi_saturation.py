@@ -59,11 +59,14 @@ class PISaturation(Formula):
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
         """Return the acceleration towards the commanded speed of Eq. 10, and the new memory."""
-        xp = namespace(state.speed)
         window = slide(memory, state.speed)
-        mean = mean_speed(window)
-        command = xp.where(xp.isnan(memory["command"]), state.speed, memory["command"])
+        acceleration, command = self._towards(mean_speed(window), state, memory["command"])
+        return acceleration, {**window, "command": command}
 
+    def _towards(self, mean: Array, state: LocalState, last: Array) -> tuple[Array, Array]:
+        """Return the acceleration and the commanded speed that a mean and the `last` command lead to."""
+        xp = namespace(state.speed)
+        command = xp.where(xp.isnan(last), state.speed, last)
         room = (state.leader_gap - self.gap_lower) / (self.gap_upper - self.gap_lower)
         target = mean + self.catch_up_speed * clip(room, 0.0, 1.0)
         safe_gap = self.safe_gap
@@ -73,10 +76,51 @@ class PISaturation(Formula):
         beta = 1.0 - 0.5 * alpha
         command = beta * (alpha * target + (1.0 - alpha) * state.leader_speed) + (1.0 - beta) * command
 
-        acceleration = (command - state.speed) / max(self.time_constant, self.time_step)
-        return acceleration, {**window, "command": command}
+        return (command - state.speed) / max(self.time_constant, self.time_step), command
 
     def memory_features(self, memory: Memory) -> Array:
         """Return the mean own speed and the commanded speed, scaled, shape (n, 2)."""
         mean = mean_speed(memory)
         return stack_columns((mean / SPEED_SCALE, memory["command"] / SPEED_SCALE))
+
+
+@dataclass(frozen=True, config=STRICT)
+class PIFromGap(PISaturation):
+    """PI with saturation whose mean begins with the speed at which people drive behind its first gap.
+
+    The plain one starts slowly: its mean is that of a car which stood. Where people stand evenly spaced, the
+    own gap says how fast all can drive alike. Where it takes over in traffic that it has watched, its mean
+    begins with a share of what it watched: who is slower at first opens the gap that swallows a wave.
+    """
+
+    name: ClassVar[str] = "pi-from-gap"
+
+    people_headway: Positive = 1.0
+    """time headway that people keep [s]"""
+    people_gap: NotNegative = 2.0
+    """gap of people who stand [m]"""
+    fading: Positive = 40.0
+    """time in which the first speed fades from the mean [s]"""
+    watched_share: NotNegative = 1.0
+    """share of the mean speed that was watched before, with which it begins in traffic"""
+
+    def initial_memory(self, n: int) -> Memory:
+        """Return that of the plain one, that the first speed is not known (NaN), and that none faded."""
+        return {**super().initial_memory(n), "first": np.full(n, np.nan), "moments": np.zeros(n)}
+
+    def recall(self, memory: Memory, history: LocalState) -> Memory:
+        """Return `memory` with the own speeds of the warm-up in its window, and where it begins then."""
+        recalled = super().recall(memory, history)
+        return {**recalled, "first": self.watched_share * mean_speed(recalled)}
+
+    def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
+        """Return the acceleration towards the commanded speed of Eq. 10, and the new memory."""
+        xp = namespace(state.speed)
+        allowed = at_least((state.leader_gap - self.people_gap) / self.people_headway, 0.0)
+        first = xp.where(xp.isnan(memory["first"]), allowed, memory["first"])
+        window = slide(memory, state.speed)
+        left = clip(1.0 - memory["moments"] * (self.time_step / self.fading), 0.0, 1.0)
+        mean = mean_speed(window)
+        acceleration, command = self._towards(mean + left * (first - mean), state, memory["command"])
+        begun = {"first": first, "moments": memory["moments"] + 1.0}
+        return acceleration, {**window, "command": command, **begun}

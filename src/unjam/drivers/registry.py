@@ -16,7 +16,7 @@ from unjam.drivers.follower_stopper import FollowerStopper
 from unjam.drivers.from_file import FileDriver, FileReference, is_file_reference
 from unjam.drivers.network import network_from_arrays
 from unjam.drivers.observation import FEATURES, FeatureName, observation_size
-from unjam.drivers.pi_saturation import PISaturation
+from unjam.drivers.pi_saturation import PIFromGap, PISaturation
 from unjam.drivers.residual import EXPERT, ResidualDriver
 from unjam.drivers.road_experts import Cruise, JamAbsorber, JamAhead, Pacer
 from unjam.drivers.safety import SafetyFilter
@@ -26,7 +26,8 @@ from unjam.parameters import STRICT, Count, NotNegative, Positive, build, split_
 from unjam.tree import Arrays
 
 _KINDS = (
-    *(Human, IDM, PISaturation, FollowerStopper, ACC, LACC, BCM, OVM, Pacer, JamAbsorber, Cruise, JamAhead),
+    *(Human, IDM, PISaturation, PIFromGap, FollowerStopper, ACC, LACC, BCM, OVM),
+    *(Pacer, JamAbsorber, Cruise, JamAhead),
     Constant,
 )
 DRIVERS: dict[str, type[Driver]] = {kind.name: kind for kind in _KINDS}

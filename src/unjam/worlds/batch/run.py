@@ -41,7 +41,7 @@ def begin(
     """
     driving = Drive(world, driver, explore, memory)
     driving.memory = mapped(numbers, driving.memory)
-    if AGE in driving.memory:
+    if driver.hold > 1 and AGE in driving.memory:
         driving.memory[AGE] = 0.0  # all rows began together: no network is asked while residuals are held
     return driving
 
