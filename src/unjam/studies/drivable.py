@@ -1,4 +1,4 @@
-"""What a drivable residual is worth on the ring: beside the tuned expert, people alone, and the ceiling.
+"""What a drivable residual is worth on the ring: beside tuned experts, people alone, and the ceiling.
 
 Every driver on every length on the same seeds; the seeds are shared by all trainings, which the intervals
 know. The ceiling leads all to the limit of the length, which no car can know.
@@ -30,13 +30,13 @@ from unjam.worlds.workers import Workers
 LENGTHS = (220, 230, 240, 250, 260, 270)
 SEEDS = 10
 """of each length"""
-TUNED = "tuned PI"
-TUNED_LONGER = "PI, tuned for as long"
-LONGER = (
+PI_TUNED = "PI, tuned"
+FROM_GAP = "PI from its gap, tuned"
+PI_LONG = (
     "pi:window=13.31,catch_up_speed=1.193,gap_lower=5.997,gap_upper=58.76,"
     "safe_gap=1.037,safe_gap_rule=closing,time_constant=0.8318,first_command=own-speed"
 )
-"""what `unjam tune ring --expert pi --steps 12000000` finds: as many steps as a training of the preset has"""
+"""what `unjam tune ring --expert pi --steps 12000000` finds; `unjam:ring-gap-tuned` is the same of the other"""
 CEILING = "leads all to the limit"
 KEPT = (
     *("return", "mean_speed", "mean_speed_steady", "throughput_veh_per_h", "fuel_ml_per_km", "drivable"),
@@ -49,7 +49,7 @@ def drivers_on(ring: Ring, trained: dict[str, Driver]) -> dict[str, Driver]:
     """Return all drivers of a ring of one length, by label."""
     named = {
         **{"human": "human", "PI": "pi", "PI (paper)": "pi:time_constant=0"},
-        **{TUNED: "unjam:ring-tuned", TUNED_LONGER: LONGER},
+        **{PI_TUNED: PI_LONG, FROM_GAP: "unjam:ring-gap-tuned"},
     }
     made = {label: make_driver(name, ring.decision_step) for label, name in named.items()}
     limit = ring.limit(ring.length[0])
@@ -114,8 +114,8 @@ def _row(episodes: pd.DataFrame, label: str, members: list[str]) -> dict[str, An
     return {
         "driver": label,
         "return": f"{mean['return']:.0f}",
-        "beyond the tuned PI": beyond(TUNED, "return", 0),
-        "beyond PI, tuned for as long": beyond(TUNED_LONGER, "return", 0),
+        f"beyond {PI_TUNED}": beyond(PI_TUNED, "return", 0),
+        f"beyond {FROM_GAP}": beyond(FROM_GAP, "return", 0),
         "mean speed [m/s]": f"{mean['mean_speed']:.2f}",
         "beyond people [m/s]": beyond("human", "mean_speed", 2),
         "flow [veh/h]": f"{mean['throughput_veh_per_h']:.0f}",
