@@ -36,7 +36,7 @@ PI_LONG = (
     "pi:window=13.31,catch_up_speed=1.193,gap_lower=5.997,gap_upper=58.76,"
     "safe_gap=1.037,safe_gap_rule=closing,time_constant=0.8318,first_command=own-speed"
 )
-"""what `unjam tune ring --expert pi --steps 12000000` finds; `unjam:ring-gap-tuned` is the same of the other"""
+"""what `unjam tune ring --expert pi --steps 12000000` finds; of the other it is `unjam:ring-gap-tuned`"""
 CEILING = "leads all to the limit"
 KEPT = (
     *("return", "mean_speed", "mean_speed_steady", "throughput_veh_per_h", "fuel_ml_per_km", "drivable"),

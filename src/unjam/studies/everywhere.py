@@ -30,18 +30,17 @@ EPISODES = 10
 """of each driver on each road"""
 PEOPLE = "human"
 TUNED: dict[str, tuple[str, ...]] = {
-    "rings": ("pi", "unjam:ring-tuned", "unjam:rings-tuned", "follower-stopper"),
+    "rings": ("pi", "unjam:ring-tuned", "unjam:ring-gap-tuned", "unjam:rings-tuned", "follower-stopper"),
     "figure-eights": ("unjam:figure-eight-tuned", "pacer:varying=true"),
     "motorways": ("jam-ahead", "unjam:on-ramp-tuned", "cruise"),
 }
 """experts of which the best on a road is its 1"""
 JUDGED: dict[str, str] = {
     "unjam:best": "unjam:best",
-    "PI, tuned on the rings": "unjam:rings-tuned",
+    "PI from its gap, tuned on the rings": "unjam:rings-tuned",
     "PI": "pi",
     "FollowerStopper": "follower-stopper",
     "jam-ahead": "jam-ahead",
-    "unjam:ring-best": "unjam:ring-best",
 }
 """who is judged on every road, by label"""
 KEPT = (
