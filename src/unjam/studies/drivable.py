@@ -20,6 +20,7 @@ from unjam.files import to_json, write_whole
 from unjam.measures.drivable import DRIVABLE, verdicts
 from unjam.measures.statistics import crossed_estimate, estimate
 from unjam.measures.table import cell_of
+from unjam.physics.arrays import Floats
 from unjam.scenarios.ring import Ring
 from unjam.scenarios.scenario import Scenario
 from unjam.studies.study import Study, StudyFolder, planned, read_part
@@ -31,13 +32,16 @@ LENGTHS = (220, 230, 240, 250, 260, 270)
 SEEDS = 10
 """of each length"""
 PI_TUNED = "PI, tuned"
-FROM_GAP = "PI from its gap, tuned"
+FROM_GAP, FROM_GAP_JAMMED = "PI from its gap, tuned", "PI from its gap, tuned in a jam"
 PI_LONG = (
     "pi:window=13.31,catch_up_speed=1.193,gap_lower=5.997,gap_upper=58.76,"
     "safe_gap=1.037,safe_gap_rule=closing,time_constant=0.8318,first_command=own-speed"
 )
 """what `unjam tune ring --expert pi --steps 12000000` finds; of the other it is `unjam:ring-gap-tuned`"""
 CEILING = "leads all to the limit"
+OTHER = "residual of the other ring"
+ROADS = {"ring": 0, "ring-jammed": 6000}
+"""their warm-up, in steps"""
 KEPT = (
     *("return", "mean_speed", "mean_speed_steady", "throughput_veh_per_h", "fuel_ml_per_km", "drivable"),
     *("min_headway", "cav_max_braking", "filter_share", "speed_std_fleet_steady", "time_to_dissolve"),
@@ -50,6 +54,7 @@ def drivers_on(ring: Ring, trained: dict[str, Driver]) -> dict[str, Driver]:
     named = {
         **{"human": "human", "PI": "pi", "PI (paper)": "pi:time_constant=0"},
         **{PI_TUNED: PI_LONG, FROM_GAP: "unjam:ring-gap-tuned"},
+        FROM_GAP_JAMMED: "unjam:ring-jammed-tuned",
     }
     made = {label: make_driver(name, ring.decision_step) for label, name in named.items()}
     limit = ring.limit(ring.length[0])
@@ -67,10 +72,15 @@ def _rows_on(ring: Scenario, drivers: dict[str, Driver], workers: Workers) -> di
 
 
 def _write(studies: StudyFolder, seeds: int, folder: Path, workers: int) -> None:
-    runs = planned(["ring"], ["best"], seeds)
-    trained = {f"training {run.seed}": make_driver(str(studies.folder_of(run)), 0.1) for run in runs}
+    made = {
+        road: [make_driver(str(studies.folder_of(run)), 0.1) for run in planned([road], ["best"], seeds)]
+        for road in ROADS
+    }
     with Workers(workers) as pool:
-        for name, warmup in (("ring", 0), ("ring-jammed", 6000)):
+        for name, warmup in ROADS.items():
+            trained = {f"training {seed}": driver for seed, driver in enumerate(made[name])}
+            (other,) = set(ROADS) - {name}
+            trained[OTHER] = made[other][0]
             found = {}
             for length in LENGTHS:
                 ring = replace(Ring(), length=(length, length), warmup=warmup)
@@ -116,19 +126,27 @@ def _row(episodes: pd.DataFrame, label: str, members: list[str]) -> dict[str, An
         "return": f"{mean['return']:.0f}",
         f"beyond {PI_TUNED}": beyond(PI_TUNED, "return", 0),
         f"beyond {FROM_GAP}": beyond(FROM_GAP, "return", 0),
+        f"beyond {FROM_GAP_JAMMED}": beyond(FROM_GAP_JAMMED, "return", 0),
         "mean speed [m/s]": f"{mean['mean_speed']:.2f}",
         "beyond people [m/s]": beyond("human", "mean_speed", 2),
         "flow [veh/h]": f"{mean['throughput_veh_per_h']:.0f}",
         "fuel [ml/km]": f"{mean['fuel_ml_per_km']:.0f}",
+        "dissolved after [s]": _dissolved(np.asarray(own["time_to_dissolve"], np.float64)),
         "smallest headway [s]": "–" if isinf(closest) else f"{closest:.2f}",
         "drivable": (worst[0] or "–") if worst else "yes",
     }
 
 
+def _dissolved(times: Floats) -> str:
+    """Return after how long waves were dissolved, and how many of them."""
+    share = np.isfinite(times).mean()
+    return "–" if not share else f"{np.nanmean(times):.1f}" + (f" ({share:.0%})" if share < 1.0 else "")
+
+
 DRIVABLE_STUDY = Study(
     title="what a drivable residual is worth beside the tuned expert, on the ring and the jammed ring",
-    runs=lambda seeds: planned(["ring"], ["best"], seeds),
+    runs=lambda seeds: planned(ROADS, ["best"], seeds),
     write=_write,
     minutes=20.0,
-    tables={road: partial(table, road) for road in ("ring", "ring-jammed")},
+    tables={road: partial(table, road) for road in ROADS},
 )

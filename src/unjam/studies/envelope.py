@@ -128,7 +128,7 @@ def _smallest(episodes: list[dict[str, Any]], name: str) -> float:
 def _gain(found: dict[str, Any], driver: str) -> Estimate:
     """Return what a driver gains over people alone in mean speed, paired [m/s]."""
     own, people = ([row["mean_speed"] for row in found[each]["episodes"]] for each in (driver, PEOPLE))
-    return estimate(np.subtract(own, people))
+    return estimate([one - other for one, other in zip(own, people, strict=True)])
 
 
 def domain_table(part: str, folder: Path) -> pd.DataFrame:

@@ -86,13 +86,16 @@ BEST: dict[str, dict[str, Any]] = {
         "virtual": {"virtual_ratio": 0.0},
         "evaluation": {"every": 5, "validation_episodes": 32},
     },
-    # A wave that has grown: larger steps of the policy unlearn what the expert can, and no wave comes in the
-    # virtual environment, where the leader's own leader is unseen.
+    # A wave that has grown: what there is to gain is gained within two minutes.
     "ring-jammed": {
-        "steps": 600_000,
-        "trpo": {"target_kl": 0.01},
+        "steps": 3_000_000,
+        "world": "batch",
+        "road": {"horizon": 1500},
+        "expert": "unjam:ring-jammed-tuned",
+        "policy": {"remember": True, "exploration_std": 0.015, "learn_exploration": False},
+        "trpo": {"batch_steps": 48_000, "target_kl": 0.02},
         "virtual": {"virtual_ratio": 0.0},
-        "evaluation": {"every": 3, "validation_episodes": 8},
+        "evaluation": {"every": 6, "validation_episodes": 32},
     },
     # The pacer alone holds the queue; the residual gathers it sooner. It needs room: with a time constant of
     # 0.1 s the pacer cancels whatever is added. The virtual environment does not know the crossing.
@@ -129,6 +132,14 @@ QUICK: dict[str, dict[str, Any]] = {
         "expert": "unjam:ring-tuned",
         "policy": {"exploration_std": 0.015, "learn_exploration": False},
         "trpo": {"target_kl": 0.02},
+    },
+    # Larger steps of the policy unlearn what the expert can, and no wave comes in the virtual environment of
+    # rows, where the leader's own leader is unseen.
+    "ring-jammed": {
+        "steps": 600_000,
+        "trpo": {"target_kl": 0.01},
+        "virtual": {"virtual_ratio": 0.0},
+        "evaluation": {"every": 3, "validation_episodes": 8},
     },
 }
 """the preset `quick`: what reaches furthest within a million actual steps or so, road by road"""
