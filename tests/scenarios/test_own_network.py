@@ -7,11 +7,15 @@ import numpy as np
 import pytest
 
 from tests.sumo_files.test_sumo_files import configuration
+from tests.worlds.sumo.own_roads import straight
+from unjam.drivers import Human
 from unjam.errors import InputError
 from unjam.scenarios import make_scenario, scenario_from_recipe, scenario_recipe
-from unjam.scenarios.own_network import OwnNetwork
+from unjam.scenarios.own_network import OwnNetwork, own_network
 from unjam.scenarios.road import OwnRoad
+from unjam.worlds.episode import run_episode
 from unjam.worlds.sumo.files import files_of
+from unjam.worlds.sumo.simulation import Simulation
 
 TYPES = """
 <routes>
@@ -46,6 +50,9 @@ TIMES = '<time><begin value="30"/><end value="90"/><step-length value="0.2"/></t
         ({"simulation_step": 0.5}, 0.5, 120),
         ({"horizon": 7}, 0.2, 7),
         ({"simulation_step": 0.1, "steps_per_decision": 3}, 0.1, 200),
+        ({"begin": 50.0}, 0.2, 200),
+        ({"begin": 40.0, "end": 70.0}, 0.2, 150),
+        ({"end": 70.0, "horizon": 9}, 0.2, 9),
     ],
 )
 def test_step_and_horizon_are_its_own_unless_said_otherwise(
@@ -53,6 +60,23 @@ def test_step_and_horizon_are_its_own_unless_said_otherwise(
 ) -> None:
     found = own(tmp_path, TIMES, cav_share=0.1, **changes)
     assert (found.simulation_step, found.horizon) == (step, horizon)
+
+
+def test_who_would_depart_before_the_begin_is_left_out(tmp_path: Path, simulation: Simulation) -> None:
+    departing = (f'<vehicle id="{at}" type="car" route="along" depart="{at}"/>' for at in (0, 5, 40, 60))
+    road = str(straight(tmp_path, "".join(departing)))
+    asked = {"cav_share": 1.0, "end": 80.0}
+    early, late = (
+        run_episode(own_network(road, {**asked, **begin}), Human(), (0,), simulation=simulation)
+        for begin in ({}, {"begin": 30.0})
+    )
+    assert (len(early.vehicle_ids), len(late.vehicle_ids)) == (4, 2)
+
+
+@pytest.mark.parametrize("times", [{"begin": 90.0}, {"end": 20.0}, {"begin": 50.0, "end": 50.0}])
+def test_an_end_before_the_begin_is_refused(times: dict[str, Any], tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"end: .* is not allowed; allowed: after begin"):
+        own(tmp_path, TIMES, cav_share=0.1, **times)
 
 
 def test_without_an_end_an_episode_is_an_hour(tmp_path: Path) -> None:

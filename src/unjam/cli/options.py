@@ -87,6 +87,8 @@ def scenario_changes(
     cav_types: Annotated[
         str | None, typer.Option(help="Vehicle types that are CAVs, on your own network: car,truck.")
     ] = None,
+    begin: Annotated[float | None, typer.Option(help="When your own network begins [s].")] = None,
+    end: Annotated[float | None, typer.Option(help="When it ends [s].")] = None,
     humans: HumansOption = None,
 ) -> dict[str, Any]:
     """Return the changes to a scenario that the options of a road ask for."""
@@ -98,6 +100,8 @@ def scenario_changes(
         "warmup": warmup,
         "cav_share": cav_share,
         "cav_types": cav_types.split(",") if cav_types else None,
+        "begin": begin,
+        "end": end,
         "population": str(humans.absolute()) if humans else None,
     }
     return {name: value for name, value in asked.items() if value is not None}

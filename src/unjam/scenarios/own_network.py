@@ -10,8 +10,8 @@ import numpy as np
 from pydantic import Field, model_validator
 from pydantic.dataclasses import dataclass
 
-from unjam.errors import InputError
-from unjam.parameters import STRICT, build
+from unjam.errors import InputError, wrong
+from unjam.parameters import STRICT, NotNegative, Positive, build
 from unjam.scenarios.road import OwnRoad
 from unjam.scenarios.scenario import Scenario
 from unjam.sumo_files import read_sumo_files
@@ -45,6 +45,10 @@ class OwnNetwork(Scenario):
     """share of the vehicles that become CAVs, cars and the like alone"""
     cav_types: tuple[str, ...] = ()
     """vehicle types all of whose vehicles become CAVs"""
+    begin: NotNegative | None = None
+    """time at which SUMO begins [s]; None: as its configuration says. Who departs before is left out"""
+    end: Positive | None = None
+    """time at which an episode ends, where no horizon is given [s]; None: as its configuration says"""
     noise: Annotated[float, Field(ge=0, le=0)] = 0.0
     """none: people drive as the vehicle types say"""
 
@@ -77,6 +81,8 @@ class OwnNetwork(Scenario):
     def draw(self, generator: np.random.Generator) -> OwnRoad:
         """Return the network; random is which vehicles the share picks."""
         files = read_sumo_files(Path(self.file))
+        if self.begin is not None:
+            files = files._replace(begin=self.begin, options={**files.options, "begin": f"{self.begin:g}"})
         return OwnRoad(
             files=files,
             limit_speed=float("nan"),
@@ -110,7 +116,7 @@ class OwnNetwork(Scenario):
 
 
 def own_network(file: str, changes: dict[str, Any]) -> OwnNetwork:
-    """Return the scenario of a .sumocfg file: time step and horizon are its own, unless `changes` say more.
+    """Return the scenario of a .sumocfg file: step, begin and end are its own, unless `changes` say more.
 
     Raises:
         InputError: one line on what is missing or broken, before SUMO starts.
@@ -122,8 +128,11 @@ def own_network(file: str, changes: dict[str, Any]) -> OwnNetwork:
     made = build(OwnNetwork, values, Path(file).name)
     if "horizon" in changes:
         return made
-    seconds = LONGEST if files.end is None else files.end - files.begin
-    return replace(made, horizon=max(1, int(seconds / made.decision_step + 1e-9)))
+    begin = files.begin if made.begin is None else made.begin
+    end = made.end or (begin + LONGEST if files.end is None else files.end)
+    if end <= begin:
+        raise wrong("end", end, f"after begin, {begin:g} s")
+    return replace(made, horizon=max(1, int((end - begin) / made.decision_step + 1e-9)))
 
 
 @cache
