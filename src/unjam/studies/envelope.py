@@ -38,7 +38,7 @@ SEEDS = 4
 SEEDS_IMPAIRED = 12
 JAMMED = 6000
 """steps of a warm-up in which a wave grows"""
-ON_RINGS = ("unjam:best", "unjam:ring-best", "unjam:ring-gap-tuned", "unjam:ring-tuned")
+ON_RINGS = ("unjam:best", "unjam:ring-best", "unjam:ring-jammed-best", "unjam:ring-jammed-tuned")
 ON_FIGURE_EIGHTS = ("unjam:best", "unjam:figure-eight-best", "unjam:figure-eight-tuned")
 PEOPLE = "human"
 ROOM = {"shorter": (8, 10), "as trained on": (10, 12), "longer": (13, 18)}
