@@ -32,17 +32,20 @@ EPISODES = 10
 """of each driver on each road"""
 PEOPLE = "human"
 TUNED: dict[str, tuple[str, ...]] = {
-    "rings": ("pi", "unjam:ring-tuned", "unjam:ring-gap-tuned", "unjam:rings-tuned", "follower-stopper"),
+    "rings": ("pi", "unjam:ring-tuned", "unjam:rings-tuned", "follower-stopper"),
     "figure-eights": ("unjam:figure-eight-tuned", "pacer:varying=true"),
     "motorways": ("jam-ahead", "unjam:on-ramp-tuned", "cruise"),
 }
 """experts of which the best on a road is its 1"""
+PI_ON_RINGS = "pi:window=23,catch_up_speed=0.5994,gap_lower=3,gap_upper=50,time_constant=0.9775,safe_gap=4"
+"""what `unjam tune rings --expert pi` finds"""
 JUDGED: dict[str, str] = {
     "unjam:best": "unjam:best",
-    "PI from its gap, tuned on the rings": "unjam:rings-tuned",
+    "PI, tuned on the rings": PI_ON_RINGS,
     "PI": "pi",
     "FollowerStopper": "follower-stopper",
     "jam-ahead": "jam-ahead",
+    "unjam:ring-best": "unjam:ring-best",
 }
 """who is judged on every road, by label"""
 KEPT = (
