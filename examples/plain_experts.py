@@ -48,9 +48,22 @@ def idm(p: Any, s: State, m: Any) -> float:
 
 def pi(p: Any, s: State, m: Any) -> float:
     average = mean(p, m, s.speed)
+    return toward(average, average, p, s, m)
+
+
+def pi_from_gap(p: Any, s: State, m: Any) -> float:
+    if not hasattr(m, "first"):
+        m.first = max((s.leader_gap - p.people_gap) / p.people_headway, 0.0)
+    average = mean(p, m, s.speed)
+    left = clip(1.0 - (m.seen - 1) * (p.time_step / p.fading), 0.0, 1.0)
+    return toward(average + left * (m.first - average), average, p, s, m)
+
+
+def toward(wanted: float, average: float, p: Any, s: State, m: Any) -> float:
+    """PI with saturation for the mean that it follows, beside the mean that a network sees."""
     command = getattr(m, "command", s.speed if p.first_command == "own-speed" else 0.0)
     room = (s.leader_gap - p.gap_lower) / (p.gap_upper - p.gap_lower)
-    target = average + p.catch_up_speed * clip(room, 0.0, 1.0)
+    target = wanted + p.catch_up_speed * clip(room, 0.0, 1.0)
     ahead = 2.0 * (s.leader_speed - s.speed)
     safe = max(ahead, p.safe_gap) if p.safe_gap_rule == "closing" else p.safe_gap
     alpha = clip((s.leader_gap - safe) / 2.0, 0.0, 1.0)
@@ -147,4 +160,4 @@ def constant(p: Any, s: State, m: Any) -> float:
 
 EXPERTS = {"idm": idm, "pi": pi, "follower-stopper": follower_stopper, "acc": acc, "lacc": acc, "bcm": bcm}
 EXPERTS |= {"ovm": ovm, "pacer": pacer, "jam-absorber": jam_absorber, "constant": constant}
-EXPERTS |= {"cruise": cruise, "jam-ahead": jam_ahead}
+EXPERTS |= {"cruise": cruise, "jam-ahead": jam_ahead, "pi-from-gap": pi_from_gap}
