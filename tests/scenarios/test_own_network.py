@@ -73,6 +73,16 @@ def test_who_would_depart_before_the_begin_is_left_out(tmp_path: Path, simulatio
     assert (len(early.vehicle_ids), len(late.vehicle_ids)) == (4, 2)
 
 
+def test_a_begin_after_the_end_that_the_configuration_names_needs_another_end(
+    tmp_path: Path, simulation: Simulation
+) -> None:
+    road = str(straight(tmp_path, '<vehicle id="it" type="car" route="along" depart="90"/>', end=60.0))
+    for end in ({"end": 100.0}, {"horizon": 200}):
+        late = own_network(road, {"cav_share": 1.0, "begin": 80.0, **end})
+        episode = run_episode(late, Human(), (0,), simulation=simulation)
+        assert (episode.vehicle_ids, late.horizon) == (("it",), 200)
+
+
 @pytest.mark.parametrize("times", [{"begin": 90.0}, {"end": 20.0}, {"begin": 50.0, "end": 50.0}])
 def test_an_end_before_the_begin_is_refused(times: dict[str, Any], tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"end: .* is not allowed; allowed: after begin"):

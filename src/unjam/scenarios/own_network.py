@@ -82,7 +82,9 @@ class OwnNetwork(Scenario):
         """Return the network; random is which vehicles the share picks."""
         files = read_sumo_files(Path(self.file))
         if self.begin is not None:
-            files = files._replace(begin=self.begin, options={**files.options, "begin": f"{self.begin:g}"})
+            # The horizon ends an episode; SUMO would refuse an end of the configuration that is earlier.
+            options = {name: value for name, value in files.options.items() if name != "end"}
+            files = files._replace(begin=self.begin, options={**options, "begin": f"{self.begin:g}"})
         return OwnRoad(
             files=files,
             limit_speed=float("nan"),
