@@ -17,15 +17,13 @@ from unjam.controller import make_driver
 from unjam.drivers.driver import Driver
 from unjam.drivers.follower_stopper import FollowerStopper
 from unjam.files import to_json, write_whole
-from unjam.measures.drivable import DRIVABLE, verdicts
+from unjam.measures.drivable import DRIVABLE
 from unjam.measures.statistics import crossed_estimate, estimate
 from unjam.measures.table import cell_of
 from unjam.physics.arrays import Floats
 from unjam.scenarios.ring import Ring
-from unjam.scenarios.scenario import Scenario
-from unjam.studies.study import Study, StudyFolder, planned, read_part
-from unjam.training.evaluate import Rows, evaluate
-from unjam.training.seeds import held_out_seeds
+from unjam.studies.study import Study, StudyFolder, judged, planned, read_part
+from unjam.training.family import GROWN
 from unjam.worlds.workers import Workers
 
 LENGTHS = (220, 230, 240, 250, 260, 270)
@@ -40,7 +38,7 @@ PI_LONG = (
 """what `unjam tune ring --expert pi --steps 12000000` finds; of the other it is `unjam:ring-gap-tuned`"""
 CEILING = "leads all to the limit"
 OTHER = "residual of the other ring"
-ROADS = {"ring": 0, "ring-jammed": 6000}
+ROADS = {"ring": 0, "ring-jammed": GROWN}
 """their warm-up, in steps"""
 KEPT = (
     *("return", "mean_speed", "mean_speed_steady", "throughput_veh_per_h", "fuel_ml_per_km", "drivable"),
@@ -62,15 +60,6 @@ def drivers_on(ring: Ring, trained: dict[str, Driver]) -> dict[str, Driver]:
     return {**made, **trained}
 
 
-def _rows_on(ring: Scenario, drivers: dict[str, Driver], workers: Workers) -> dict[str, Any]:
-    rows: Rows = evaluate(ring, drivers, held_out_seeds(SEEDS), workers).rows
-    said = verdicts(rows)
-    return {
-        label: {"drivable": said[label], "episodes": [{name: row[name] for name in KEPT} for row in found]}
-        for label, found in rows.items()
-    }
-
-
 def _write(studies: StudyFolder, seeds: int, folder: Path, workers: int) -> None:
     made = {
         road: [make_driver(str(studies.folder_of(run)), 0.1) for run in planned([road], ["best"], seeds)]
@@ -84,12 +73,12 @@ def _write(studies: StudyFolder, seeds: int, folder: Path, workers: int) -> None
             found = {}
             for length in LENGTHS:
                 ring = replace(Ring(), length=(length, length), warmup=warmup)
-                found[str(length)] = _rows_on(ring, drivers_on(ring, trained), pool)
+                found[str(length)] = judged(ring, drivers_on(ring, trained), SEEDS, KEPT, pool)
             write_whole(folder / f"{name}.json", to_json(found))
 
 
 def table(road: str, folder: Path) -> pd.DataFrame:
-    """Return who earns what on a road, over all lengths, and what each is beyond both tuned experts."""
+    """Return who earns what on a road, over all lengths, and what each is beyond the tuned experts."""
     rows = [
         {"driver": label, "seed": seed, "verdict": found["drivable"], **row}
         for of_length in read_part(folder, road).values()

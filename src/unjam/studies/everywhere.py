@@ -24,8 +24,6 @@ from unjam.scenarios.scenario import Scenario
 from unjam.studies.study import Study, StudyFolder, about_study
 from unjam.training.family import FAMILY, GROUPS
 from unjam.training.seeds import held_out_seeds, tuning_seeds
-from unjam.worlds.batch.run import run_batches
-from unjam.worlds.batch.world import why_not
 from unjam.worlds.workers import EpisodeTask, Workers
 
 EPISODES = 10
@@ -64,9 +62,7 @@ def _driven(
         for name in drivers.values()
         for index, seed in enumerate(seeds)
     ]
-    # Ten thousands of vehicles that drive for minutes: rings are stepped together, which tests hold equal.
-    episodes = workers.run(tasks) if why_not(scenario) else run_batches(tasks)
-    rows = [{key: row[key] for key in KEPT} for row in map(measure, episodes)]
+    rows = [{key: row[key] for key in KEPT} for row in map(measure, workers.run(tasks))]
     count = len(seeds)
     return {label: rows[n * count : (n + 1) * count] for n, label in enumerate(drivers)}
 

@@ -14,13 +14,18 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from unjam.drivers.driver import Driver
 from unjam.files import make_folder, to_json, write_whole
 from unjam.manifest import manifest
+from unjam.measures.drivable import verdicts
 from unjam.reports.results import EVALUATION_FILE, read_progress, read_rows
+from unjam.scenarios.scenario import Scenario
 from unjam.training.config import RunConfig, load_config
-from unjam.training.evaluate import TRAINED
+from unjam.training.evaluate import TRAINED, evaluate
 from unjam.training.folder import read_config
 from unjam.training.presets import CLOSING_ABSORBER
+from unjam.training.seeds import held_out_seeds
+from unjam.worlds.workers import Workers
 
 BUDGET = 300_000
 """actual steps of every learner"""
@@ -94,6 +99,21 @@ def measure_parts(
 def read_part(folder: Path, name: str) -> Any:
     """Return what a part has answered."""
     return json.loads((folder / f"{name}.json").read_text(encoding="utf-8"))
+
+
+def judged(
+    scenario: Scenario, drivers: dict[str, Driver], seeds: int, kept: Sequence[str], workers: Workers
+) -> dict[str, Any]:
+    """Return what each driver did on seeds that judge: its verdict, and the numbers `kept` of each episode.
+
+    People alone, where they are among them, are `human`.
+    """
+    rows = evaluate(scenario, drivers, held_out_seeds(seeds), workers).rows
+    said = verdicts(rows)
+    return {
+        label: {"drivable": said[label], "episodes": [{name: row[name] for name in kept} for row in found]}
+        for label, found in rows.items()
+    }
 
 
 @dataclass(frozen=True)
