@@ -73,6 +73,8 @@ PRESETS["rings"] = {
 CLOSING_ABSORBER = "jam-absorber:gap_gain=0,push=0.9,speed_gain=0.8"
 """the expert that gets furthest on the merge"""
 
+LITTLE_NOISE = {"exploration_std": 0.015, "learn_exploration": False}
+"""exploration that neither grows nor vanishes, on experts that much of it upsets"""
 BEST: dict[str, dict[str, Any]] = {
     # Much of what is learned from few episodes is their noise: iterations are large, and the batch affords
     # them. More exploration makes another task of it: PI answers noise with braking. Less vanishes too soon.
@@ -81,7 +83,7 @@ BEST: dict[str, dict[str, Any]] = {
         "steps": 6_000_000,
         "world": "batch",
         "expert": "unjam:ring-gap-tuned",
-        "policy": {"remember": True, "exploration_std": 0.015, "learn_exploration": False},
+        "policy": {"remember": True, **LITTLE_NOISE},
         "trpo": {"batch_steps": 96_000, "target_kl": 0.02},
         "virtual": {"virtual_ratio": 0.0},
         "evaluation": {"every": 5, "validation_episodes": 32},
@@ -93,7 +95,7 @@ BEST: dict[str, dict[str, Any]] = {
         "world": "batch",
         "road": {"horizon": 1500},
         "expert": "unjam:ring-jammed-tuned",
-        "policy": {"remember": True, "exploration_std": 0.015, "learn_exploration": False},
+        "policy": {"remember": True, **LITTLE_NOISE},
         "trpo": {"batch_steps": 48_000, "target_kl": 0.02},
         "virtual": {"virtual_ratio": 0.0},
         "evaluation": {"every": 6, "validation_episodes": 32},
@@ -131,7 +133,7 @@ QUICK: dict[str, dict[str, Any]] = {
         **PRESETS["demo"],
         "steps": 1_500_000,
         "expert": "unjam:ring-tuned",
-        "policy": {"exploration_std": 0.015, "learn_exploration": False},
+        "policy": LITTLE_NOISE,
         "trpo": {"target_kl": 0.02},
     },
     # Larger steps of the policy unlearn what the expert can, and no wave comes in the virtual environment of
