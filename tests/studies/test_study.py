@@ -3,7 +3,12 @@ from pathlib import Path
 
 import pytest
 
-from unjam.studies.study import Part, about_study, measure_parts, read_part
+from unjam.errors import EpisodeError
+from unjam.scenarios import Ring
+from unjam.studies import study
+from unjam.studies.study import Part, about_study, judged, measure_parts, read_part
+from unjam.training.evaluate import Evaluation
+from unjam.worlds.workers import Workers
 
 
 def square(number: int) -> dict[str, int]:
@@ -53,3 +58,10 @@ def test_a_study_keeps_its_first_manifest_and_says_when_it_went_on(tmp_path: Pat
     found = about_study(tmp_path)
     assert found["started"] == "long ago"
     assert [later["commit"] for later in found["went_on"]] == [first["commit"]] * 2
+
+
+def test_an_episode_that_failed_is_told_and_not_left_out_of_a_mean(monkeypatch: pytest.MonkeyPatch) -> None:
+    failed = {"status": "failed", "error": "EpisodeError", "reason": "SUMO cannot start", "seed": [1, 0]}
+    monkeypatch.setattr(study, "evaluate", lambda *given: Evaluation({"pi": [failed]}, {}))
+    with Workers(1) as workers, pytest.raises(EpisodeError, match=r"SUMO cannot start \(seed \[1, 0\]\)"):
+        judged(Ring(), {}, 1, (), workers)

@@ -16,7 +16,7 @@ from unjam.scenarios import SCENARIOS
 from unjam.studies import STUDIES, TOGETHER
 from unjam.studies.study import REFERENCES, ROADS, OnProgress, PlannedRun, Study, StudyFolder
 from unjam.training.config import load_config
-from unjam.training.evaluate import evaluate, save_evaluation
+from unjam.training.evaluate import evaluate, raise_failures, save_evaluation
 from unjam.training.executors import Executor, run_all, training_command
 from unjam.training.folder import read_config
 from unjam.training.seeds import held_out_seeds
@@ -127,6 +127,7 @@ def drive_references(road: str, studies: StudyFolder, workers: int) -> None:
     drivers = {label: driver for label, driver in made.items() if can_drive(driver, scenario)}
     with Workers(workers) as processes:
         found = evaluate(scenario, drivers, held_out_seeds(config.evaluation.episodes), processes)
+    raise_failures(found)
     save_evaluation(studies.drives_of(road), found, {"scenario": config.scenario, "manifest": manifest()})
 
 

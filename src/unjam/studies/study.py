@@ -21,7 +21,7 @@ from unjam.measures.drivable import verdicts
 from unjam.reports.results import EVALUATION_FILE, read_progress, read_rows
 from unjam.scenarios.scenario import Scenario
 from unjam.training.config import RunConfig, load_config
-from unjam.training.evaluate import TRAINED, evaluate
+from unjam.training.evaluate import TRAINED, evaluate, raise_failures
 from unjam.training.folder import read_config
 from unjam.training.presets import CLOSING_ABSORBER
 from unjam.training.seeds import held_out_seeds
@@ -108,7 +108,9 @@ def judged(
 
     People alone, where they are among them, are `human`.
     """
-    rows = evaluate(scenario, drivers, held_out_seeds(seeds), workers).rows
+    driven = evaluate(scenario, drivers, held_out_seeds(seeds), workers)
+    raise_failures(driven)
+    rows = driven.rows
     said = verdicts(rows)
     return {
         label: {"drivable": said[label], "episodes": [{name: row[name] for name in kept} for row in found]}
