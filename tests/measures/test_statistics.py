@@ -26,7 +26,7 @@ from unjam.measures.statistics import (
 )
 
 COUNTS = (3, 5, 10, 20)
-REPEATS = 1500
+REPEATS = 500
 RING = Path(__file__).parents[2] / "results" / "drivable" / "ring.json"
 NUMBERS = st.lists(st.floats(-1e3, 1e3), min_size=2, max_size=12)
 
