@@ -10,12 +10,15 @@ from functools import partial
 from itertools import product
 from math import isfinite
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from unjam.controller import make_driver
+from unjam.controller.certificate import certificate_of
+from unjam.controller.file import SUFFIX, read_controller
 from unjam.drivers.safety import Actuator, SafetyFilter
 from unjam.drivers.sensors import Sensors
 from unjam.files import to_json, write_whole
@@ -26,14 +29,26 @@ from unjam.scenarios.figure_eight import FigureEight
 from unjam.scenarios.ring import Ring
 from unjam.scenarios.scenario import Scenario
 from unjam.studies.study import Study, StudyFolder, judged, read_part
+from unjam.training.export import export_controller
 from unjam.training.family import GROWN
 from unjam.worlds.workers import Workers
 
 SEEDS = 4
 """of each driver on each road"""
 SEEDS_IMPAIRED = 12
-ON_RINGS = ("unjam:best", "unjam:ring-best", "unjam:ring-jammed-best", "unjam:ring-jammed-tuned")
-ON_FIGURE_EIGHTS = ("unjam:best", "unjam:figure-eight-best", "unjam:figure-eight-tuned")
+ROADS: dict[str, str] = {
+    "unjam:best": "ring-jammed",
+    "unjam:ring-best": "ring",
+    "unjam:ring-gap-tuned": "ring",
+    "unjam:ring-tuned": "ring",
+    "unjam:rings-tuned": "ring",
+    "unjam:ring-jammed-best": "ring-jammed",
+    "unjam:ring-jammed-tuned": "ring-jammed",
+    "unjam:figure-eight-best": "figure-eight",
+    "unjam:figure-eight-tuned": "figure-eight",
+}
+"""what ships for closed roads, and the road that it is for"""
+IMPAIRED_DRIVERS = ("unjam:best", "unjam:ring-best", "unjam:ring-jammed-best", "unjam:ring-jammed-tuned")
 PEOPLE = "human"
 ROOM = {"shorter": (8, 10), "as trained on": (10, 12), "longer": (13, 18)}
 """road for each vehicle [m], from and to"""
@@ -83,11 +98,13 @@ def impaired(warmup: int) -> Iterator[tuple[str, Ring]]:
 
 def _write(studies: StudyFolder, seeds: int, folder: Path, workers: int) -> None:
     parts: dict[str, tuple[Iterator[tuple[str, Scenario]], tuple[str, ...], int]] = {
-        "rings": (rings(), ON_RINGS, SEEDS),
-        "figure-eights": (figure_eights(), ON_FIGURE_EIGHTS, SEEDS),
-        "impaired": (impaired(0), ON_RINGS, SEEDS_IMPAIRED),
-        "impaired-jammed": (impaired(GROWN), ON_RINGS, SEEDS_IMPAIRED),
+        "rings": (rings(), tuple(ROADS), SEEDS),
+        "figure-eights": (figure_eights(), tuple(ROADS), SEEDS),
+        "impaired": (impaired(0), IMPAIRED_DRIVERS, SEEDS_IMPAIRED),
+        "impaired-jammed": (impaired(GROWN), IMPAIRED_DRIVERS, SEEDS_IMPAIRED),
     }
+    worst = {controller: _worst_cases(controller, road) for controller, road in ROADS.items()}
+    write_whole(folder / "worst.json", to_json(worst))
     with Workers(workers) as pool:
         for part, (roads, drivers, count) in parts.items():
             found = {}
@@ -95,6 +112,31 @@ def _write(studies: StudyFolder, seeds: int, folder: Path, workers: int) -> None
                 made = {driver: make_driver(driver, road.decision_step) for driver in (PEOPLE, *drivers)}
                 found[name] = judged(road, made, count, KEPT, pool)
             write_whole(folder / f"{part}.json", to_json(found))
+
+
+def _worst_cases(controller: str, road: str) -> dict[str, Any]:
+    """Return what was tried to make a controller touch its leader, from all that it visits on its road."""
+    with TemporaryDirectory() as folder:
+        file = Path(folder, f"controller{SUFFIX}")
+        export_controller(controller, file, scenario=road)
+        return certificate_of(read_controller(file))["worst"]
+
+
+def worst_table(folder: Path) -> pd.DataFrame:
+    """Return how close leaders that brake and attack came to each controller."""
+    return pd.DataFrame(
+        {
+            "controller": controller,
+            "road": ROADS[controller],
+            "stops": f"{worst['stops']:,}",
+            "steps": f"{worst['steps']:,}",
+            "contacts": worst["contacts"],
+            "smallest gap [m]": f"{worst['smallest_gap']:.2f}",
+            "smallest headway [s]": f"{worst['smallest_headway']:.2f}",
+            "hardest braking [m/s²]": f"{worst['hardest_braking']:.1f}",
+        }
+        for controller, worst in read_part(folder, "worst").items()
+    )
 
 
 def _closest(episodes: list[dict[str, Any]]) -> float:
@@ -155,6 +197,7 @@ ENVELOPE = Study(
     write=_write,
     minutes=15.0,
     tables={
+        "worst": worst_table,
         **{part: partial(domain_table, part) for part in ("rings", "figure-eights")},
         **{part: partial(impaired_table, part) for part in ("impaired", "impaired-jammed")},
     },
