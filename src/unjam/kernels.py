@@ -20,12 +20,14 @@ from typing import Any
 CHOICE = "UNJAM_KERNELS"
 SETTINGS = {
     "OPENBLAS_CORETYPE": "Haswell",
+    # Products here are small: threads wait for each other, and where others compute too they wait long.
+    "OPENBLAS_NUM_THREADS": "1",
     "NPY_DISABLE_CPU_FEATURES": "X86_V4 AVX512_ICL AVX512_SPR",
     "ATEN_CPU_CAPABILITY": "avx2",
     # AVX2 would hold on Intel's processors alone: on others MKL takes it for COMPATIBLE, without a word.
     "MKL_CBWR": "COMPATIBLE",
 }
-"""NumPy's products; NumPy's functions; torch's functions; torch's products and long functions"""
+"""NumPy's products, and on how many cores; NumPy's functions; torch's functions; torch's products and long functions"""
 OLDER_NUMPY = "AVX512F AVX512CD AVX512_SKX AVX512_CLX AVX512_CNL AVX512_ICL AVX512_SPR"
 """what NumPy before 2.4 calls the same"""
 LOADED = ("numpy", "torch")
