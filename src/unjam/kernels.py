@@ -27,7 +27,7 @@ SETTINGS = {
     # AVX2 would hold on Intel's processors alone: on others MKL takes it for COMPATIBLE, without a word.
     "MKL_CBWR": "COMPATIBLE",
 }
-"""NumPy's products, and on how many cores; NumPy's functions; torch's functions; torch's products and long functions"""
+"""NumPy's products, on how many cores; its functions; torch's functions; its products and long functions"""
 OLDER_NUMPY = "AVX512F AVX512CD AVX512_SKX AVX512_CLX AVX512_CNL AVX512_ICL AVX512_SPR"
 """what NumPy before 2.4 calls the same"""
 LOADED = ("numpy", "torch")

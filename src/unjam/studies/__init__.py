@@ -1,7 +1,7 @@
 """The studies of `unjam reproduce`: the paper's tables and figures."""
 
 from unjam.studies.comparison import FIGURE_5, comparison_of
-from unjam.studies.drivable import DRIVABLE_STUDY
+from unjam.studies.drivable import DRIVABLE_EIGHT, DRIVABLE_STUDY
 from unjam.studies.envelope import ENVELOPE
 from unjam.studies.everywhere import EVERYWHERE_STUDY
 from unjam.studies.figure_6 import FIGURE_6
@@ -48,6 +48,7 @@ STUDIES: dict[str, Study] = {
     ),
     "robustness": ROBUSTNESS,
     "drivable": DRIVABLE_STUDY,
+    "drivable-eight": DRIVABLE_EIGHT,
     "envelope": ENVELOPE,
     "everywhere": EVERYWHERE_STUDY,
 }

@@ -1,14 +1,15 @@
-"""What a drivable residual is worth on the ring: beside tuned experts, people alone, and the ceiling.
+"""What a drivable residual is worth on closed roads: beside tuned experts, people alone, and a ceiling.
 
-Every driver on every length on the same seeds; the seeds are shared by all trainings, which the intervals
-know. The ceiling leads all to the limit of the length, which no car can know.
+Every driver on every length or radius on the same seeds; the seeds are shared by all trainings, which the
+intervals know. The ring's ceiling leads all to the limit of the length, which no car can know.
 """
 
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from math import inf, isinf
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pandas as pd
@@ -21,14 +22,17 @@ from unjam.measures.drivable import DRIVABLE
 from unjam.measures.statistics import crossed_estimate, estimate
 from unjam.measures.table import cell_of
 from unjam.physics.arrays import Floats
+from unjam.scenarios.figure_eight import FigureEight
 from unjam.scenarios.ring import Ring
+from unjam.scenarios.scenario import Scenario
 from unjam.studies.study import Study, StudyFolder, judged, planned, read_part
 from unjam.training.family import GROWN
+from unjam.training.presets import BEST
 from unjam.worlds.workers import Workers
 
-LENGTHS = (220, 230, 240, 250, 260, 270)
 SEEDS = 10
-"""of each length"""
+"""of each length or radius"""
+PEOPLE = "human"
 PI_TUNED = "PI, tuned"
 FROM_GAP, FROM_GAP_JAMMED = "PI from its gap, tuned", "PI from its gap, tuned in a jam"
 PI_LONG = (
@@ -37,43 +41,89 @@ PI_LONG = (
 )
 """what `unjam tune ring --expert pi --steps 12000000` finds; of the other it is `unjam:ring-gap-tuned`"""
 CEILING = "leads all to the limit"
-OTHER = "residual of the other ring"
-ROADS = {"ring": 0, "ring-jammed": GROWN}
-"""their warm-up, in steps"""
+OTHER = "residual of the other road"
+PACER_TUNED, PACER_GENTLE = "pacer, tuned", "pacer, tuned, with room"
 KEPT = (
-    *("return", "mean_speed", "mean_speed_steady", "throughput_veh_per_h", "fuel_ml_per_km", "drivable"),
-    *("min_headway", "cav_max_braking", "filter_share", "speed_std_fleet_steady", "time_to_dissolve"),
+    *("return", "return_eq16", "mean_speed", "mean_speed_steady", "throughput_veh_per_h", "fuel_ml_per_km"),
+    *("drivable", "min_headway", "cav_max_braking", "filter_share", "speed_std_fleet_steady"),
+    "time_to_dissolve",
 )
 """of each episode"""
 
 
-def drivers_on(ring: Ring, trained: dict[str, Driver]) -> dict[str, Driver]:
-    """Return all drivers of a ring of one length, by label."""
-    named = {
-        **{"human": "human", "PI": "pi", "PI (paper)": "pi:time_constant=0"},
+@dataclass(frozen=True)
+class JudgedRoad:
+    """A road, and who is judged on it."""
+
+    sizes: tuple[int, ...]
+    """lengths or radii [m]"""
+    of_size: Callable[[int], Scenario]
+    named: dict[str, str]
+    """drivers by label"""
+    baselines: tuple[str, ...]
+    """the tuned experts among them"""
+    metric: str = "return"
+    """what the trainings maximised"""
+    ceiling: Callable[[int], Driver] | None = None
+
+    def drivers(self, size: int, trained: dict[str, Driver]) -> dict[str, Driver]:
+        """Return all drivers of one size, by label."""
+        road = self.of_size(size)
+        made = {label: make_driver(name, road.decision_step) for label, name in self.named.items()}
+        return {**made, **({CEILING: self.ceiling(size)} if self.ceiling else {}), **trained}
+
+
+def _ring(warmup: int, length: int) -> Ring:
+    return Ring(length=(length, length), warmup=warmup)
+
+
+def _lead(length: int) -> Driver:
+    return FollowerStopper(desired_speed=Ring().limit(length), gaps=(0.5, 1.0, 1.5), time_constant=3.0)
+
+
+OF_RINGS = JudgedRoad(
+    sizes=(220, 230, 240, 250, 260, 270),
+    of_size=partial(_ring, 0),
+    named={
+        **{PEOPLE: "human", "PI": "pi", "PI (paper)": "pi:time_constant=0"},
         **{PI_TUNED: PI_LONG, FROM_GAP: "unjam:ring-gap-tuned"},
         FROM_GAP_JAMMED: "unjam:ring-jammed-tuned",
-    }
-    made = {label: make_driver(name, ring.decision_step) for label, name in named.items()}
-    limit = ring.limit(ring.length[0])
-    made[CEILING] = FollowerStopper(desired_speed=limit, gaps=(0.5, 1.0, 1.5), time_constant=3.0)
-    return {**made, **trained}
+    },
+    baselines=(PI_TUNED, FROM_GAP, FROM_GAP_JAMMED),
+    ceiling=_lead,
+)
+ROADS = {
+    "ring": OF_RINGS,
+    "ring-jammed": replace(OF_RINGS, of_size=partial(_ring, GROWN)),
+    "figure-eight": JudgedRoad(
+        sizes=(32, 33, 34, 35),
+        of_size=lambda radius: FigureEight(radius=(radius, radius)),
+        named={
+            **{PEOPLE: "human", "pacer": "pacer", "varying pacer": "pacer:varying=true"},
+            PACER_TUNED: "unjam:figure-eight-tuned",
+            PACER_GENTLE: cast(str, BEST["figure-eight"]["expert"]),
+        },
+        baselines=(PACER_TUNED, PACER_GENTLE),
+        metric="return_eq16",
+    ),
+}
 
 
-def _write(studies: StudyFolder, seeds: int, folder: Path, workers: int) -> None:
+def _write(roads: Sequence[str], studies: StudyFolder, seeds: int, folder: Path, workers: int) -> None:
     made = {
         road: [make_driver(str(studies.folder_of(run)), 0.1) for run in planned([road], ["best"], seeds)]
-        for road in ROADS
+        for road in roads
     }
     with Workers(workers) as pool:
-        for name, warmup in ROADS.items():
+        for name in roads:
             trained = {f"training {seed}": driver for seed, driver in enumerate(made[name])}
-            (other,) = set(ROADS) - {name}
-            trained[OTHER] = made[other][0]
-            found = {}
-            for length in LENGTHS:
-                ring = replace(Ring(), length=(length, length), warmup=warmup)
-                found[str(length)] = judged(ring, drivers_on(ring, trained), SEEDS, KEPT, pool)
+            for other in set(roads) - {name}:
+                trained[OTHER] = made[other][0]
+            road = ROADS[name]
+            found = {
+                str(size): judged(road.of_size(size), road.drivers(size, trained), SEEDS, KEPT, pool)
+                for size in road.sizes
+            }
             write_whole(folder / f"{name}.json", to_json(found))
 
 
@@ -91,10 +141,10 @@ def table(road: str, folder: Path) -> pd.DataFrame:
     groups = {label: [label] for label in labels if label not in trainings}
     if trainings:
         groups[f"residual, {len(trainings)} trainings"] = trainings
-    return pd.DataFrame([_row(episodes, label, members) for label, members in groups.items()])
+    return pd.DataFrame([_row(ROADS[road], episodes, label, members) for label, members in groups.items()])
 
 
-def _row(episodes: pd.DataFrame, label: str, members: list[str]) -> dict[str, Any]:
+def _row(road: JudgedRoad, episodes: pd.DataFrame, label: str, members: list[str]) -> dict[str, Any]:
     """Return what a driver, or several trainings together, are worth on a road."""
     own = episodes[episodes["driver"].isin(members)]
     mean, closest = (
@@ -104,7 +154,7 @@ def _row(episodes: pd.DataFrame, label: str, members: list[str]) -> dict[str, An
     worst = [verdict for verdict in own["verdict"] if verdict != DRIVABLE]
 
     def beyond(baseline: str, name: str, digits: int) -> str:
-        """Return what they are beyond another driver, on each seed over all lengths."""
+        """Return what they are beyond another driver, on each seed over all sizes."""
         by_seed = episodes.pivot_table(name, "driver", "seed")
         values = (by_seed.loc[members] - by_seed.loc[baseline]).to_numpy()
         found = crossed_estimate(values) if len(members) > 1 else estimate(values[0])
@@ -112,12 +162,10 @@ def _row(episodes: pd.DataFrame, label: str, members: list[str]) -> dict[str, An
 
     return {
         "driver": label,
-        "return": f"{mean['return']:.0f}",
-        f"beyond {PI_TUNED}": beyond(PI_TUNED, "return", 0),
-        f"beyond {FROM_GAP}": beyond(FROM_GAP, "return", 0),
-        f"beyond {FROM_GAP_JAMMED}": beyond(FROM_GAP_JAMMED, "return", 0),
+        "return": f"{mean[road.metric]:.0f}",
+        **{f"beyond {baseline}": beyond(baseline, road.metric, 0) for baseline in road.baselines},
         "mean speed [m/s]": f"{mean['mean_speed']:.2f}",
-        "beyond people [m/s]": beyond("human", "mean_speed", 2),
+        "beyond people [m/s]": beyond(PEOPLE, "mean_speed", 2),
         "flow [veh/h]": f"{mean['throughput_veh_per_h']:.0f}",
         "fuel [ml/km]": f"{mean['fuel_ml_per_km']:.0f}",
         "dissolved after [s]": _dissolved(np.asarray(own["time_to_dissolve"], np.float64)),
@@ -132,10 +180,21 @@ def _dissolved(times: Floats) -> str:
     return "–" if not share else f"{np.nanmean(times):.1f}" + (f" ({share:.0%})" if share < 1.0 else "")
 
 
-DRIVABLE_STUDY = Study(
-    title="what a drivable residual is worth beside the tuned expert, on the ring and the jammed ring",
-    runs=lambda seeds: planned(ROADS, ["best"], seeds),
-    write=_write,
-    minutes=20.0,
-    tables={road: partial(table, road) for road in ROADS},
+def _study(title: str, roads: Sequence[str], minutes: float) -> Study:
+    return Study(
+        title=title,
+        runs=lambda seeds: planned(roads, ["best"], seeds),
+        write=partial(_write, roads),
+        minutes=minutes,
+        tables={road: partial(table, road) for road in roads},
+    )
+
+
+DRIVABLE_STUDY = _study(
+    "what a drivable residual is worth beside the tuned expert, on the ring and the jammed ring",
+    ("ring", "ring-jammed"),
+    20.0,
+)
+DRIVABLE_EIGHT = _study(
+    "what a drivable residual is worth beside the tuned expert, on the figure eight", ("figure-eight",), 5.0
 )
