@@ -1,5 +1,6 @@
 """The experts of the figure eight, the merge and motorways: they know where they are, and what is ahead."""
 
+from collections.abc import Iterable
 from dataclasses import replace
 from functools import cached_property
 from typing import Annotated, Any, ClassVar
@@ -94,13 +95,20 @@ class Pacer(Formula):
         loop = state.loop_length
         xp = namespace(loop)
         acceleration, gathered, nearest = loop * 0.0, loop * 0.0, loop * 0.0 + float("inf")
-        for lap, pacer in self._tuned.items():
-            found, after = pacer.act(state, memory)
+        for lap in self._needed(loop):
+            found, after = self._tuned[lap].act(state, memory)
             closer = abs(loop - lap) < nearest
             acceleration = xp.where(closer, found, acceleration)
             gathered = xp.where(closer, after["gathered"], gathered)
             nearest = xp.where(closer, abs(loop - lap), nearest)
         return acceleration, {"gathered": gathered}
+
+    def _needed(self, loop: Array) -> Iterable[float]:
+        """Return the laps of those pacers that drive somebody; of tensors, which may be traced, all."""
+        if not isinstance(loop, np.ndarray):
+            return self._tuned
+        laps = np.array([*self._tuned])
+        return laps[sorted(set(abs(laps[:, None] - loop).argmin(0).tolist()))].tolist()
 
     @cached_property
     def _tuned(self) -> dict[float, "Pacer"]:

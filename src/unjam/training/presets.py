@@ -108,7 +108,7 @@ BEST: dict[str, dict[str, Any]] = {
     "figure-eight": {
         "expert": f"{GATHERING_PACER},time_constant=1",
         "reward": "eq16",
-        "steps": 900_000,
+        "steps": 720_000,
         "policy": {
             "observe": ["local", "expert_acceleration", "expert_memory", "place"],
             "remember": True,
