@@ -12,7 +12,7 @@ from typing import Any
 
 from safetensors.numpy import save
 
-from unjam.controller import hash_of_controller, make_driver
+from unjam.controller import SHIPPED, hash_of_controller, make_driver
 from unjam.controller.domain import notes_on_controllers
 from unjam.drivers.driver import Driver
 from unjam.drivers.from_file import DriverLike, as_driver
@@ -185,7 +185,9 @@ def comparison(config: RunConfig, folder: Path, baselines: Sequence[str]) -> dic
     for name in baselines:
         driver = make_driver(name, scenario.decision_step)
         if can_drive(driver, scenario):
-            drivers[free_label(driver, {**expert, **drivers})] = driver
+            # The description of a shipped driver has every parameter that was tuned.
+            shipped = name.startswith(SHIPPED) and name != config.expert
+            drivers[name if shipped else free_label(driver, {**expert, **drivers})] = driver
     return {**drivers, **expert, TRAINED: make_driver(str(folder), scenario.decision_step)}
 
 
