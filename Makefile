@@ -16,7 +16,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet -c const
 
 demo: $(VENV)/.installed
 	$(BIN)/unjam train ring-jammed --preset demo
-	$(BIN)/unjam drive on-ramp -d human -d unjam:on-ramp-tuned --cav-share 0.05 --held-out --episodes 4
+	$(BIN)/unjam drive on-ramp -d human -d unjam:on-ramp-tuned --cav-share 0.05 --held-out -n 4
 
 # The tests of a file share what they have made
 SPREAD := -n 2 --dist loadfile --no-loadscope-reorder
