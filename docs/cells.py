@@ -23,7 +23,7 @@ KERNEL = AsyncKernelManager()
 
 
 def kept_in(build: Path) -> Path:
-    """Return the folder for what cells make of all that is there now; those of what was before are removed."""
+    """Return the folder for what cells make of what is there now; those of what was before are removed."""
     content = hashlib.sha256(sys.version.encode())
     files = [path for pattern in MADE_OF for path in ROOT.glob(pattern)]
     files += [path for folder in files if folder.is_dir() for path in folder.rglob("*")]
