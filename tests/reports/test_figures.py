@@ -131,7 +131,7 @@ def test_the_speed_of_a_ring_goes_on_across_its_seam() -> None:
 
 def test_paper_is_left_where_nobody_is_near_or_on_the_road() -> None:
     positions, speeds = np.array([[0.0, 400.0], [np.nan, np.nan]]), np.array([[5.0, 5.0], [np.nan, np.nan]])
-    found = speed_field(positions, speeds, np.array([0.0, 14.0, 200.0, 400.0]), 0.0)
+    found = speed_field(positions, speeds, np.array([0.0, 16.0, 200.0, 400.0]), 0.0)
     assert np.isnan(found).tolist() == [[False, True], [False, True], [True, True], [False, True]]
 
 

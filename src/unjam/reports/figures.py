@@ -34,7 +34,7 @@ POINTS_IN_TIME = 600
 """moments that a picture shows of an episode"""
 PLACES = 250
 """places along the road at which a picture shows a speed"""
-NEAR, NEAR_SECONDS = 10.0, 1.0
+NEAR, NEAR_SECONDS = 10.0, 1.4
 """how far from a vehicle a picture shows its speed: metres, and seconds of driving"""
 PEOPLE_LINE: dict[str, Any] = {"colors": "white", "linewidths": 0.35, "alpha": 0.5}
 CAV_LINE: dict[str, Any] = {"colors": CAV_COLOUR, "linewidths": 1.6}
