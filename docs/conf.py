@@ -13,13 +13,15 @@ os.environ["PYTHONPATH"] = os.pathsep.join([str(here), *filter(None, [os.environ
 import cells  # noqa: E402
 
 project = "unjam"
-author = "The unjam maintainers"
+author = copyright = "The unjam maintainers"
 release = version = unjam.__version__
 
 extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.viewcode"]
 exclude_patterns = ["_build", "**.ipynb_checkpoints"]
 html_theme = "furo"
 html_title = "unjam"
+html_static_path = ["_static"]
+html_css_files = ["pictures.css"]
 
 nb_execution_mode = "cache"
 nb_execution_cache_path = str(cells.kept_in(here / "_build" / "cells"))
