@@ -152,7 +152,7 @@ DEMO: dict[str, dict[str, Any]] = {
     # People have made a wave, and one CAV dissolves it: half a minute of training. Rows imagine no wave, and
     # iterations are large, for the batch affords them.
     "ring-jammed": {
-        "steps": 480_000,
+        "steps": 288_000,
         "world": "batch",
         "road": {"horizon": 1500},
         "trpo": {"batch_steps": 48_000},
