@@ -118,9 +118,10 @@ def train(
         if name:
             console.print(f"{name}:")
         print_metrics(of.rows)
-        console.print(lead_of(read_results(of.folder)), soft_wrap=True)
+        judged = read_results(of.folder)
+        console.print(lead_of(judged), soft_wrap=True)
         aside.print(f"controller: {of.controller}")
-        after_training(of.folder, of.gain, config.steps)
+        after_training(of.folder, of.gain, max(config.steps, judged.progress[-1]["actual_steps"]))
     aside.print(f"report: {result.report}")
 
 

@@ -36,7 +36,7 @@ PLACES = 250
 """places along the road at which a picture shows a speed"""
 NEAR, NEAR_SECONDS = 10.0, 1.4
 """how far from a vehicle a picture shows its speed: metres, and seconds of driving"""
-PEOPLE_LINE: dict[str, Any] = {"colors": "white", "linewidths": 0.35, "alpha": 0.5}
+PEOPLE_LINE: dict[str, Any] = {"colors": "white", "linewidths": 0.35, "alpha": 0.35}
 CAV_LINE: dict[str, Any] = {"colors": CAV_COLOUR, "linewidths": 1.6}
 
 STYLE: dict[Any, Any] = {
