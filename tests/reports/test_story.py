@@ -52,7 +52,7 @@ EXPERT = [100.0, 140.0, 180.0, 120.0]
 
 
 def test_what_everybody_gains_beside_people_alone_comes_first_then_the_expert() -> None:
-    nowhere = {"travel_time": float("nan")}  # nobody leaves a ring
+    nowhere: dict[str, Any] = {"travel_time": float("nan")}  # nobody leaves a ring
     result = trained_on_pi(
         [112.0, 148.0, 190.0, 130.0], EXPERT, mean_speed=1.5, fuel_ml_per_km=0.8, **nowhere
     )
@@ -77,8 +77,8 @@ def test_an_expert_that_earns_more_than_its_own_is_told_of() -> None:
         ({"collisions": 2.0}, "; no car could drive so: 2 vehicles in contact"),
     ],
 )
-def test_the_lead_says_whether_a_car_could_drive_so(changes: dict[str, float], words: str) -> None:
-    safe = {"cav_min_ttc": 9.0, "overridden": 0.0, "people_beyond_4_5": 0.0, **changes}
+def test_the_lead_says_whether_a_car_could_drive_so(changes: dict[str, Any], words: str) -> None:
+    safe: dict[str, Any] = {"cav_min_ttc": 9.0, "overridden": 0.0, "people_beyond_4_5": 0.0, **changes}
     assert words in lead_of(trained_on_pi([1.0, 2.0], [1.0, 2.0], **safe))
 
 

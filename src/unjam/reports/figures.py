@@ -194,9 +194,8 @@ def _trajectories(
         points = np.stack([np.broadcast_to(times, position.shape), position], axis=-1)
         keep = np.abs(np.diff(position)) < seam  # not across the seam of the road, nor where nobody is
         segments = list(np.stack([points[:, :-1], points[:, 1:]], axis=2)[keep])
-        lines = LineCollection(segments, rasterized=True, **style)
-        lines.set_linewidth(width * lines.get_linewidth()[0])
-        axes.add_collection(lines)
+        style = {**style, "linewidths": width * style["linewidths"]}
+        axes.add_collection(LineCollection(segments, rasterized=True, **style))
 
 
 def speed_field(
