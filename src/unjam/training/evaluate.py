@@ -285,6 +285,9 @@ def drive(
     with Workers(min(workers or os.cpu_count() or 1, episodes * len(drivers))) as pool:
         found = evaluate(made, drivers, seeds, pool, reward, progress)
     report, notes = None, notes_on_controllers(scenario_recipe(made), drivers, found.shown)
+    if folder is not None and all(row["status"] == "failed" for rows in found.rows.values() for row in rows):
+        folder.rmdir()  # there is nothing to look at
+        folder = None
     if folder is not None:
         about = {"scenario": Path(scenario).name, "reward": reward or made.reward, "manifest": manifest()}
         named = {label: label for label in drivers}
