@@ -1,4 +1,5 @@
-# make demo   sets everything up, trains a residual on the ring, and drives a motorway beside people alone
+# make demo   sets everything up, trains a residual in a jam, and drives a motorway beside people alone: a minute
+#             or two after the installation
 # make test   the tests that take minutes; make test-all adds the slow ones
 # make check  lint, format, types; make docs builds the site; make bench measures speed
 #
@@ -14,8 +15,8 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet -c const
 .PHONY: demo test test-all coverage check bless docs bench soak clean
 
 demo: $(VENV)/.installed
-	$(BIN)/unjam train ring --preset demo
-	$(BIN)/unjam drive on-ramp -d human -d jam-ahead --episodes 4
+	$(BIN)/unjam train ring-jammed --preset demo
+	$(BIN)/unjam drive on-ramp -d human -d unjam:on-ramp-tuned --cav-share 0.05 --held-out -n 4
 
 # The tests of a file share what they have made
 SPREAD := -n 2 --dist loadfile --no-loadscope-reorder

@@ -8,18 +8,23 @@ import unjam
 
 here = Path(__file__).parent
 sys.path.insert(0, str(here))  # the pages import tables.py
-os.environ["PYTHONPATH"] = str(here)  # so do the kernels that run them
+os.environ["PYTHONPATH"] = os.pathsep.join([str(here), *filter(None, [os.environ.get("PYTHONPATH")])])
+
+import cells  # noqa: E402
 
 project = "unjam"
-author = "The unjam maintainers"
+author = copyright = "The unjam maintainers"
 release = version = unjam.__version__
 
 extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.viewcode"]
 exclude_patterns = ["_build", "**.ipynb_checkpoints"]
 html_theme = "furo"
 html_title = "unjam"
+html_static_path = ["_static"]
+html_css_files = ["pictures.css"]
 
-nb_execution_mode = "force"
+nb_execution_mode = "cache"
+nb_execution_cache_path = str(cells.kept_in(here / "_build" / "cells"))
 nb_execution_in_temp = True
 nb_execution_timeout = 600
 nb_execution_raise_on_error = True

@@ -9,7 +9,8 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from PIL import Image, ImageSequence
+import numpy as np
+from PIL import Image, ImageChops, ImageSequence
 
 import unjam
 from unjam.controller import make_driver, shipped_file
@@ -21,7 +22,7 @@ from unjam.measures.drivable import verdicts
 from unjam.measures.effect import beside_people
 from unjam.measures.statistics import estimate_of
 from unjam.reports.figures import png_bytes
-from unjam.reports.film import write_video
+from unjam.reports.film import draw_road, scenes, write_video
 from unjam.reports.lanes import space_time_of
 from unjam.reports.results import shown_of
 from unjam.scenarios import make_scenario
@@ -36,6 +37,8 @@ ROADS = {
     "on-ramp-tuned": ("on-ramp", {"cav_share": 0.05}),
 }
 """where each controller is shown, and what is changed of the road"""
+SEEN_AT = {"ring": 280.0, "figure-eight": 60.0, "merge": 400.0}
+"""when there is something to see on roads that a picture holds [s]"""
 HERE = Path(__file__).parent
 PICTURES = HERE.parents[1] / "docs" / "pictures"
 
@@ -51,11 +54,24 @@ def film(road: str, name: str) -> None:
     frames[0].save(target, save_all=True, append_images=frames[1:], duration=50, loop=0, quality=55)
 
 
+def seen_from_above(road: str, seconds: float) -> None:
+    """Write the picture of a road's page: people alone at one moment, without the paper around."""
+    scenario = make_scenario(road)
+    scenario = make_scenario(road, {"horizon": int(seconds / scenario.decision_step) + 1})
+    episode = run_episode(scenario, make_driver("human", scenario.decision_step), (0,), full=True)
+    [scene] = scenes(episode, [int(seconds / episode.step)])
+    image = draw_road(scene, float(np.nanmax(episode.speeds)), "")
+    ink = ImageChops.difference(image, Image.new("RGB", image.size, "white")).getbbox()
+    image.crop(ink).quantize(64).save(PICTURES / f"road-{road}.png")
+
+
 def main(names: Sequence[str]) -> None:
     """Drive, draw and write the cards; what is driven anew has a manifest of its own."""
     target = HERE / "gallery.json"
     if not names:
         film("ring-jammed", "ring-tuned")
+        for road, seconds in SEEN_AT.items():
+            seen_from_above(road, seconds)
     found = json.loads(target.read_text()) if names else {"manifest": manifest(), "cards": {}}
     cards = found["cards"]
     for name in names or ROADS:

@@ -74,7 +74,8 @@ def test_roads_without_lanes_or_with_different_ones_are_drawn_as_lines(shown: Sh
     assert not drawn_by_lane([shown, merge])
     assert not drawn_by_lane([])
     panels = [axes for axes in space_time_of([merge]).axes if axes.get_label() != "<colorbar>"]
-    assert not [found for axes in panels for found in axes.collections if isinstance(found, QuadMesh)]
+    lines = [[each for each in axes.collections if isinstance(each, LineCollection)] for axes in panels]
+    assert [len(of_panel) for of_panel in lines] == [2, 2]  # people's and the CAVs', on highway and ramp
 
 
 def test_of_many_lanes_the_busiest_are_drawn(shown: Shown) -> None:

@@ -51,11 +51,35 @@ def driven(folder: str = "runs/drive-001", scenario: str = "ring", **rows: list[
 EXPERT = [100.0, 140.0, 180.0, 120.0]
 
 
-def test_a_gain_above_zero_is_that_of_one_training() -> None:
-    lead = lead_of(trained_on_pi([112.0, 148.0, 190.0, 130.0], EXPERT))
-    assert lead.startswith("On 4 held-out seeds the trained controller earns 145 an episode")
-    assert f"its expert pi alone 135: {signed(estimate([12.0, 8.0, 10.0, 10.0]))}." in lead
+def test_what_everybody_gains_beside_people_alone_comes_first_then_the_expert() -> None:
+    nowhere: dict[str, Any] = {"travel_time": float("nan")}  # nobody leaves a ring
+    result = trained_on_pi(
+        [112.0, 148.0, 190.0, 130.0], EXPERT, mean_speed=1.5, fuel_ml_per_km=0.8, **nowhere
+    )
+    lead = lead_of(result)
+    assert lead.startswith("Beside people alone on ring, 4 held-out seeds paired: ")
+    assert "mean speed +0.50" in lead
+    assert "fuel -0.2" in lead
+    assert f"Return beyond its expert, pi: {signed(estimate([12.0, 8.0, 10.0, 10.0]))}." in lead
     assert lead.endswith("It earns more: that is one training, and a residual pays where 10 show it.")
+
+
+def test_an_expert_that_earns_more_than_its_own_is_told_of() -> None:
+    result = trained_on_pi([112.0, 148.0, 190.0, 130.0], EXPERT)
+    result.rows["acc"] = rows_of([500.0] * 4)
+    assert "Beyond acc, the expert that earns most: -355" in lead_of(result)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({}, "; a car could drive so."),
+        ({"collisions": 2.0}, "; no car could drive so: 2 vehicles in contact"),
+    ],
+)
+def test_the_lead_says_whether_a_car_could_drive_so(changes: dict[str, Any], words: str) -> None:
+    safe: dict[str, Any] = {"cav_min_ttc": 9.0, "overridden": 0.0, "people_beyond_4_5": 0.0, **changes}
+    assert words in lead_of(trained_on_pi([1.0, 2.0], [1.0, 2.0], **safe))
 
 
 def test_a_gain_below_zero_is_said_to_be_less() -> None:
@@ -146,16 +170,14 @@ def test_notes_are_about_the_trained_controller_and_not_its_expert() -> None:
     assert notes_of(result) == []
 
 
-def test_cards_show_the_gain_first_and_the_humans_beside() -> None:
+def test_cards_show_the_humans_beside_first_and_the_gain_on_the_expert_last() -> None:
     result = trained_on_pi([112.0, 148.0, 190.0, 130.0], EXPERT, speed_limit_ratio_steady=0.914)
     cards = cards_of(result)
-    assert [card["label"] for card in cards][:2] == [
-        "Return beyond the expert",
-        "Mean speed / limit, steady",
-    ]
-    assert cards[0]["value"] == "+10"
-    assert cards[1]["value"] == "91 %"
-    assert cards[1]["detail"] == "all-human: 100 %"
+    assert cards[0]["label"] == "Mean speed / limit, steady"
+    assert cards[0]["value"] == "91 %"
+    assert cards[0]["detail"] == "all-human: 100 %"
+    assert cards[-1]["label"] == "Return beyond the expert"
+    assert cards[-1]["value"] == "+10"
 
 
 def test_cards_of_a_drive_without_humans_compare_with_nothing() -> None:

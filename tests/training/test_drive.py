@@ -283,3 +283,10 @@ def test_two_drivers_of_the_same_description_are_both_driven(my_drivers: Path) -
 
     drivers = [make_driver(f"{my_drivers}:Keeper:gain={gain}", 0.1) for gain in (0.1, 0.2)]
     assert len(drive("ring", drivers, 1, road=ROAD, workers=1).rows) == 2
+
+
+def test_a_drive_of_which_every_episode_failed_leaves_no_folder(tmp_path: Path, my_drivers: Path) -> None:
+    road = {"horizon": 20}
+    result = drive("ring", f"{my_drivers}:broken", 1, road=road, workers=1, out=tmp_path / "drive")
+    assert (result.folder, result.report) == (None, None)
+    assert not (tmp_path / "drive").exists()

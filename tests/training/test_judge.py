@@ -66,6 +66,12 @@ def test_an_expert_among_the_baselines_is_compared_once(run: tuple[Path, RunConf
     assert list(comparison(config, folder, ["pi", "human"])) == ["pi", "human", TRAINED]
 
 
+def test_a_shipped_baseline_has_its_short_name(run: tuple[Path, RunConfig]) -> None:
+    folder, config = run
+    name = "unjam:ring-jammed-tuned"
+    assert list(comparison(config, folder, ["human", name])) == ["human", name, "pi", TRAINED]
+
+
 def test_baselines_of_one_file_with_other_parameters_are_all_compared(
     run: tuple[Path, RunConfig], my_drivers: Path
 ) -> None:

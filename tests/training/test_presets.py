@@ -34,6 +34,13 @@ def test_a_preset_changes_what_it_names_and_nothing_else(name: str) -> None:
     assert {key for key in made if made[key] != defaults[key]} <= {*named, "preset"}
 
 
+def test_the_demo_of_a_first_visit_begins_with_a_wave_and_ends_within_a_minute() -> None:
+    made = load_config(preset="demo", changes={"scenario": "ring-jammed"})
+    assert (made.scenario, made.world, made.steps) == ("ring-jammed", "batch", 288_000)
+    assert made.evaluation.baselines[0] == "human"
+    assert load_config(preset="demo").world == "sumo"
+
+
 def test_the_papers_preset_has_the_papers_numbers() -> None:
     made = load_config(preset="paper")
     assert (made.trpo.gamma, made.trpo.gae_lambda, made.trpo.target_kl) == (0.995, 0.97, 0.01)

@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from tests.training.test_run import STEPS, learn_with, small_config
+from tests.training.test_run import STEPS, controller_manifest, learn_with, outcome, small_config
 from unjam.errors import MissingPartError
 from unjam.reports.results import read_progress
 from unjam.training.folder import gave_up
@@ -42,6 +42,27 @@ def test_training_ends_where_patience_is_over(monkeypatch: pytest.MonkeyPatch, t
         learn_with(workers, tmp_path / "run", config)
     found = [row["return_validation"] for row in read_progress(tmp_path / "run")]
     assert found == [6.0, 5.5, 5.8]
+
+
+def test_a_callback_that_returns_false_ends_the_training_as_its_steps_would(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    returns = iter([5.0, 4.0, 6.0])  # of the expert, after two iterations, and where it ends
+    monkeypatch.setattr(Trainer, "returns_of", lambda *given: [next(returns)])
+    config = small_config(steps=20 * STEPS, evaluation__every=2)
+    with Workers(1) as workers:
+        learn_with(workers, tmp_path / "run", config, lambda row: row["iteration"] < 3)
+    assert [row["return_validation"] for row in read_progress(tmp_path / "run")] == [None, 4.0, None]
+    assert controller_manifest(tmp_path / "run")["iteration"] == 3
+
+
+def test_what_a_callback_ended_goes_on_as_if_it_never_had(tmp_path: Path) -> None:
+    config = small_config(steps=2 * STEPS, evaluation__every=2)
+    with Workers(1) as workers:
+        learn_with(workers, tmp_path / "stopped", config, lambda row: False)
+        learn_with(workers, tmp_path / "stopped", config, resume=True)
+        learn_with(workers, tmp_path / "one go", config)
+    assert outcome(tmp_path / "stopped") == outcome(tmp_path / "one go")
 
 
 def test_tensorboard_has_every_number_at_its_actual_step(tmp_path: Path) -> None:

@@ -40,8 +40,9 @@ def evaluate(
       unjam evaluate runs/ring-001 --humans drivers.json --out runs/among-others
     """
     from unjam.drivers.registry import DRIVERS
-    from unjam.measures.statistics import signed, verdict_on
     from unjam.reports.html import write_report
+    from unjam.reports.results import read_results
+    from unjam.reports.story import lead_of
     from unjam.training.evaluate import comparison, judge
     from unjam.training.folder import read_config
     from unjam.training.train import TrainResult, gain_of
@@ -69,8 +70,7 @@ def evaluate(
         print_json({"run": str(run), "scenario": config.scenario, "gain": gain, "drivers": drivers})
         return
     print_metrics(found.rows)
-    if result.gain is not None:
-        console.print(f"return beyond the expert: {signed(result.gain)}. {verdict_on(result.gain)}")
+    console.print(lead_of(read_results(target)), soft_wrap=True)
     aside.print(f"report: {result.report}")
 
 

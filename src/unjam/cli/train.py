@@ -85,10 +85,8 @@ def train(
         config = load_config(asked.file, asked.preset, changes)
         folder = new_folder(out, config.scenario)
     check_possible(config)
-    from unjam.measures.statistics import (  # and torch: seconds that nobody waits for a wrong word
-        signed,
-        verdict_on,
-    )
+    from unjam.reports.results import read_results  # and torch: seconds that nobody waits for a wrong word
+    from unjam.reports.story import lead_of
     from unjam.training.config import steps_to_train
     from unjam.training.evaluate import Evaluation
     from unjam.training.tensorboard import tensorboard_into
@@ -120,12 +118,10 @@ def train(
         if name:
             console.print(f"{name}:")
         print_metrics(of.rows)
-        if of.gain is not None:
-            console.print(
-                f"return beyond the expert, held-out seeds: {signed(of.gain)}. {verdict_on(of.gain)}"
-            )
+        judged = read_results(of.folder)
+        console.print(lead_of(judged), soft_wrap=True)
         aside.print(f"controller: {of.controller}")
-        after_training(of.folder, of.gain, config.steps)
+        after_training(of.folder, of.gain, max(config.steps, judged.progress[-1]["actual_steps"]))
     aside.print(f"report: {result.report}")
 
 

@@ -26,10 +26,18 @@ LINES = ["#7b8794", "#e07a1f", "#2b6cb0", "#2f855a", "#b83280", "#805ad5", "#1a2
 """of drivers, in the order in which they are shown"""
 WIDTH = 10.5
 """of a figure of the page [inch]: its letters are legible from 760 pixels on, the least that it gets there"""
+LONGEST_LABEL = 34
+"""letters of a driver's label in a picture"""
 DPI = 130
 """pixels per inch of what is drawn in pixels"""
 POINTS_IN_TIME = 600
 """moments that a picture shows of an episode"""
+PLACES = 250
+"""places along the road at which a picture shows a speed"""
+NEAR, NEAR_SECONDS = 10.0, 1.4
+"""how far from a vehicle a picture shows its speed: metres, and seconds of driving"""
+PEOPLE_LINE: dict[str, Any] = {"colors": "white", "linewidths": 0.35, "alpha": 0.35}
+CAV_LINE: dict[str, Any] = {"colors": CAV_COLOUR, "linewidths": 1.6}
 
 STYLE: dict[Any, Any] = {
     "font.family": "DejaVu Sans",
@@ -49,6 +57,11 @@ STYLE: dict[Any, Any] = {
     "legend.frameon": False,
     "figure.facecolor": "white",
 }
+
+
+def short(label: str) -> str:
+    """Return a driver's label as far as a title has room: parameters that were tuned are many."""
+    return label if len(label) <= LONGEST_LABEL else f"{label[: LONGEST_LABEL - 1]}…"
 
 
 def new_figure(height: float, width: float = WIDTH) -> Figure:
@@ -96,7 +109,7 @@ def speed_scale(shown: Sequence[Shown]) -> Normalize:
 
 @rc_context(STYLE)
 def space_time(shown: Sequence[Shown]) -> Figure:
-    """Draw where every vehicle is at every time, coloured by speed; a panel per driver, all on one scale.
+    """Draw where every vehicle is at every time, and the speed there; a panel per driver, all on one scale.
 
     A stop-and-go wave is a dark band that runs against the direction of travel. Where the road crosses itself
     is shaded. Of a merging road the ramp has a panel of its own below the main road's; of your own network
@@ -117,11 +130,11 @@ def space_time(shown: Sequence[Shown]) -> Figure:
         for number, episode in enumerate(shown):
             row, column = divmod(number, columns)
             axes = panels[row * parts + part, column]
-            _trajectories(axes, episode, positions[number], scale)
+            _trajectories(axes, episode, positions[number], extent, scale)
             axes.set_xlim(0, longest)
             axes.set_ylim(*extent)
             if part == 0:
-                axes.set_title(episode.driver, fontsize=10)
+                axes.set_title(short(episode.driver), fontsize=10)
             if column == 0:
                 axes.set_ylabel(f"{branch} [m]" if branch else "position along the road [m]")
             if part == parts - 1 and number + columns >= count:
@@ -160,27 +173,61 @@ def _extent(shown: Sequence[Shown], positions: Sequence[np.ndarray]) -> tuple[fl
     return (float(there.min()), float(there.max())) if there.size else (0.0, 1.0)
 
 
-def _trajectories(axes: Axes, episode: Shown, positions: np.ndarray, scale: Normalize) -> None:
+def _trajectories(
+    axes: Axes, episode: Shown, positions: np.ndarray, extent: tuple[float, float], scale: Normalize
+) -> None:
     every = max(1, len(episode.times) // POINTS_IN_TIME)
-    times, positions = episode.times[::every], positions[::every]
+    times, positions, speeds = (each[::every] for each in (episode.times, positions, episode.speeds))
     axes.grid(False)
     for start, end in episode.crossings:
-        axes.axhspan(start, end, color=GRID, lw=0, rasterized=True)
-    seam, people, cavs, mark = np.inf, 0.7, 1.6, 0.6
+        axes.axhspan(start, end, color=INK, alpha=0.15, lw=0, zorder=1.5, rasterized=True)
+    loop_length, places = 0.0, np.linspace(*extent, PLACES)
     if episode.closed:
-        positions = positions % episode.loop_length
-        seam, people, cavs, mark = episode.loop_length / 2, 1.1, 2.6, 1.3
-    for is_cav, width in ((False, people), (True, cavs)):
-        driven = np.isin(np.arange(episode.speeds.shape[1]), episode.cavs) == is_cav
+        loop_length = episode.loop_length
+        positions, places = positions % loop_length, np.linspace(0.0, loop_length, PLACES)
+    seam, width = loop_length / 2 or np.inf, 1.0 if episode.closed else 0.5  # many come and go
+    field = speed_field(positions, speeds, places, loop_length)
+    axes.pcolormesh(times, places, field, cmap=SPEED_COLOURS, norm=scale, rasterized=True)
+    is_cav = np.isin(np.arange(speeds.shape[1]), episode.cavs)
+    for driven, style in ((~is_cav, PEOPLE_LINE), (is_cav, CAV_LINE)):
         position = positions[:, driven].T
         points = np.stack([np.broadcast_to(times, position.shape), position], axis=-1)
         keep = np.abs(np.diff(position)) < seam  # not across the seam of the road, nor where nobody is
         segments = list(np.stack([points[:, :-1], points[:, 1:]], axis=2)[keep])
-        lines = LineCollection(segments, cmap=SPEED_COLOURS, norm=scale, linewidths=width, rasterized=True)
-        lines.set_array(episode.speeds[::every, driven].T[:, :-1][keep])
-        axes.add_collection(lines)
-        if is_cav:
-            axes.add_collection(LineCollection(segments, colors=CAV_COLOUR, linewidths=mark, rasterized=True))
+        style = {**style, "linewidths": width * style["linewidths"]}
+        axes.add_collection(LineCollection(segments, rasterized=True, **style))
+
+
+def speed_field(
+    positions: np.ndarray, speeds: np.ndarray, places: np.ndarray, loop_length: float
+) -> np.ndarray:
+    """Return the speed along the road at each moment [m/s], shape (places, moments).
+
+    Between two vehicles it goes from the one's to the other's; it is NaN where nobody is near. Lines alone
+    would leave stripes of paper, which a screen of other pixels makes into patterns that are not there.
+
+    Args:
+        positions: of the vehicles [m], shape (moments, N), NaN where one is not on the road.
+        speeds: of the vehicles [m/s], likewise.
+        places: where it is asked for [m], ascending.
+        loop_length: of a closed road [m]; 0: it has ends.
+    """
+    field = np.full((len(places), len(positions)), np.nan)
+    for moment, (where, fast) in enumerate(zip(positions, speeds, strict=True)):
+        there = np.flatnonzero(~np.isnan(where))
+        if not len(there):
+            continue
+        there = there[np.argsort(where[there])]
+        where, fast = where[there], fast[there]
+        if loop_length:  # it goes on at both ends
+            where = np.concatenate([where - loop_length, where, where + loop_length])
+            fast = np.tile(fast, 3)
+        behind = (np.searchsorted(where, places) - 1).clip(min=0)
+        ahead = (behind + 1).clip(max=len(where) - 1)
+        nearest = np.where(np.abs(places - where[behind]) < np.abs(places - where[ahead]), behind, ahead)
+        near = np.abs(places - where[nearest]) <= NEAR + NEAR_SECONDS * fast[nearest]
+        field[near, moment] = np.interp(places, where, fast)[near]
+    return field
 
 
 @rc_context(STYLE)
@@ -198,7 +245,7 @@ def over_time(shown: Sequence[Shown]) -> Figure:
         for axes, (label, values) in zip(panels, _three_of(episode, closed).items(), strict=True):
             axes.plot(episode.times[::every], values[::every], color=colour, lw=1.2)
             axes.set_ylabel(label)
-        panels[0].plot([], [], color=colour, lw=1.2, label=episode.driver)
+        panels[0].plot([], [], color=colour, lw=1.2, label=short(episode.driver))
     limit = shown[0].limit_speed
     if np.isfinite(limit):
         panels[0].axhline(limit, color=INK, lw=0.8, ls=":", label="limit")

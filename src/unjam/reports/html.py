@@ -23,6 +23,7 @@ from unjam.reports.figures import (
     data_uri,
     learning_curve,
     over_time,
+    short,
     speed_scale,
     time_split,
 )
@@ -151,10 +152,10 @@ def _references(results: Sequence[Results]) -> dict[str, float]:
     for result in results:
         expert = result.about.get("expert", "none")
         if result.progress and expert != "none":
-            found.setdefault(f"{expert}, validation", result.progress[0]["return_expert"])
+            found.setdefault(f"{short(expert)}, validation", result.progress[0]["return_expert"])
         for label, rows in result.rows.items():
             if label not in (result.trained, expert):
-                found.setdefault(f"{label}, held-out", estimate_of(rows, "return").mean)
+                found.setdefault(f"{short(label)}, held-out", estimate_of(rows, "return").mean)
     return found
 
 

@@ -15,6 +15,7 @@ from unjam.reports.figures import (
     STYLE,
     add_speed_bar,
     new_figure,
+    short,
     space_time,
     speed_scale,
 )
@@ -63,7 +64,7 @@ def lane_maps(shown: Sequence[Shown]) -> Figure:
             axes.set_visible(True)
             _map(axes, episode, lane, (longest, *extent), scale)
             if row == 0:
-                axes.set_title(episode.driver, fontsize=10)
+                axes.set_title(short(episode.driver), fontsize=10)
             if column == 0:
                 axes.set_ylabel(f"{episode.lane_names[lane]}\n[m]")
             if row == len(rows) - 1 and number + columns >= len(shown):

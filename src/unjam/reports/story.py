@@ -7,10 +7,11 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from unjam.measures.effect import beside_people
+from unjam.measures.drivable import DRIVABLE
+from unjam.measures.effect import Effect, beside_people
 from unjam.measures.metrics import METRICS
 from unjam.measures.statistics import digits_of, estimate_of, paired_difference, signed, verdict_on
-from unjam.measures.table import baseline_of, cell_of
+from unjam.measures.table import PEOPLE, baseline_of, cell_of
 from unjam.reports.results import Results, Shown
 
 CLOSE_HEADWAY = 1.0
@@ -93,19 +94,33 @@ def title_of(results: Sequence[Results]) -> str:
 
 
 def lead_of(result: Results) -> str:
-    """Return the main finding of a folder in a sentence or two, whichever way it went."""
+    """Return the main finding of a folder in a few sentences, whichever way it went."""
     if result.trained is None:
         return _lead_of_drives(result)
-    trained, expert = result.rows[result.trained], result.rows.get(result.about["expert"])
-    earned = estimate_of(trained, "return").mean
-    if expert is None:
-        return f"On {len(trained)} held-out seeds the trained controller earns {earned:.0f} an episode."
-    gain = paired_difference(trained, expert, "return")
-    alone = estimate_of(expert, "return").mean
-    return (
-        f"On {gain.count} held-out seeds the trained controller earns {earned:.0f} an episode, its expert "
-        f"{result.about['expert']} alone {alone:.0f}: {signed(gain)}. {verdict_on(gain)}"
-    )
+    rows, effect = result.rows[result.trained], beside_people(result.rows).get(result.trained)
+    if effect:
+        scenario = result.about["scenario"]
+        said = f"Beside people alone on {scenario}, {len(rows)} held-out seeds paired: {_words_of(effect)}."
+    else:
+        earned = estimate_of(rows, "return").mean
+        said = f"On {len(rows)} held-out seeds the trained controller earns {earned:.0f} an episode."
+    experts = {label: of for label, of in result.rows.items() if label not in (result.trained, PEOPLE)}
+    returns = {label: estimate_of(of, "return").mean for label, of in experts.items()}
+    expert = result.about["expert"]
+    best = max(returns, key=lambda label: np.nan_to_num(returns[label], nan=-np.inf), default=expert)
+    if expert in experts:
+        gain = paired_difference(rows, experts[expert], "return")
+        said += f" Return beyond its expert, {expert}: {signed(gain)}. {verdict_on(gain)}"
+    if best != expert:
+        gain = paired_difference(rows, experts[best], "return")
+        said += f" Beyond {best}, the expert that earns most: {signed(gain)}."
+    return said
+
+
+def _words_of(effect: Effect) -> str:
+    """Return what everybody on the road gains, and whether a car could drive so."""
+    safe = {"": "", DRIVABLE: "; a car could drive so"}
+    return effect.words + safe.get(effect.drivable, f"; no car could drive so: {effect.drivable}")
 
 
 def _lead_of_drives(result: Results) -> str:
@@ -113,7 +128,7 @@ def _lead_of_drives(result: Results) -> str:
     scenario, effects = result.about["scenario"], beside_people(result.rows)
     if effects:
         count = len(result.rows["human"])
-        said = "; ".join(f"{label}: {effect.words}" for label, effect in effects.items())
+        said = "; ".join(f"{label}: {_words_of(effect)}" for label, effect in effects.items())
         return f"Beside people alone on {scenario}, {count} episodes with the same seeds paired: {said}."
     ratios = {label: estimate_of(rows, "speed_limit_ratio_steady") for label, rows in result.rows.items()}
     if len(ratios) > 1:
@@ -194,7 +209,7 @@ def cards_of(result: Results) -> list[dict[str, str]]:
         gain = paired_difference(rows, expert, "return")
         beyond = cell_of(gain, 0, sign="+")
         detail = f"95 % interval {beyond.interval}" if gain.low < gain.high else f"of {gain.count} seeds"
-        cards.insert(0, {"label": "Return beyond the expert", "value": beyond.mean, "detail": detail})
+        cards.append({"label": "Return beyond the expert", "value": beyond.mean, "detail": detail})
     return cards
 
 

@@ -12,7 +12,7 @@ from typing import Any
 
 from safetensors.numpy import save
 
-from unjam.controller import hash_of_controller, make_driver
+from unjam.controller import SHIPPED, hash_of_controller, make_driver
 from unjam.controller.domain import notes_on_controllers
 from unjam.drivers.driver import Driver
 from unjam.drivers.from_file import DriverLike, as_driver
@@ -185,7 +185,9 @@ def comparison(config: RunConfig, folder: Path, baselines: Sequence[str]) -> dic
     for name in baselines:
         driver = make_driver(name, scenario.decision_step)
         if can_drive(driver, scenario):
-            drivers[free_label(driver, {**expert, **drivers})] = driver
+            # The description of a shipped driver has every parameter that was tuned.
+            shipped = name.startswith(SHIPPED) and name != config.expert
+            drivers[name if shipped else free_label(driver, {**expert, **drivers})] = driver
     return {**drivers, **expert, TRAINED: make_driver(str(folder), scenario.decision_step)}
 
 
@@ -283,6 +285,9 @@ def drive(
     with Workers(min(workers or os.cpu_count() or 1, episodes * len(drivers))) as pool:
         found = evaluate(made, drivers, seeds, pool, reward, progress)
     report, notes = None, notes_on_controllers(scenario_recipe(made), drivers, found.shown)
+    if folder is not None and all(row["status"] == "failed" for rows in found.rows.values() for row in rows):
+        folder.rmdir()  # there is nothing to look at
+        folder = None
     if folder is not None:
         about = {"scenario": Path(scenario).name, "reward": reward or made.reward, "manifest": manifest()}
         named = {label: label for label in drivers}

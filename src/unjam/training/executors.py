@@ -2,6 +2,7 @@
 
 The one alone is for a program that imported NumPy before unjam: see `unjam.kernels`. Its child, `python -m
 unjam.training.executors`, reads one line of JSON and answers lines: a list of a word and what belongs to it.
+After each row of progress it reads whether to go on.
 """
 
 import json
@@ -14,7 +15,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, as_completed
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
@@ -32,8 +33,8 @@ Executor = Literal["local", "ray"]
 EXECUTORS: tuple[Executor, ...] = ("local", "ray")
 OnLine = Callable[[str], None]
 """gets a line of progress"""
-OnIteration = Callable[[dict[str, Any]], None]
-"""called with each row of progress as it is written"""
+OnIteration = Callable[[dict[str, Any]], object]
+"""called with each row of progress as it is written; False ends the training"""
 ATTEMPTS = 3
 """how often a command line is started that a signal kills, or whose machine is lost"""
 
@@ -195,12 +196,13 @@ def train_apart(
     try:
         assert child.stdin is not None
         assert child.stdout is not None
-        child.stdin.write(json.dumps([asdict(config), os.fspath(folder), resume, sys.path]))
-        child.stdin.close()
+        print(json.dumps([asdict(config), os.fspath(folder), resume, sys.path]), file=child.stdin, flush=True)
         for line in child.stdout:
             match json.loads(line):
-                case ["row", row] if on_iteration is not None:
-                    on_iteration(row)
+                case ["row", row]:
+                    goes_on = on_iteration is None or on_iteration(row) is not False
+                    with suppress(BrokenPipeError):  # it was killed: its code is told below
+                        print(json.dumps(goes_on), file=child.stdin, flush=True)
                 case ["judged", driver, episode, steps] if progress is not None:
                     progress((driver, episode), steps)
                 case ["error", kind, words]:
@@ -224,11 +226,15 @@ def main() -> None:
     end_with_parent(signal.SIGTERM)
     answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)  # SUMO and user code may print: not into the answers
-    values, folder, resume, path = json.loads(sys.stdin.read())
+    values, folder, resume, path = json.loads(sys.stdin.readline())
     sys.path[:] = path  # a user's driver imports what it did in the program
 
     def say(*words: Any) -> None:
         print(json.dumps(words), file=answers, flush=True)
+
+    def iterated(row: dict[str, Any]) -> bool:
+        say("row", row)
+        return json.loads(sys.stdin.readline())
 
     try:
         from unjam.training.config import RunConfig
@@ -238,7 +244,7 @@ def main() -> None:
             build(RunConfig, values, ""),
             Path(folder),
             resume,
-            lambda row: say("row", row),
+            iterated,
             lambda episode, steps: say("judged", *episode, steps),
         )
         say("done", rows)

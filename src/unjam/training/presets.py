@@ -166,6 +166,26 @@ QUICK: dict[str, dict[str, Any]] = {
 """the preset `quick`: what reaches furthest within a million actual steps or so, road by road"""
 
 
+DEMO: dict[str, dict[str, Any]] = {
+    # People have made a wave, and one CAV dissolves it: half a minute of training. Rows imagine no wave, and
+    # iterations are large, for the batch affords them.
+    "ring-jammed": {
+        "steps": 288_000,
+        "world": "batch",
+        "road": {"horizon": 1500},
+        "trpo": {"batch_steps": 48_000},
+        "virtual": {"virtual_ratio": 0.0},
+        "evaluation": {
+            "every": 2,
+            "validation_episodes": 16,
+            "episodes": 8,
+            "baselines": ["human", "unjam:ring-jammed-tuned"],
+        },
+    },
+}
+"""the preset `demo` where it is another: on the road that a first visit sees"""
+
+
 def preset_values(preset: str, scenario: str) -> dict[str, Any]:
     """Return what a preset changes on a scenario; raise `InputError` where there is no such preset."""
     by_road = {"best": BEST, "quick": QUICK}
@@ -173,6 +193,8 @@ def preset_values(preset: str, scenario: str) -> dict[str, Any]:
         if scenario not in BEST:
             raise wrong("scenario", scenario, f"with the preset {preset}: {', '.join(BEST)}")
         return by_road[preset][scenario]
+    if preset == "demo" and scenario in DEMO:
+        return DEMO[scenario]
     if preset not in PRESETS:
         raise wrong_name("preset", preset, [*PRESETS, *by_road])
     return PRESETS[preset]

@@ -95,7 +95,8 @@ def train(
         config: what to do; see `unjam.load_config`.
         folder: new, or the run's.
         resume: whether to go on with the run in `folder`.
-        on_iteration: called with a row of progress after each iteration.
+        on_iteration: called with a row of progress after each iteration; where it returns False the training
+            ends there, as if its steps were made, and can go on with `resume`.
         progress: called with how far the final evaluation is: ((driver, episode), decisions).
 
     Raises:
@@ -216,11 +217,11 @@ class Trainer:
         counts = episodes_of_iteration(self.tasks, self.config.learner.batch_steps)
         return self._drive(self.drivers(network), counts, (self.config.seed, iteration), explore=True)
 
-    def validate(self, iteration: Iteration) -> Validated:
+    def validate(self, iteration: Iteration, ended: bool = False) -> Validated:
         """Now and then, and at the end, drive the validation seeds, and keep the best controller."""
         started, found = time.perf_counter(), None
         network, every = self.training.learner.network(), self.config.evaluation.every
-        last = iteration.actual_steps >= self.config.steps
+        last = ended or iteration.actual_steps >= self.config.steps
         scheduled = every > 0 and iteration.number % every == 0
         if scheduled or (every and last):
             found = self.returns_of(self.drivers(network))
@@ -236,7 +237,7 @@ class Trainer:
     def write(self, iteration: Iteration, validated: Validated) -> bool:
         """Write a row of progress, of the whole run and of each road, and a checkpoint.
 
-        Return whether it is time to stop: `evaluation.patience` is over.
+        Return whether it is time to stop: the user says so, or `evaluation.patience` is over.
         """
         rows = [self._row(iteration, validated, index) for index in range(len(self.tasks))]
         whole = rows[0]
@@ -263,7 +264,10 @@ class Trainer:
             "expert_returns": self._expert_returns,
         }
         save_checkpoint(self.folder / "checkpoint", state, {**tensors, **self._controllers.tensors()})
-        self._on_iteration(whole)
+        if self._on_iteration(whole) is False:
+            if validated is None:
+                self.validate(iteration, ended=True)
+            return True
         return gave_up(self.config, read_progress(self.folder))
 
     def returns_of(self, drivers: Sequence[Driver]) -> list[float]:
