@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, Self, get_type_hints
 
 from unjam.errors import EpisodeError, error_named, in_own_words
-from unjam.processes import PrivateFolder, bound, end_with_parent
+from unjam.processes import PrivateFolder, bound, end_with_parent, sweep_private_folders
 from unjam.sandbox import confine, limit
 from unjam.scenarios.own_network import OwnNetwork
 from unjam.scenarios.scenario import Scenario
@@ -58,6 +58,7 @@ class SimulationApart:
 
     def __init__(self) -> None:
         """Start the process."""
+        sweep_private_folders()
         self._folder = PrivateFolder()
         self._process = subprocess.Popen(
             [sys.executable, "-m", "unjam.worlds.sumo.apart"],
