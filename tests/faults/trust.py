@@ -260,7 +260,7 @@ def cheats(count: int, folder: Path, generator: np.random.Generator) -> Outcome:
         for number in range(count):
             name = ROADS[number % len(ROADS)]
             closed = name in ("ring", "figure-eight")
-            share = {"cavs": 2, "warmup": 0} if closed else {"cav_share": 0.5}
+            share = {"cavs": 2, "warmup": 0} if closed else {"cav_share": 1.0}
             road = make_scenario(str(own) if name == "own" else name, {**share, "horizon": 30})
             seed = int(generator.integers(10))
             if (name, seed) not in honest_ones:
