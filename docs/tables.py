@@ -118,9 +118,10 @@ def soak_table() -> pd.DataFrame:
 
 
 def soak_origin() -> str:
-    """Return with what the last soak was made."""
-    made = json.loads((RESULTS / SOAK).read_text())["manifest"]
-    return f"SUMO {made['packages']['libsumo']}, commit {made['commit']}, {made['started'][:10]}"
+    """Return with what the rows of the soak were made."""
+    soak = json.loads((RESULTS / SOAK).read_text())
+    made, commits = soak["manifest"], dict.fromkeys(row["commit"] for row in soak["rows"])
+    return f"SUMO {made['packages']['libsumo']}, commit {', '.join(commits)}, {made['started'][:10]}"
 
 
 def show(table: pd.DataFrame, index: bool = False, digits: int = 3) -> HTML:

@@ -33,10 +33,11 @@ ALLOWED = {
 """what else a part may import"""
 LAZY = {
     "__init__": {
-        *("controller", "drivers", "environments", "errors", "kernels", "measures", "reports", "scenarios"),
+        *("controller", "drivers", "environments", "errors", "kernels", "limited", "measures", "scenarios"),
         *("training", "worlds"),
     },
     "__main__": {"cli"},
+    "limited": {"controller", "errors", "processes"},
 }
 TORCH = {"torch", "stable_baselines3", "sb3_contrib"}
 LONGEST = 330

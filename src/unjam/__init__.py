@@ -22,11 +22,10 @@ __version__ = "0.1.0"
 
 if TYPE_CHECKING:
     from unjam.controller import load_controller, make_driver
-    from unjam.controller.verify import verify_controller
     from unjam.drivers import Driver, LocalState, check_driver
     from unjam.environments.several import parallel_env
+    from unjam.limited import verify_controller, write_report
     from unjam.measures.metrics import measure
-    from unjam.reports.html import write_report
     from unjam.scenarios import make_scenario
     from unjam.training.config import load_config
     from unjam.training.evaluate import drive
@@ -42,14 +41,14 @@ _PLACES = {
     "load_config": "unjam.training.config",
     "load_controller": "unjam.controller",
     "export_controller": "unjam.training.export",
-    "verify_controller": "unjam.controller.verify",
+    "verify_controller": "unjam.limited",
     "make_driver": "unjam.controller",
     "make_scenario": "unjam.scenarios",
     "measure": "unjam.measures.metrics",
     "list_runs": "unjam.training.runs",
     "run_episode": "unjam.worlds.episode",
     "parallel_env": "unjam.environments.several",
-    "write_report": "unjam.reports.html",
+    "write_report": "unjam.limited",
     "Driver": "unjam.drivers",
     "LocalState": "unjam.drivers",
     "check_driver": "unjam.drivers",

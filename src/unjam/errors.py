@@ -60,6 +60,19 @@ def disk_error(error: OSError, path: object) -> DiskError:
     return DiskError(f"cannot write {path}: {error.strerror or error}")
 
 
+def error_named(kind: str, words: str) -> UnjamError:
+    """Return the error that another process told of; of a kind that is not ours, it is an `UnjamError`."""
+    kinds = {each.__name__: each for each in UnjamError.__subclasses__()}
+    return kinds.get(kind, UnjamError)(words)
+
+
+def in_own_words(error: Exception) -> UnjamError:
+    """Return any error as one of ours, to be told to another process."""
+    if isinstance(error, OSError) and error.errno in DISK_ERRNOS:
+        return disk_error(error, error.filename or "a temporary file")
+    return error if isinstance(error, UnjamError) else UnjamError(f"{type(error).__name__}: {error}")
+
+
 def wrong(field: str, value: object, allowed: str) -> InputError:
     """Return the error for a wrong value, in the form that all of unjam uses."""
     return InputError(f"{field}: {value!r} is not allowed; allowed: {allowed}")

@@ -10,7 +10,6 @@ import os
 import platform
 import runpy
 import sys
-from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
 
@@ -70,15 +69,17 @@ def confine(*writable: Path) -> None:
 
     Where the kernel offers one of both, that holds; where none, nothing changes.
     """
+    keep_disk(*writable)
+    if sys.platform == "linux":
+        _close_network(ctypes.CDLL(None))
+
+
+def keep_disk(*writable: Path) -> None:
+    """Leave this thread and its children no writing but under these folders, and all sockets; for good."""
     if sys.platform != "linux":
         return
     libc = ctypes.CDLL(None)
     libc.prctl(NO_NEW_PRIVILEGES, 1, 0, 0, 0)
-    _keep_disk(libc, writable)
-    _close_network(libc)
-
-
-def _keep_disk(libc: ctypes.CDLL, writable: Iterable[Path]) -> None:
     version = libc.syscall(CREATE_RULESET, None, ctypes.c_size_t(0), 1)
     if version < 1:
         return

@@ -3,6 +3,7 @@
 from tests.faults.files import checkpoints, configurations, controllers, full_disks, results
 from tests.faults.outcome import Fault
 from tests.faults.processes import hostile, killed_runs, lost_workers, networks, resets
+from tests.faults.trust import caches, cheats, codes, crash_points, lineages, locks, sandboxes
 
 FAULTS: dict[str, Fault] = {
     "checkpoints": Fault(
@@ -25,6 +26,29 @@ FAULTS: dict[str, Fault] = {
     "hostile files": Fault(
         "network of others that wants SUMO to write, to listen or to read another file", hostile, 8, 200
     ),
+    "sandbox": Fault(
+        "program beside the reader of networks, and SUMO, that write or open a socket", sandboxes, 12, 300
+    ),
+    "cached networks": Fault("network in the cache edited, cut, emptied or removed", caches, 8, 300),
+    "code in folders": Fault(
+        "controller of a run folder that names Python code, looked at by verify", codes, 12, 300
+    ),
+    "drivers that change": Fault(
+        "driver that changes all that it is shown, on every kind of road", cheats, quick=5, long=200
+    ),
+    "crash points": Fault(
+        "run killed, or the disk full, before, within or after each thing that it does to its folder",
+        crash_points,
+        quick=30,
+        long=600,
+    ),
+    "lineage": Fault(
+        "run that goes on with other settings, another expert, reward, network or checkpoint",
+        lineages,
+        quick=8,
+        long=200,
+    ),
+    "locks": Fault("folder that another process writes, which is then killed", locks, quick=3, long=100),
     "lost workers": Fault("worker killed, crashed or stopped in an episode", lost_workers, quick=2, long=200),
     "resets": Fault("episodes one after the other in one process", resets, quick=100, long=10_000),
     "killed runs": Fault("training run killed (signal 9)", killed_runs, quick=4, long=12, slow=True),

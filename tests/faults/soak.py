@@ -37,6 +37,7 @@ def soak(names: list[str]) -> None:
             "happened": dict(sorted(outcome.happened.items())),
             "facts": outcome.facts,
             "seconds": round(time.monotonic() - started, 1),
+            "commit": about["commit"],
         }
         print(json.dumps(rows[name]), flush=True)
         ordered = [rows[each] for each in FAULTS if each in rows]

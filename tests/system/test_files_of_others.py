@@ -9,6 +9,7 @@ from tests.controller.test_verify import content_of
 from tests.system.conftest import Run
 from tests.system.test_wrong_inputs import one_line
 from tests.test_processes import holder
+from tests.worlds.sumo.own_roads import straight
 from unjam.controller.file import GRAPH
 from unjam.drivers import Constant
 
@@ -51,3 +52,30 @@ def test_a_folder_that_another_process_writes_is_left_alone(unjam: Run, tmp_path
     process.communicate("")
     assert (tmp_path / "run" / "report.html").read_bytes() == before
     assert not (tmp_path / "run" / "other.html").exists()
+
+
+ON_ROAD = ("ring", "--set", "horizon=20")
+WRITERS = [
+    ("drive", *ON_ROAD, "--driver", "pi", "--episodes", "1", "--out", "held"),
+    ("tune", *ON_ROAD, "--steps", "10000", "--out", "held"),
+    ("search", "ring", "--set", "road.horizon=20", "--vary", "trpo.target_kl=0.1,0.2", "--out", "held"),
+    ("train", "ring", "--set", "road.horizon=20", "--steps", "100", "--out", "held"),
+    ("reproduce", "theory", "--out", "held"),
+    ("assess", "straight.sumocfg", "-d", "acc", "--shares", "0.5", "--set", "horizon=20", "--out", "held"),
+]
+
+
+@pytest.mark.parametrize("arguments", WRITERS, ids=lambda arguments: arguments[0])
+def test_two_of_a_verb_cannot_write_one_folder(
+    arguments: tuple[str, ...], unjam: Run, tmp_path: Path
+) -> None:
+    straight(tmp_path, '<vehicle id="a" type="car" route="along" depart="0"/>')
+    held = tmp_path / "held"
+    held.mkdir()
+    process = holder(held)
+    ran = unjam(*arguments)
+    assert (ran.returncode, ran.stdout) == (2, ""), ran.stderr
+    assert ran.stderr.splitlines()[-1].startswith("unjam: run: 'held' is being written by another process")
+    assert "Traceback" not in ran.stderr
+    assert [path.name for path in held.iterdir()] == [".lock"]
+    process.communicate("")

@@ -190,7 +190,7 @@ def test_a_search_goes_on_with_more_trials_but_not_with_others(tmp_path: Path, t
 
 def test_a_folder_with_something_else_is_left_alone(tmp_path: Path) -> None:
     (tmp_path / "mine.txt").touch()
-    with pytest.raises(InputError, match="is not empty and no search"):
+    with pytest.raises(InputError, match="is not empty; allowed: a new folder, or that of a search"):
         search(BASE, SPACE, 2, tmp_path, 1)
     assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
 

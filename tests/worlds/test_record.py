@@ -11,9 +11,9 @@ from unjam.drivers.safety import SafetyFilter
 from unjam.scenarios import Ring
 from unjam.tree import pack, unpack
 from unjam.worlds.episode import run_episode
+from unjam.worlds.messages import read_message, write_message
 from unjam.worlds.record import Episode, Trajectory, failed_episode
 from unjam.worlds.sumo.simulation import Simulation
-from unjam.worlds.worker import read_message, write_message
 
 RING = Ring(length=(230, 240), horizon=60)
 

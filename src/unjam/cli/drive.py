@@ -223,13 +223,15 @@ def assess(
     """
     from unjam.training.assess import DRIVERS_OF_OPEN_ROADS, question
     from unjam.training.assess import assess as run
+    from unjam.training.folder import new_and_owned
     from unjam.worlds.workers import Workers
 
     drivers, changes = driver or DRIVERS_OF_OPEN_ROADS, assignments(settings)
     asked = question(scenario, _shares(shares), episodes, precision, minutes, drivers, changes)
     folder = new_folder(out, f"assess-{Path(scenario).stem}")
     total = asked.road.horizon * episodes
-    with counting_steps("assessing, at most", total) as steps, Workers(workers) as pool:
+    counting = counting_steps("assessing, at most", total)
+    with new_and_owned(folder), counting as steps, Workers(workers) as pool:
         found = run(asked, folder, pool, steps, (lambda line: None) if json else aside.print)
     if json:
         print_json({**found.document, "folder": str(folder), "report": str(found.page)})

@@ -72,10 +72,10 @@ def _draw(scenario: Any, name: str, path: Path) -> None:
     from unjam.reports.film import draw_road
     from unjam.scenarios.road import ClosedRoad
     from unjam.worlds.sumo import make_traffic
-    from unjam.worlds.sumo.simulation import Simulation
+    from unjam.worlds.sumo.apart import simulation_for
 
     check_folder(path)
-    with Simulation() as simulation:
+    with simulation_for(scenario) as simulation:
         traffic = make_traffic(scenario, (0,), simulation)
         traffic.start(controlled=False)
         closed = isinstance(traffic.road, ClosedRoad)

@@ -89,15 +89,20 @@ def model(
 
       unjam model runs/ring-001 --json
     """
+    from matplotlib import get_cachedir
+
+    go_on_limited(f"model: {run}", run, Path(get_cachedir()))
     from unjam.reports.html import write_report
     from unjam.reports.model import bound_of, cells, error_rows, headings, trust_of, verdict_of
     from unjam.reports.results import read_progress
     from unjam.training.folder import read_config
     from unjam.training.model_facts import newest_model_facts
 
-    facts = newest_model_facts(run, read_config(run))
-    ended = (run / "evaluation.json").is_file()
-    report = write_report([run], run / "report.html") if ended else None
+    config = read_config(run)
+    with owned(run):
+        facts = newest_model_facts(run, config)
+        ended = (run / "evaluation.json").is_file()
+        report = write_report([run], run / "report.html") if ended else None
     if json:
         print_json({"run": str(run), "report": str(report) if report else None, **facts})
         return

@@ -23,6 +23,8 @@ from unjam.cli.options import (
 )
 from unjam.cli.output import Counted, after_training, aside, console, print_json, print_metrics, resumable
 from unjam.errors import InputError
+from unjam.files import make_folder
+from unjam.processes import owned
 
 LINE_EVERY = 5
 """iterations between two plain lines of progress where there is no terminal"""
@@ -189,7 +191,11 @@ def search(
     base = replace(base, workers=1)
     check_space(base, space)
     folder = new_folder(out, f"search-{Path(base.scenario).stem}")
-    found = run(base, space, trials, folder, workers, runner, (lambda line: None) if json else aside.print)
+    make_folder(folder)
+    with owned(folder):
+        found = run(
+            base, space, trials, folder, workers, runner, (lambda line: None) if json else aside.print
+        )
     best = folder / BEST
     if json:
         rows = [
@@ -251,7 +257,9 @@ def reproduce(
     )
     if dry_run:
         return
-    folders = [str(folder) for folder in run(plan, workers, runner, aside.print)]
+    make_folder(out)
+    with owned(out):
+        folders = [str(folder) for folder in run(plan, workers, runner, aside.print)]
     if json:
         print_json({"folders": folders})
         return

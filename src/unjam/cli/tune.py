@@ -64,6 +64,7 @@ def tune(
     """
     from unjam.scenarios import make_scenario
     from unjam.training.family import FAMILY, is_family, roads_of
+    from unjam.training.folder import new_and_owned
     from unjam.training.search import space_of
     from unjam.training.tune import space_around
     from unjam.training.tune import tune as run
@@ -83,7 +84,7 @@ def tune(
     around = space_around(expert, made.decision_step)
     space = space_of(vary) if vary else around
     folder = new_folder(out, f"tune-{Path(scenario).stem}")
-    with Workers(workers) as pool:
+    with new_and_owned(folder), Workers(workers) as pool:
         found = run(
             *(roads, expert, space, steps, folder, pool, reward, seed),
             (lambda line: None) if json else aside.print,

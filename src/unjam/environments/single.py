@@ -21,7 +21,8 @@ from unjam.scenarios import make_scenario
 from unjam.worlds.drive import Drive
 from unjam.worlds.reward import Outcome, make_reward, time_headway
 from unjam.worlds.sumo import make_traffic
-from unjam.worlds.sumo.simulation import Backend, Simulation, own_simulation
+from unjam.worlds.sumo.apart import simulation_for
+from unjam.worlds.sumo.simulation import Backend, Simulation
 from unjam.worlds.sumo.traffic import Traffic
 
 Observations = NDArray[np.float32]
@@ -123,7 +124,7 @@ class SteppedRoad:
         self._episodes += 1
         if self._simulation is None:
             own = self._backend == "libsumo"
-            self._simulation = own_simulation() if own else Simulation(self._backend)
+            self._simulation = simulation_for(self.scenario) if own else Simulation(self._backend)
         self._traffic = traffic = make_traffic(self.scenario, numbers, self._simulation)
         self._drive = Drive(traffic, self._driver)
         self._decisions = iter(self._drive)

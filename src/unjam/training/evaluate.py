@@ -5,9 +5,11 @@
 
 import os
 from collections.abc import Callable, Container, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
+from shutil import rmtree
 from typing import Any
 
 from safetensors.numpy import save
@@ -17,7 +19,7 @@ from unjam.controller.domain import notes_on_controllers
 from unjam.drivers.driver import Driver
 from unjam.drivers.from_file import DriverLike, as_driver
 from unjam.drivers.registry import driver_names, free_label, travels
-from unjam.errors import InputError, wrong
+from unjam.errors import InputError, error_named, wrong
 from unjam.files import make_folder, to_json, write_whole
 from unjam.manifest import manifest
 from unjam.measures.metrics import measure
@@ -28,13 +30,12 @@ from unjam.scenarios import make_scenario, scenario_recipe
 from unjam.scenarios.scenario import Scenario
 from unjam.training.config import RunConfig
 from unjam.training.drive_result import DriveResult, Rows, frame_of_rows
-from unjam.training.executors import error_named
-from unjam.training.folder import make_new_folder
+from unjam.training.folder import new_and_owned
 from unjam.training.seeds import held_out_seeds
 from unjam.worlds.episode import can_drive, run_episode
 from unjam.worlds.record import Episode
 from unjam.worlds.reward import make_reward
-from unjam.worlds.sumo.simulation import own_simulation
+from unjam.worlds.sumo.apart import simulation_for
 from unjam.worlds.workers import EpisodeTask, Workers
 
 TRAINED = "trained"
@@ -128,7 +129,7 @@ def _driven_here(
     left = {index: task for index, task in enumerate(tasks) if index not in done}
     if not left:
         return {}
-    with own_simulation() as simulation:
+    with simulation_for(*(task.scenario for task in left.values())) as simulation:
         return {
             index: keep(
                 index,
@@ -278,19 +279,18 @@ def drive(
         raise wrong("driver", driver, driver_names())
     make_reward(reward or made.reward)
     folder = Path(out) if out is not None else None
-    if folder is not None:
-        make_new_folder(folder)
-
     seeds = held_out_seeds(episodes) if held_out else [(seed + index,) for index in range(episodes)]
-    with Workers(min(workers or os.cpu_count() or 1, episodes * len(drivers))) as pool:
+    pool = Workers(min(workers or os.cpu_count() or 1, episodes * len(drivers)))
+    with new_and_owned(folder) if folder is not None else nullcontext(), pool:
         found = evaluate(made, drivers, seeds, pool, reward, progress)
-    report, notes = None, notes_on_controllers(scenario_recipe(made), drivers, found.shown)
-    if folder is not None and all(row["status"] == "failed" for rows in found.rows.values() for row in rows):
-        folder.rmdir()  # there is nothing to look at
+        report, notes = None, notes_on_controllers(scenario_recipe(made), drivers, found.shown)
+        ran = any(row["status"] != "failed" for rows in found.rows.values() for row in rows)
+        if folder is not None and ran:
+            about = {"scenario": Path(scenario).name, "reward": reward or made.reward, "manifest": manifest()}
+            named = {label: label for label in drivers}
+            save_evaluation(folder, found, {**about, "controllers": _hashes(named), "notes": notes})
+            report = write_report([folder], folder / "report.html")
+    if folder is not None and not ran:  # there is nothing to look at
+        rmtree(folder)
         folder = None
-    if folder is not None:
-        about = {"scenario": Path(scenario).name, "reward": reward or made.reward, "manifest": manifest()}
-        named = {label: label for label in drivers}
-        save_evaluation(folder, found, {**about, "controllers": _hashes(named), "notes": notes})
-        report = write_report([folder], folder / "report.html")
     return DriveResult(scenario, found.rows, folder, report, found.shown, notes)

@@ -20,7 +20,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
-from unjam.errors import MissingPartError, UnjamError
+from unjam.errors import MissingPartError, UnjamError, error_named
 from unjam.files import make_folder, write_whole
 from unjam.parameters import build
 from unjam.processes import bound, end_with_parent
@@ -213,12 +213,6 @@ def train_apart(
     finally:
         child.terminate()  # where it has ended by itself, this does nothing
         child.wait()
-
-
-def error_named(kind: str, words: str) -> UnjamError:
-    """Return the error that another process told of; of a kind that is not ours, it is an `UnjamError`."""
-    kinds = {each.__name__: each for each in UnjamError.__subclasses__()}
-    return kinds.get(kind, UnjamError)(words)
 
 
 def main() -> None:

@@ -6,7 +6,8 @@ are made at the end of iterations: written whole, checked by hash, two generatio
 
 import json
 import shutil
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,7 +19,7 @@ from unjam.drivers.observation import feature, observation_size
 from unjam.errors import InputError
 from unjam.files import DAMAGED, is_leftover, make_folder, to_json, write_folder, write_whole
 from unjam.manifest import manifest, package_versions
-from unjam.processes import LOCK
+from unjam.processes import LOCK, owned
 from unjam.reports.results import read_progress
 from unjam.scenarios import scenario_recipe
 from unjam.scenarios.scenario import Scenario
@@ -84,6 +85,19 @@ def make_new_folder(folder: Path, otherwise: str = "") -> None:
     except OSError as error:  # no place for a folder at all: under /proc, or of a name too long
         why = f"cannot be made ({error.strerror})"
         raise InputError(f"out: {str(folder)!r} {why}; allowed: a new folder") from None
+
+
+@contextmanager
+def new_and_owned(folder: Path) -> Iterator[None]:
+    """Make a folder, and hold it for this process alone.
+
+    Raises:
+        InputError: it holds something already, or another process holds it.
+    """
+    make_new_folder(folder)
+    with owned(folder):
+        make_new_folder(folder)  # another may have written it until just now
+        yield
 
 
 def start_folder(folder: Path, config: RunConfig) -> None:

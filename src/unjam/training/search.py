@@ -13,13 +13,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from unjam.errors import InputError, MissingPartError, UnjamError, wrong
-from unjam.files import make_folder, to_json, write_whole
+from unjam.files import to_json, write_whole
 from unjam.manifest import manifest
 from unjam.parameters import changed, nested, parse_value
 from unjam.reports.results import read_progress, validations_of
 from unjam.training.config import RunConfig, load_config, to_toml
 from unjam.training.executors import CommandLine, Executor, OnLine, running, training_command
-from unjam.training.folder import check_possible
+from unjam.training.folder import check_possible, make_new_folder
 
 if TYPE_CHECKING:
     from optuna import Study
@@ -209,11 +209,10 @@ def _study(base: RunConfig, space: Space, folder: Path) -> "Study":
     from optuna.storages.journal import JournalFileBackend
 
     known = (folder / CONFIG).is_file()
-    if folder.exists() and any(folder.iterdir()) and not known:
-        raise InputError(f"out: {str(folder)!r} is not empty and no search; allowed: a new folder")
+    if not known:
+        make_new_folder(folder, ", or that of a search")
     if known and load_config(folder / CONFIG) != base:
         raise InputError(f"out: {str(folder)!r} is of another configuration; allowed: a new folder")
-    make_folder(folder)
     write_whole(folder / CONFIG, to_toml(base))
     storage = JournalStorage(JournalFileBackend(str(folder / JOURNAL)))
     study = optuna.create_study(

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -144,7 +145,10 @@ def _train_owned(
     else:
         start_folder(folder, config)
     torch.set_num_threads(1)  # more threads would fight with the workers for the cores
-    with Workers(config.workers) as workers:
+    with ExitStack() as held, Workers(config.workers) as workers:
+        for place in [folder / name for name in config.roads() if name]:  # others may evaluate one alone
+            make_folder(place)
+            held.enter_context(owned(place))
         Trainer(folder, config, workers, on_iteration).train()
         rows = {
             name: judge(folder / name, road, workers, progress=progress).rows

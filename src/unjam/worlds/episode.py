@@ -13,7 +13,8 @@ from unjam.worlds.drive import drive
 from unjam.worlds.record import Episode, Floats, outcome_of
 from unjam.worlds.reward import Reward, make_reward
 from unjam.worlds.sumo import make_traffic
-from unjam.worlds.sumo.simulation import Simulation, own_simulation
+from unjam.worlds.sumo.apart import simulation_for
+from unjam.worlds.sumo.simulation import Simulation
 from unjam.worlds.world import OnProgress
 
 
@@ -55,7 +56,8 @@ def run_episode(
         explore: whether a residual driver adds its exploration noise.
         full: whether fuel is recorded and, on roads with ends, where on the plane vehicles are (it costs a
             tenth of the speed).
-        simulation: an open one to use again; without it, one is opened and closed.
+        simulation: an open one to use again; without it, one is opened and closed, on a network of your
+            own in a process that may neither write nor listen.
         progress: called now and then with the number of decisions made.
 
     Raises:
@@ -67,7 +69,7 @@ def run_episode(
         raise InputError(f"driver: it is not allowed on {scenario.title}: it needs a closed road")
     earned = make_reward(reward or scenario.reward)
     if simulation is None:
-        with own_simulation() as simulation:
+        with simulation_for(scenario) as simulation:
             return run_episode(scenario, driver, seed, reward, explore, full, simulation, progress)
     traffic = make_traffic(scenario, seed, simulation, driver.plain_numbers, full)
     episode = drive(traffic, driver, explore, on_progress=progress)

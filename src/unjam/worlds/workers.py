@@ -19,8 +19,8 @@ from unjam.scenarios import scenario_recipe
 from unjam.scenarios.own_network import OwnNetwork
 from unjam.scenarios.scenario import Scenario
 from unjam.tree import Arrays, unpack
+from unjam.worlds.messages import read_message, write_message
 from unjam.worlds.record import Episode, failed_episode
-from unjam.worlds.worker import read_message, write_message
 
 ATTEMPTS = 3
 """how often an episode is tried before its row says that it failed"""

@@ -2,10 +2,10 @@
 
 import importlib
 import io
-import warnings
 import weakref
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import redirect_stdout, suppress
 from functools import partial
 from itertools import count, dropwhile, starmap
@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from unjam.errors import EpisodeError, MissingPartError, UnjamError
 from unjam.processes import PrivateFolder
+from unjam.sandbox import keep_disk
 from unjam.scenarios.scenario import Actuation
 from unjam.sumo_files import copy_harmless, stamp_of
 from unjam.worlds.sumo.files import Files
@@ -142,8 +143,14 @@ class Simulation:
             return
         label = f"unjam-{next(_labels)}"
         traci = _import("traci")
-        with redirect_stdout(io.StringIO()):  # traci announces each of its attempts to connect
+
+        def start() -> None:
+            keep_disk(Path(self._folder.name), Path("/dev"))  # screens and sockets it needs
             traci.start(command, label=label)
+
+        # A thread that ends with it: what is forbidden to SUMO is forbidden to nobody else here.
+        with redirect_stdout(io.StringIO()), ThreadPoolExecutor(1) as confined:
+            confined.submit(start).result()  # traci announces each of its attempts to connect
         self._sumo = traci.getConnection(label)
         # One that nobody closes would complain aloud of the lost connection as this process ends.
         weakref.finalize(self, _close, self._sumo)
@@ -293,16 +300,9 @@ def _close(sumo: Any) -> None:
         sumo.close()
 
 
-def own_simulation() -> Simulation:
-    """Open a simulation in this process; over TraCI, with a warning, where libsumo runs one already."""
-    if _open is None:
-        return Simulation()
-    warnings.warn(
-        "another simulation is open in this process: this one runs over TraCI, with the same results but "
-        "several times slower; close the other, or use gymnasium.make_vec(..., vectorization_mode='async')",
-        stacklevel=2,
-    )
-    return Simulation("traci")
+def is_open() -> bool:
+    """Return whether libsumo runs a simulation in this process."""
+    return _open is not None
 
 
 def _function(sumo: Any, domain: str, name: str) -> Callable[..., Any]:

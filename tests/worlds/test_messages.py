@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from unjam.tree import Arrays
-from unjam.worlds.worker import read_message, write_message
+from unjam.worlds.messages import read_message, write_message
 
 NAMES = st.text(min_size=1, max_size=8)
 FACTS = st.dictionaries(

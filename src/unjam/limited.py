@@ -1,0 +1,59 @@
+"""What a program asks of files of others: the command line's verbs, in a process with their limits.
+
+These are `unjam.verify_controller` and `unjam.write_report`.
+"""
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from unjam.controller.verify import Verified
+from unjam.errors import UnjamError
+from unjam.processes import bound
+
+
+def verify_controller(path: Path | str, trust_code: bool = False) -> list[Verified]:
+    """Return what was checked of a `.unjam` file, or of a run folder; nothing of it is executed.
+
+    It is read as `unjam verify` reads it: in a process of its own, with little memory and time, which may
+    neither write nor reach the network where the kernel sees to it.
+
+    Args:
+        path: the file, or the folder.
+        trust_code: whether Python code that a run folder names may be executed all the same.
+
+    Raises:
+        InputError: the first thing that is wrong, in one line; also where there is code that is not trusted.
+    """
+    options = ["--trust-code"] if trust_code else []
+    found = _answer("verify", *options, "--", str(path))["verified"]
+    return [Verified(name, words) for name, words in found.items()]
+
+
+def write_report(folders: Sequence[Path | str], target: Path | str) -> Path:
+    """Write the report of one folder of results, or a comparison of several; return its path.
+
+    The folders are read as `unjam report` reads them, in a process that may write into the page's folder
+    alone.
+
+    Raises:
+        InputError: a folder holds no results, or another process writes it.
+        DiskError: the page cannot be written, or there is no folder for it.
+    """
+    _answer("report", "--out", str(target), "--", *map(str, folders))
+    return Path(target)
+
+
+def _answer(verb: str, *words: str) -> Any:
+    """Return what a verb of the command line answers; raise its error where it ends with another code."""
+    command = [sys.executable, "-m", "unjam", verb, "--json", *words]
+    done = subprocess.run(command, capture_output=True, text=True, env=bound(os.environ), check=False)
+    if done.returncode == 0:
+        return json.loads(done.stdout)
+    said = (done.stderr.strip().splitlines() or [f"unjam: {verb}: exit code {done.returncode}"])[-1]
+    kinds = {kind.exit_code: kind for kind in UnjamError.__subclasses__() if kind.exit_code > 1}
+    raise kinds.get(done.returncode, UnjamError)(said.removeprefix("unjam: "))

@@ -1,0 +1,151 @@
+"""SUMO in a process of its own that may neither write nor listen: for networks that may come from anywhere.
+
+Programs that drive on such a network ask it over a pipe for what `Simulation` can do: SUMO is confined, while
+the driver and whoever looks on stay where they are. Started as `python -m unjam.worlds.sumo.apart`.
+"""
+
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import warnings
+from collections.abc import Callable
+from functools import cache, partial
+from pathlib import Path
+from typing import Any, Self, get_type_hints
+
+from unjam.errors import EpisodeError, error_named, in_own_words
+from unjam.processes import PrivateFolder, bound, end_with_parent, sweep_private_folders
+from unjam.sandbox import confine, limit
+from unjam.scenarios.own_network import OwnNetwork
+from unjam.scenarios.scenario import Scenario
+from unjam.tree import pack, unpack
+from unjam.worlds.messages import read_message, write_message
+from unjam.worlds.sumo.files import Files
+from unjam.worlds.sumo.simulation import Simulation, is_open
+
+NETWORK_MEMORY = 16 * 2**30
+"""bytes that a process may take once it drives on a network of the user's own"""
+
+
+def simulation_for(*scenarios: Scenario) -> Simulation:
+    """Open a simulation for episodes on these roads: a confined one where one is a network of the user's own.
+
+    Of others it runs in this process; over TraCI, with a warning, where libsumo runs one already.
+    """
+    if any(isinstance(scenario, OwnNetwork) for scenario in scenarios):
+        return SimulationApart()  # pyright: ignore[reportReturnType]  (it answers to the same names)
+    if not is_open():
+        return Simulation()
+    warnings.warn(
+        "another simulation is open in this process: this one runs over TraCI, with the same results but "
+        "several times slower; close the other, or use gymnasium.make_vec(..., vectorization_mode='async')",
+        stacklevel=2,
+    )
+    return Simulation("traci")
+
+
+@cache
+def give_up_rights() -> None:
+    """Let a file that would fill the memory end this process alone, which writes only into its own folder."""
+    limit(NETWORK_MEMORY)
+    confine(Path(tempfile.gettempdir()))
+
+
+class SimulationApart:
+    """A `Simulation` in a confined process; what it is asked for, that process does and answers."""
+
+    def __init__(self) -> None:
+        """Start the process."""
+        sweep_private_folders()
+        self._folder = PrivateFolder()
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "unjam.worlds.sumo.apart"],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            env=bound({**os.environ, "TMPDIR": self._folder.name}),
+            start_new_session=True,  # an interrupt in the terminal is this process's to handle
+        )
+
+    def __getattr__(self, name: str) -> Callable[..., Any]:
+        if name.startswith("_"):
+            raise AttributeError(name)
+        return partial(self._ask, name)
+
+    def load(self, files: Files, step: float, seed: int) -> None:
+        """Start an episode, as `Simulation.load` does."""
+        named = {option: list(map(str, paths)) for option, paths in files.named.items()}
+        self._ask(
+            "load", {**files._asdict(), "named": named, "to_copy": [*map(str, files.to_copy)]}, step, seed
+        )
+
+    def _ask(self, name: str, *arguments: Any) -> Any:
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        plain = [each if isinstance(each, (str, dict)) else _plain(each) for each in arguments]
+        try:
+            write_message(self._process.stdin, {"call": name, "arguments": plain})
+            facts, arrays = read_message(self._process.stdout)
+        except (BrokenPipeError, EOFError):
+            raise EpisodeError(f"SUMO was lost: its process ended with code {self._process.wait()}") from None
+        if "error" in facts:
+            raise error_named(*facts["error"])
+        return unpack(_answer_of(name), facts["answer"], arrays)
+
+    def close(self) -> None:
+        """End the process; may be called twice."""
+        self._process.kill()
+        self._process.communicate()
+        self._folder.cleanup()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+
+def _plain(value: Any) -> Any:
+    """Return an argument as JSON: names and numbers come in many kinds of sequences."""
+    return list(value) if hasattr(value, "__iter__") else value
+
+
+@cache
+def _answer_of(name: str) -> Any:
+    """Return the type of what `Simulation` answers when it is asked for `name`."""
+    method = getattr(Simulation, name, None)
+    return get_type_hints(method).get("return", Any) if method else Any
+
+
+def main() -> None:
+    """Do what is asked on standard input until it is closed."""
+    end_with_parent(signal.SIGKILL)
+    answers = os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)  # SUMO may print: not into the answers
+    give_up_rights()
+    with Simulation() as simulation:
+        while True:
+            try:
+                facts, _ = read_message(sys.stdin.buffer)
+            except EOFError:
+                return
+            try:
+                answer, arrays = pack(_do(simulation, facts["call"], facts["arguments"]))
+                write_message(answers, {"answer": answer}, arrays)
+            except Exception as error:
+                known = in_own_words(error)
+                write_message(answers, {"error": [type(known).__name__, str(known)]})
+
+
+def _do(simulation: Simulation, name: str, arguments: list[Any]) -> Any:
+    if name == "load":
+        files = arguments[0]
+        named = {option: tuple(map(Path, paths)) for option, paths in files["named"].items()}
+        to_copy = frozenset(map(Path, files["to_copy"]))
+        arguments[0] = Files(tuple(files["options"]), named, files["traffic"], files["option"], to_copy)
+    return getattr(simulation, name)(*arguments)
+
+
+if __name__ == "__main__":
+    main()

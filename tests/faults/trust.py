@@ -1,0 +1,272 @@
+"""Attacks by files of others, and on what a run belongs to; and kills at every point of a run's life."""
+
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import product
+from pathlib import Path
+from typing import Any, get_args
+
+import numpy as np
+import psutil
+import pytest
+
+from tests.controller.test_file import residual
+from tests.faults.outcome import Outcome, one_line
+from tests.test_processes import holder
+from tests.test_sandbox import TRIES
+from tests.training.test_belonging import of_expert, of_network, of_reward, with_checkpoint
+from tests.training.test_crash_points import Moment, content_of, crash, run
+from tests.training.test_run import small_config
+from tests.worlds.sumo.own_roads import straight
+from tests.worlds.sumo.test_hostile import OPTIONS
+from tests.worlds.sumo.test_network_files import edges_of
+from tests.worlds.test_episode import insists
+from tests.worlds.test_record import fingerprint
+from unjam import sandbox
+from unjam.controller import controller_bytes
+from unjam.controller.verify import verify_controller
+from unjam.drivers import Driver, LocalState, PISaturation
+from unjam.drivers.from_file import FileDriver
+from unjam.drivers.wrappers import Mixed, Remembering
+from unjam.errors import EpisodeError, InputError
+from unjam.processes import owned
+from unjam.scenarios import Ring, make_scenario
+from unjam.training import folder as run_folder
+from unjam.training.folder import STATE, belonging, last_state
+from unjam.worlds.episode import run_episode
+from unjam.worlds.sumo import networks
+from unjam.worlds.sumo.apart import SimulationApart
+from unjam.worlds.sumo.files import files_of
+from unjam.worlds.sumo.networks import network_file
+from unjam.worlds.sumo.simulation import Simulation
+
+FORBIDDEN = ("write", "make", "remove", "move", "link", "by a child", "TCP", "UDP", "Unix")
+"""what `TRIES` tries and must not do"""
+CARS = '<flow id="f" type="car" route="along" begin="0" end="60" period="3"/>'
+GENTLE = "def gentle(state):\n    return 0.1 * (state.leader_speed - state.speed)\n"
+ROADS = ("ring", "figure-eight", "merge", "on-ramp", "own")
+
+
+def sandboxes(count: int, folder: Path, generator: np.random.Generator) -> Outcome:
+    """Let what runs in the sandbox write, or open a socket: a program beside the reader, and SUMO itself."""
+    outcome, inside = Outcome(), folder / "inside"
+    inside.mkdir()
+    program, canary = folder / "tries.py", folder / "canary"
+    program.write_text(TRIES)
+    path = straight(folder, CARS)
+    road = make_scenario(str(path), {"cav_share": 0.5, "horizon": 5})
+    files = files_of(road, road.of_seed((0,))[0])
+    canary.write_text("as it was")
+    limited = [sys.executable, "-I", "-S", sandbox.__file__, str(2**30), "60", str(inside), str(program)]
+    before = sorted(path.name for path in folder.iterdir())
+    with SimulationApart() as sumo:
+        for _ in range(count):
+            if generator.random() < 0.5:
+                wanted = str(generator.choice(FORBIDDEN))
+                ran = subprocess.run(
+                    [*limited, str(canary), str(inside), wanted], capture_output=True, check=True
+                )
+                assert ran.stdout == b"", wanted
+                words = f"a program in the sandbox: {wanted}: refused by the kernel"
+            else:
+                wanted = str(generator.choice([*OPTIONS, "remote-port"]))
+                told = f"--{wanted}={45871 if wanted == 'remote-port' else canary}"
+                try:
+                    sumo.load(files._replace(options=(*files.options, told)), 0.1, 0)
+                    sumo.step()
+                except EpisodeError as error:
+                    one_line(error)
+                process = psutil.Process(sumo._process.pid)
+                assert not any(one.status == "LISTEN" for one in process.net_connections())
+                words = "SUMO that was told to write or to listen: it did not"
+            assert canary.read_text() == "as it was"
+            assert sorted(path.name for path in folder.iterdir()) == before
+            outcome.happened[words] += 1
+    return outcome
+
+
+def crash_points(count: int, folder: Path, generator: np.random.Generator) -> Outcome:
+    """Kill a run, or fill the disk, before, within or after a thing that it does to its folder; go on."""
+    outcome = Outcome()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(run_folder, "manifest", lambda: {"started": "some day"})
+        total = crash(folder / "wanted", 0, "before", False).count
+        wanted = content_of(folder / "wanted")
+        points = list(product((True, False), get_args(Moment), range(1, total + 1)))
+        order = generator.permutation(len(points))
+        for number in np.resize(order, count):  # none twice before all were once
+            kill, moment, at = points[number]
+            place = folder / "run"
+            crash(place, at, moment, kill)
+            run(place)
+            assert content_of(place) == wanted, points[number]
+            shutil.rmtree(place)
+            how = "killed" if kill else "the disk was full"
+            outcome.happened[f"{how} {HALF.get(moment, moment)}: it went on to the same files"] += 1
+    outcome.facts["points"] = len(points)
+    return outcome
+
+
+HALF = {"half": "within"}
+
+
+@dataclass(frozen=True)
+class _Run:
+    """A run folder with a checkpoint, that somebody changes."""
+
+    folder: Path
+    place: Path
+
+
+def _another_setting(at: _Run, generator: np.random.Generator) -> Any:
+    with_checkpoint(at.folder, small_config())
+    changes = [{"seed": 5}, {"trpo__gamma": 0.5}, {"road__vehicles": 9}, {"expert": "idm"}, {"agent": "ppo"}]
+    return small_config(**changes[int(generator.integers(len(changes)))])
+
+
+def _another_file(at: _Run, generator: np.random.Generator) -> Any:
+    makers = {of_expert: "mine.py", of_reward: "mine.py", of_network: "demand.rou.xml"}
+    make = list(makers)[int(generator.integers(len(makers)))]
+    config = make(at.place)
+    with_checkpoint(at.folder, config)
+    changed = at.place / makers[make]
+    changed.write_text(changed.read_text() + " ")
+    return config
+
+
+def _anothers_checkpoint(at: _Run, generator: np.random.Generator) -> Any:
+    other = at.place / "other"
+    with_checkpoint(at.folder, small_config())
+    with_checkpoint(other, small_config(seed=int(generator.integers(1, 100))))
+    shutil.rmtree(at.folder / "checkpoint")
+    shutil.copytree(other / "checkpoint", at.folder / "checkpoint")
+    return small_config()
+
+
+def _edited_checkpoint(at: _Run, generator: np.random.Generator) -> Any:
+    with_checkpoint(at.folder, small_config())
+    state = next((at.folder / "checkpoint").rglob(STATE))
+    state.write_text(state.read_text().replace('"seed": 0', '"seed": 7'))
+    return small_config(seed=7)
+
+
+LINEAGES: dict[str, Callable[[_Run, np.random.Generator], Any]] = {
+    "another setting": _another_setting,
+    "another expert, reward or network": _another_file,
+    "another run's checkpoint": _anothers_checkpoint,
+    "an edited checkpoint": _edited_checkpoint,
+}
+
+
+def lineages(count: int, folder: Path, generator: np.random.Generator) -> Outcome:
+    """Let a run go on from a checkpoint that is not its own, or as another run."""
+    outcome = Outcome()
+    for number in range(count):
+        at = _Run(folder / str(number) / "run", folder / str(number))
+        at.place.mkdir()
+        what = str(generator.choice(list(LINEAGES)))
+        config = LINEAGES[what](at, generator)
+        before = content_of(at.folder)
+        with pytest.raises(InputError) as caught:
+            last_state(at.folder, {at.folder}, belonging(config))
+        one_line(caught.value)
+        assert content_of(at.folder) == before
+        outcome.happened[f"{what}: refused in one line, nothing changed"] += 1
+        shutil.rmtree(at.place)
+    return outcome
+
+
+def locks(count: int, folder: Path, generator: np.random.Generator) -> Outcome:
+    """Write into a folder that another process writes, and again once that is killed."""
+    outcome = Outcome()
+    for _ in range(count):
+        process = holder(folder)
+        with pytest.raises(InputError, match="is being written by another process") as caught, owned(folder):
+            pass
+        one_line(caught.value)
+        process.kill()
+        process.wait()
+        with owned(folder):
+            outcome.happened["refused in one line; free as soon as the owner was killed"] += 1
+        assert list(folder.iterdir()) == []
+    return outcome
+
+
+def caches(count: int, folder: Path, generator: np.random.Generator) -> Outcome:
+    """Edit, cut, empty or remove a network in the cache, and ask for it."""
+    outcome, road = Outcome(), Ring(length=(230, 230)).draw(np.random.default_rng(0)).network
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("UNJAM_CACHE", str(folder))
+        made = network_file(road)
+        whole, edges = made.read_bytes(), edges_of(made)
+        for _ in range(count):
+            at = int(generator.integers(len(whole)))
+            kind = str(generator.choice(["edited", "cut", "empty", "gone"]))
+            made.unlink()
+            if kind != "gone":
+                edited = whole[:at] + bytes([whole[at] ^ 1]) + whole[at + 1 :]
+                made.write_bytes({"edited": edited, "cut": whole[:at], "empty": b""}[kind])
+            networks._whole.clear()  # as in a new process
+            assert network_file(road) == made
+            assert edges_of(made) == edges
+            assert len(list(made.parent.iterdir())) == 1
+            outcome.happened[f"{kind}: noticed, and made anew"] += 1
+    return outcome
+
+
+def codes(count: int, folder: Path, generator: np.random.Generator) -> Outcome:
+    """Let a run folder's controller name Python code, somewhere within it, and verify it."""
+    outcome = Outcome()
+    for number in range(count):
+        place = folder / str(number)
+        place.mkdir()
+        code, ran = place / "code.py", place / "ran"
+        code.write_text(f"{GENTLE}seen = gentle\n")
+        driver, where = _hidden(code, generator)
+        (place / "controller.unjam").write_bytes(controller_bytes(driver, {}))
+        code.write_text(f"open({str(ran)!r}, 'w').close()\n" + code.read_text())
+        path = place if generator.random() < 0.5 else place / "controller.unjam"
+        with pytest.raises(InputError) as caught:
+            verify_controller(path)
+        one_line(caught.value)
+        assert not ran.exists()
+        outcome.happened[f"{where}: refused in one line, nothing ran"] += 1
+    return outcome
+
+
+def _hidden(code: Path, generator: np.random.Generator) -> tuple[Driver, str]:
+    """Return a driver that holds Python code, and where."""
+    mine = FileDriver(code, "gentle")
+    choices: Sequence[tuple[Driver, str]] = (
+        (mine, "a driver"),
+        (residual(mine), "an expert"),
+        (Mixed((PISaturation(), mine)), "one of several drivers"),
+        (Remembering(mine, 0.1), "a driver that another holds"),
+    )
+    return choices[int(generator.integers(len(choices)))]
+
+
+def cheats(count: int, folder: Path, generator: np.random.Generator) -> Outcome:
+    """Let a driver change all that it is shown, by force, on every kind of road."""
+    outcome, own, honest_ones = Outcome(), straight(folder, CARS, length=300.0), {}
+
+    def honest(state: LocalState) -> np.ndarray:
+        return np.clip(0.5 * np.subtract(state.leader_speed, state.speed), -1, 1)
+
+    with Simulation() as simulation:
+        for number in range(count):
+            name = ROADS[number % len(ROADS)]
+            closed = name in ("ring", "figure-eight")
+            share = {"cavs": 2, "warmup": 0} if closed else {"cav_share": 1.0}
+            road = make_scenario(str(own) if name == "own" else name, {**share, "horizon": 30})
+            seed = int(generator.integers(10))
+            if (name, seed) not in honest_ones:
+                driven = run_episode(road, honest, seed, simulation=simulation)
+                honest_ones[name, seed] = fingerprint(driven)
+            cheated = run_episode(road, insists, seed, simulation=simulation)
+            assert fingerprint(cheated) == honest_ones[name, seed]
+            outcome.happened[f"{name}: measured as if it had not"] += 1
+    return outcome

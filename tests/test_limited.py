@@ -1,0 +1,40 @@
+"""What a program asks of files of others."""
+
+from pathlib import Path
+
+import pytest
+
+import unjam
+from tests.controller.test_verify import ABOUT, content_of
+from unjam.controller import controller_bytes
+from unjam.controller.verify import verify_controller
+from unjam.drivers.from_file import FileDriver
+from unjam.errors import DiskError, InputError
+
+
+def test_a_controller_is_verified_in_a_limited_process(tmp_path: Path) -> None:
+    path = tmp_path / "it.unjam"
+    path.write_bytes(content_of())
+    assert unjam.verify_controller(path) == verify_controller(path)
+    path.write_bytes(content_of()[:-5])
+    with pytest.raises(InputError, match=r"^controller it\.unjam: "):
+        unjam.verify_controller(path)
+
+
+def test_code_that_a_folder_names_runs_where_it_is_trusted_alone(tmp_path: Path) -> None:
+    code = tmp_path / "code.py"
+    code.write_text("def gentle(state):\n    return 0.1 * (state.leader_speed - state.speed)\n")
+    (tmp_path / "controller.unjam").write_bytes(controller_bytes(FileDriver(code, "gentle"), ABOUT))
+    with pytest.raises(InputError, match="which runs only with --trust-code"):
+        unjam.verify_controller(tmp_path)
+    assert unjam.verify_controller(tmp_path, trust_code=True)[-1].name == "manifest"
+
+
+@pytest.mark.usefixtures("without_pictures")
+def test_a_report_is_written_in_a_limited_process(tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    unjam.drive("ring", "pi", 1, road={"horizon": 20, "warmup": 0}, workers=1, out=run)
+    assert unjam.write_report([run], run / "again.html") == run / "again.html"
+    assert (run / "again.html").stat().st_size > 10_000
+    with pytest.raises(DiskError, match="no such folder"):
+        unjam.write_report([run], run / "nowhere" / "again.html")

@@ -1,0 +1,129 @@
+"""Programs that drive on networks of their own: SUMO is confined, the driver is not."""
+
+import os
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import psutil
+import pytest
+
+from tests.test_processes import soon
+from tests.test_sandbox import kept
+from tests.worlds.sumo.own_roads import straight
+from tests.worlds.test_record import fingerprint
+from unjam import drive
+from unjam.drivers import IDM, LocalState
+from unjam.errors import EpisodeError
+from unjam.scenarios import Ring, make_scenario
+from unjam.scenarios.scenario import Scenario
+from unjam.worlds.episode import run_episode
+from unjam.worlds.sumo import make_traffic
+from unjam.worlds.sumo.apart import SimulationApart, simulation_for
+from unjam.worlds.sumo.files import files_of
+from unjam.worlds.sumo.simulation import Simulation
+
+CARS = "".join(
+    f'<vehicle id="{number}" type="car" route="along" depart="0" departPos="{400 - 60 * number}" '
+    f'departSpeed="10"/>'
+    for number in range(5)
+)
+WRITING = ("--tripinfo-output={}", "--fcd-output={}", "--save-configuration={}")
+
+
+@pytest.fixture
+def road(tmp_path: Path) -> Scenario:
+    return make_scenario(str(straight(tmp_path, CARS)), {"cav_share": 0.5, "horizon": 40})
+
+
+def test_an_episode_is_the_same_wherever_sumo_runs(road: Scenario, simulation: Simulation) -> None:
+    here = run_episode(road, IDM(), 3, simulation=simulation, full=True)
+    apart = run_episode(road, IDM(), 3, full=True)
+    assert fingerprint(here) == fingerprint(apart)
+    np.testing.assert_array_equal(here.places, apart.places)
+
+
+def test_all_that_is_asked_of_a_simulation_is_answered_alike(road: Scenario, simulation: Simulation) -> None:
+    asked = [(name, of) for name, of in vars(Simulation).items() if not name.startswith("_") and callable(of)]
+    told = {"load", "step", "close", "command_speeds", "replace_speeds", "command_people", "take_control"}
+    answers = []
+    with SimulationApart() as apart:
+        for each in (simulation, apart):
+            make_traffic(road, (0,), each).start(controlled=False)  # pyright: ignore[reportArgumentType]
+            names = ["0", "1"]
+            arguments = {"neighbours": ("1", 100.0), "leader": ("1", 100.0), "left": (), "more_expected": ()}
+            arguments |= dict.fromkeys(("type_of", "route_of"), ("1",))
+            answers.append(
+                {
+                    name: getattr(each, name)(*arguments.get(name, (names,)))
+                    for name, _ in asked
+                    if name not in told
+                }
+            )
+    for name, answer in answers[0].items():
+        assert type(answers[1][name]) is type(answer), name
+        np.testing.assert_equal(answers[1][name], answer, name)
+
+
+def test_a_function_of_the_program_drives_where_it_is(road: Scenario, tmp_path: Path) -> None:
+    seen = []
+
+    def mine(state: LocalState) -> np.ndarray:
+        seen.append(os.getpid())
+        (tmp_path / "mine").touch()
+        return np.zeros(len(state.speed))
+
+    result = drive(road.file, mine, 1, road={"cav_share": 0.5, "horizon": 5})  # pyright: ignore
+    assert [row["status"] for rows in result.rows.values() for row in rows] == ["completed"]
+    assert set(seen) == {os.getpid()}
+
+
+@kept
+@pytest.mark.parametrize("option", WRITING)
+def test_what_sumo_might_be_brought_to_do_the_kernel_refuses(
+    option: str, road: Scenario, tmp_path: Path
+) -> None:
+    canary, files = tmp_path / "canary", files_of(road, road.of_seed((0,))[0])
+    canary.write_text("as it was")
+    told = (*files.options, option.format(canary))
+    with SimulationApart() as simulation, pytest.raises(EpisodeError, match="SUMO cannot start") as caught:
+        simulation.load(files._replace(options=told), road.simulation_step, 0)
+    assert "\n" not in str(caught.value)
+    assert canary.read_text() == "as it was"
+
+
+@kept
+@pytest.mark.parametrize("option", WRITING)
+def test_sumo_as_a_child_of_its_own_and_its_window_write_nothing_either(
+    option: str, road: Scenario, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    canary, files = tmp_path / "canary", files_of(road, road.of_seed((0,))[0])
+    canary.write_text("as it was")
+
+    def start(command: list[str], label: str) -> None:
+        code = subprocess.run(command, capture_output=True, check=False).returncode
+        raise RuntimeError(f"code {code}")
+
+    monkeypatch.setattr("traci.start", start)
+    told = (*files.options, option.format(canary))
+    with Simulation("traci") as simulation, pytest.raises(EpisodeError, match="SUMO cannot start"):
+        simulation.load(files._replace(options=told), road.simulation_step, 0)
+    assert canary.read_text() == "as it was"
+    canary.write_text("this process may still write")
+
+
+def test_a_lost_process_is_an_error_in_one_line_and_leaves_nothing(road: Scenario) -> None:
+    with SimulationApart() as simulation:
+        process, folder = psutil.Process(simulation._process.pid), Path(simulation._folder.name)
+        files = files_of(road, road.of_seed((0,))[0])
+        simulation.load(files, road.simulation_step, 0)
+        process.kill()
+        with pytest.raises(EpisodeError, match=r"SUMO was lost: .* -9"):
+            simulation.step()
+    assert soon(process.pid)
+    assert not folder.exists()
+
+
+def test_only_networks_of_others_run_apart(road: Scenario) -> None:
+    with simulation_for(Ring()) as here, simulation_for(Ring(), road) as apart:
+        assert [type(here), type(apart)] == [Simulation, SimulationApart]
