@@ -33,9 +33,9 @@ from unjam.training.export import export_controller
 from unjam.training.family import GROWN
 from unjam.worlds.workers import Workers
 
-SEEDS = 4
+SEEDS = 2
 """of each driver on each road"""
-SEEDS_IMPAIRED = 12
+SEEDS_IMPAIRED = 8
 ROADS: dict[str, str] = {
     "unjam:best": "ring-jammed",
     "unjam:ring-best": "ring",
