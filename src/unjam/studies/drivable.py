@@ -42,6 +42,7 @@ PI_LONG = (
 """what `unjam tune ring --expert pi --steps 12000000` finds; of the other it is `unjam:ring-gap-tuned`"""
 CEILING = "leads all to the limit"
 OTHER = "residual of the other road"
+NOTHING = "–"
 PACER_TUNED, PACER_GENTLE = "pacer, tuned", "pacer, tuned, with room"
 KEPT = (
     *("return", "return_eq16", "mean_speed", "mean_speed_steady", "throughput_veh_per_h", "fuel_ml_per_km"),
@@ -141,7 +142,8 @@ def table(road: str, folder: Path) -> pd.DataFrame:
     groups = {label: [label] for label in labels if label not in trainings}
     if trainings:
         groups[f"residual, {len(trainings)} trainings"] = trainings
-    return pd.DataFrame([_row(ROADS[road], episodes, label, members) for label, members in groups.items()])
+    found = pd.DataFrame([_row(ROADS[road], episodes, label, members) for label, members in groups.items()])
+    return found.loc[:, (found != NOTHING).any()]
 
 
 def _row(road: JudgedRoad, episodes: pd.DataFrame, label: str, members: list[str]) -> dict[str, Any]:
@@ -169,15 +171,15 @@ def _row(road: JudgedRoad, episodes: pd.DataFrame, label: str, members: list[str
         "flow [veh/h]": f"{mean['throughput_veh_per_h']:.0f}",
         "fuel [ml/km]": f"{mean['fuel_ml_per_km']:.0f}",
         "dissolved after [s]": _dissolved(np.asarray(own["time_to_dissolve"], np.float64)),
-        "smallest headway [s]": "–" if isinf(closest) else f"{closest:.2f}",
-        "drivable": (worst[0] or "–") if worst else "yes",
+        "smallest headway [s]": NOTHING if isinf(closest) else f"{closest:.2f}",
+        "drivable": (worst[0] or NOTHING) if worst else "yes",
     }
 
 
 def _dissolved(times: Floats) -> str:
     """Return after how long waves were dissolved, and how many of them."""
     share = np.isfinite(times).mean()
-    return "–" if not share else f"{np.nanmean(times):.1f}" + (f" ({share:.0%})" if share < 1.0 else "")
+    return NOTHING if not share else f"{np.nanmean(times):.1f}" + (f" ({share:.0%})" if share < 1.0 else "")
 
 
 def _study(title: str, roads: Sequence[str], minutes: float) -> Study:
