@@ -19,7 +19,7 @@ from unjam.parameters import changed, nested, parse_value
 from unjam.reports.results import read_progress, validations_of
 from unjam.training.config import RunConfig, load_config, to_toml
 from unjam.training.executors import CommandLine, Executor, OnLine, running, training_command
-from unjam.training.folder import check_possible, make_new_folder
+from unjam.training.folder import check_possible, make_new_folder, read_config
 
 if TYPE_CHECKING:
     from optuna import Study
@@ -211,7 +211,7 @@ def _study(base: RunConfig, space: Space, folder: Path) -> "Study":
     known = (folder / CONFIG).is_file()
     if not known:
         make_new_folder(folder, ", or that of a search")
-    if known and load_config(folder / CONFIG) != base:
+    if known and read_config(folder, to_run=False) != base:
         raise InputError(f"out: {str(folder)!r} is of another configuration; allowed: a new folder")
     write_whole(folder / CONFIG, to_toml(base))
     storage = JournalStorage(JournalFileBackend(str(folder / JOURNAL)))
@@ -230,8 +230,9 @@ def _study(base: RunConfig, space: Space, folder: Path) -> "Study":
 def _proposed(study: "Study", space: Space, trials: int) -> Iterator[tuple[int, dict[str, Any]]]:
     """Yield number and values of what is to be tried: what was stopped, then new ones, so many in all."""
     for stopped in [trial for trial in study.get_trials() if trial.state.name == "RUNNING"]:
-        if stopped.params.keys() == space.keys():
-            yield stopped.number, stopped.params
+        known = {key: value for key, value in stopped.params.items() if _is_of(space.get(key), value)}
+        if known.keys() == space.keys():
+            yield stopped.number, known
         else:
             _tell(study, stopped.number, None)  # it was stopped before it had all its values
     while len(study.get_trials(deepcopy=False)) < trials:
@@ -239,6 +240,11 @@ def _proposed(study: "Study", space: Space, trials: int) -> Iterator[tuple[int, 
         for key, values in space.items():
             values.suggest(trial, key)
         yield trial.number, trial.params
+
+
+def _is_of(values: Range | Choice | None, value: Any) -> bool:
+    """Return whether a value that a folder holds was proposed from these: others could name code."""
+    return values is not None and (isinstance(value, int | float) or value in values.ends)
 
 
 def _tell(study: "Study", number: int, gain: float | None) -> None:
