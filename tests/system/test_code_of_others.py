@@ -105,7 +105,7 @@ def test_who_names_his_own_code_is_asked_for_nothing(unjam: Run, tmp_path: Path)
     (tmp_path / "mine.py").write_text(DRIVER)
     (tmp_path / "small.toml").write_text(to_toml(small_config(road__horizon=20)))
     named = ("--config", "small.toml", "--expert", "mine.py:gentle", "--out", "run")
-    for arguments in (("train", *named), (*DRIVE, "run"), ("evaluate", "run", "--episodes", "1")):
+    for arguments in (("train", *named), (*DRIVE, "run")):
         done = unjam(*arguments, pictures=False)
         assert done.returncode == 0, done.stderr
 

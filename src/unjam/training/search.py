@@ -230,9 +230,10 @@ def _study(base: RunConfig, space: Space, folder: Path) -> "Study":
 def _proposed(study: "Study", space: Space, trials: int) -> Iterator[tuple[int, dict[str, Any]]]:
     """Yield number and values of what is to be tried: what was stopped, then new ones, so many in all."""
     for stopped in [trial for trial in study.get_trials() if trial.state.name == "RUNNING"]:
-        known = {key: value for key, value in stopped.params.items() if _is_of(space.get(key), value)}
-        if known.keys() == space.keys():
-            yield stopped.number, known
+        if stopped.params.keys() == space.keys():
+            for key, value in stopped.params.items():
+                _check_offered(key, value, space[key])
+            yield stopped.number, stopped.params
         else:
             _tell(study, stopped.number, None)  # it was stopped before it had all its values
     while len(study.get_trials(deepcopy=False)) < trials:
@@ -242,9 +243,10 @@ def _proposed(study: "Study", space: Space, trials: int) -> Iterator[tuple[int, 
         yield trial.number, trial.params
 
 
-def _is_of(values: Range | Choice | None, value: Any) -> bool:
-    """Return whether a value that a folder holds was proposed from these: others could name code."""
-    return values is not None and (isinstance(value, int | float) or value in values.ends)
+def _check_offered(key: str, value: Any, values: Range | Choice) -> None:
+    """Raise `InputError` where a value that a folder holds is a text not offered: it may name code."""
+    if not isinstance(value, int | float) and value not in values.ends:
+        raise InputError(f"out: {key}: {value!r} in {JOURNAL} was not offered; allowed: a new folder")
 
 
 def _tell(study: "Study", number: int, gain: float | None) -> None:
