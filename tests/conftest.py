@@ -1,6 +1,9 @@
 """What all tests share."""
 
 import itertools
+import os
+import shutil
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -12,6 +15,11 @@ from tests.pictures import empty_pictures
 from unjam.drivers import LocalState
 from unjam.drivers.network import Network
 from unjam.worlds.sumo.simulation import Simulation
+
+if "UNJAM_STATE" not in os.environ:  # which code the tests ran is not what the user ran
+    os.environ["UNJAM_STATE"] = STATE = tempfile.mkdtemp(prefix="state-of-tests-")
+else:
+    STATE = ""
 
 # No timed tests, and the same each time. `make test-all` takes the thorough one.
 settings.register_profile("unjam", deadline=None, derandomize=True, max_examples=20)
@@ -27,6 +35,11 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     ranks = {name: rank for rank, name in enumerate(LONGEST)}
     tests = Path(__file__).parent
     items.sort(key=lambda item: ranks.get(item.path.relative_to(tests).parts[0], len(ranks)))
+
+
+def pytest_unconfigure() -> None:
+    if STATE:
+        shutil.rmtree(STATE, ignore_errors=True)
 
 
 @pytest.fixture

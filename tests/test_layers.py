@@ -18,7 +18,18 @@ ORDER = (
     *("training", "studies", "cli"),
 )
 """each may import those before it, and none after it"""
-EVERYWHERE = {"", "errors", "files", "kernels", "manifest", "parameters", "processes", "sandbox", "tree"}
+EVERYWHERE = {
+    "",
+    "errors",
+    "files",
+    "kernels",
+    "manifest",
+    "parameters",
+    "processes",
+    "sandbox",
+    "tree",
+    "trust",
+}
 """what has no place in the order: it imports none of the layers"""
 ALLOWED = {
     "controller": {"physics", "drivers", "worlds"},
@@ -34,10 +45,10 @@ ALLOWED = {
 LAZY = {
     "__init__": {
         *("controller", "drivers", "environments", "errors", "kernels", "limited", "measures", "scenarios"),
-        *("training", "worlds"),
+        *("training", "trust", "worlds"),
     },
     "__main__": {"cli"},
-    "limited": {"controller", "errors", "processes"},
+    "limited": {"controller", "errors", "processes", "trust"},
 }
 TORCH = {"torch", "stable_baselines3", "sb3_contrib"}
 LONGEST = 330

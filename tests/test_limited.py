@@ -21,11 +21,14 @@ def test_a_controller_is_verified_in_a_limited_process(tmp_path: Path) -> None:
         unjam.verify_controller(path)
 
 
-def test_code_that_a_folder_names_runs_where_it_is_trusted_alone(tmp_path: Path) -> None:
+def test_code_that_a_folder_names_runs_where_it_is_trusted_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     code = tmp_path / "code.py"
     code.write_text("def gentle(state):\n    return 0.1 * (state.leader_speed - state.speed)\n")
     (tmp_path / "controller.unjam").write_bytes(controller_bytes(FileDriver(code, "gentle"), ABOUT))
-    with pytest.raises(InputError, match="which runs only with --trust-code"):
+    monkeypatch.setenv("UNJAM_STATE", str(tmp_path / "of another user"))
+    with pytest.raises(InputError, match="it runs only with --trust-code"):
         unjam.verify_controller(tmp_path)
     assert unjam.verify_controller(tmp_path, trust_code=True)[-1].name == "manifest"
 

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from unjam.training.export import export_controller
     from unjam.training.runs import list_runs
     from unjam.training.train import train
+    from unjam.trust import trusting_code
     from unjam.worlds.episode import run_episode
 
 # Imported when first used: workers must stay free of torch, and the command line quick.
@@ -48,6 +49,7 @@ _PLACES = {
     "list_runs": "unjam.training.runs",
     "run_episode": "unjam.worlds.episode",
     "parallel_env": "unjam.environments.several",
+    "trusting_code": "unjam.trust",
     "write_report": "unjam.limited",
     "Driver": "unjam.drivers",
     "LocalState": "unjam.drivers",
@@ -71,6 +73,7 @@ __all__ = [
     "parallel_env",
     "run_episode",
     "train",
+    "trusting_code",
     "verify_controller",
     "write_report",
 ]

@@ -14,22 +14,23 @@ from typing import Any
 from unjam.controller.verify import Verified
 from unjam.errors import UnjamError
 from unjam.processes import bound
+from unjam.trust import FLAG
 
 
 def verify_controller(path: Path | str, trust_code: bool = False) -> list[Verified]:
-    """Return what was checked of a `.unjam` file, or of a run folder; nothing of it is executed.
+    """Return what was checked of a `.unjam` file, or of a run folder; no code runs that is not trusted.
 
     It is read as `unjam verify` reads it: in a process of its own, with little memory and time, which may
     neither write nor reach the network where the kernel sees to it.
 
     Args:
         path: the file, or the folder.
-        trust_code: whether Python code that a run folder names may be executed all the same.
+        trust_code: whether Python code that a run folder names runs all the same.
 
     Raises:
         InputError: the first thing that is wrong, in one line; also where there is code that is not trusted.
     """
-    options = ["--trust-code"] if trust_code else []
+    options = [FLAG] if trust_code else []
     found = _answer("verify", *options, "--", str(path))["verified"]
     return [Verified(name, words) for name, words in found.items()]
 

@@ -26,6 +26,7 @@ from unjam.drivers.observation import FeatureName, observation_size
 from unjam.drivers.registry import recipe_of
 from unjam.drivers.wrappers import Mixed
 from unjam.errors import InputError
+from unjam.trust import trusting_code
 
 ALL_PARTS: tuple[FeatureName, ...] = (
     *("local", "expert_acceleration", "expert_memory", "loop_length", "place", "route_position"),
@@ -233,7 +234,10 @@ def test_a_feature_of_the_users_own_runs_from_its_run_folder_alone_and_unchanged
         written(tmp_path, content)
     )
     assert not (tmp_path / "sprung").exists()
-    assert isinstance(load_controller(tmp_path), Mixed)
+    assert "runs only with --trust-code" in refused(tmp_path)
+    assert not (tmp_path / "sprung").exists()
+    with trusting_code():
+        assert isinstance(load_controller(tmp_path), Mixed)
     code.write_text(code.read_text() + "# changed")
     assert "has changed since" in refused(tmp_path)
 

@@ -19,6 +19,7 @@ from unjam.controller.verify import verify_controller
 from unjam.drivers import Constant, Driver, PISaturation, ResidualDriver
 from unjam.drivers.from_file import FileDriver
 from unjam.errors import InputError
+from unjam.trust import trusting_code
 
 HELD = residual(PISaturation(), hold=3)
 
@@ -62,15 +63,18 @@ def test_code_of_a_folder_runs_only_where_it_is_trusted(tmp_path: Path) -> None:
     held = residual(FileDriver(code, "gentle"))
     code.write_text(f"open({str(ran)!r}, 'w').close()\n" + code.read_text())
     (tmp_path / "controller.unjam").write_bytes(controller_bytes(held, ABOUT))
-    for path in (tmp_path, tmp_path / "controller.unjam"):
-        assert "its expert is Python code (code.py), which " in refused(path)
-    assert refused(tmp_path).endswith("which runs only with --trust-code")
+    alone = refused(tmp_path / "controller.unjam")
+    assert alone.endswith("Python code (code.py), which a file by itself may not run; use the run folder")
+    assert f"names Python code ({str(code)!r}), which " in refused(tmp_path)
+    assert refused(tmp_path).endswith("it runs only with --trust-code")
     assert not ran.exists()
-    assert [each.name for each in verify_controller(tmp_path, trust_code=True)][-1] == "manifest"
+    with trusting_code():
+        assert names(tmp_path)[-1] == "manifest"
     assert ran.exists()
+    assert names(tmp_path)[-1] == "manifest"  # it is remembered
 
 
-def test_a_feature_of_a_folder_is_code_too(tmp_path: Path) -> None:
+def test_a_feature_of_a_folder_is_code_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     code, ran = tmp_path / "eyes.py", tmp_path / "ran"
     code.write_text("def seen(state):\n    return state.speed\n")
     network = random_network(inputs=1)
@@ -78,7 +82,8 @@ def test_a_feature_of_a_folder_is_code_too(tmp_path: Path) -> None:
     code.write_text(f"open({str(ran)!r}, 'w').close()\n" + code.read_text())
     (tmp_path / "controller.unjam").write_bytes(controller_bytes(held, ABOUT))
     ran.unlink(missing_ok=True)
-    assert refused(tmp_path).endswith("Python code (eyes.py), which runs only with --trust-code")
+    monkeypatch.setenv("UNJAM_STATE", str(tmp_path / "of another user"))
+    assert refused(tmp_path).endswith("it runs only with --trust-code")
     assert not ran.exists()
 
 

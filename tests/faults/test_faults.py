@@ -7,13 +7,20 @@ import numpy as np
 import pytest
 
 from tests.faults.registry import FAULTS
+from tests.test_sandbox import kept
 
 MARKS = {True: [pytest.mark.slow], False: []}
+NEEDED = {"sandbox": kept}
+"""what the kernel must offer for a fault to be tried"""
 SOAK = Path(__file__).parents[2] / "results" / "soak" / "soak.json"
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=MARKS[fault.slow]) for name, fault in FAULTS.items()]
+    "name",
+    [
+        pytest.param(name, marks=[*MARKS[fault.slow], *([NEEDED[name]] if name in NEEDED else [])])
+        for name, fault in FAULTS.items()
+    ],
 )
 def test_a_fault_does_no_harm(name: str, tmp_path: Path) -> None:
     fault = FAULTS[name]

@@ -9,9 +9,11 @@ from tests.controller.test_verify import content_of
 from tests.system.conftest import Run
 from tests.system.test_wrong_inputs import one_line
 from tests.test_processes import holder
+from tests.training.test_tasks import mixture
 from tests.worlds.sumo.own_roads import straight
 from unjam.controller.file import GRAPH
 from unjam.drivers import Constant
+from unjam.training.folder import start_folder
 
 
 def test_a_graph_that_wants_all_memory_is_refused_in_one_line(unjam: Run, tmp_path: Path) -> None:
@@ -78,4 +80,27 @@ def test_two_of_a_verb_cannot_write_one_folder(
     assert ran.stderr.splitlines()[-1].startswith("unjam: run: 'held' is being written by another process")
     assert "Traceback" not in ran.stderr
     assert [path.name for path in held.iterdir()] == [".lock"]
+    process.communicate("")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "held"),
+    [
+        (("model", "run"), "run"),
+        (("train", "--resume", "run"), "run"),
+        (("train", "--resume", "run"), "run/ring"),
+    ],
+    ids=["model", "train", "train, a road of several"],
+)
+def test_a_run_that_another_process_writes_is_left_alone(
+    arguments: tuple[str, ...], held: str, unjam: Run, tmp_path: Path
+) -> None:
+    start_folder(tmp_path / "run", mixture())
+    (tmp_path / "run" / "ring").mkdir()
+    process = holder(tmp_path / held)
+    ran = unjam(*arguments)
+    assert ran.returncode == 2, ran.stderr
+    words = f"unjam: run: {held!r} is being written by another process; allowed: one at a time"
+    assert ran.stderr.splitlines()[-1] == words
+    assert not (tmp_path / "run" / "progress.jsonl").exists()
     process.communicate("")

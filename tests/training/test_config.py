@@ -1,3 +1,4 @@
+import os
 from pathlib import Path
 from typing import Any
 
@@ -145,6 +146,13 @@ def test_a_missing_file_and_a_folder_are_refused(tmp_path: Path) -> None:
         read_toml(tmp_path / "none.toml")
     with pytest.raises(InputError, match=r"config file .*directory"):
         read_toml(tmp_path)
+
+
+def test_a_pipe_is_refused_and_not_waited_for(tmp_path: Path) -> None:
+    pipe = tmp_path / "pipe.toml"
+    os.mkfifo(pipe)
+    with pytest.raises(InputError, match=r"pipe\.toml: not a file"):
+        load_config(pipe)
 
 
 @pytest.mark.parametrize("preset", ["", *PRESETS])

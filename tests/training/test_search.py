@@ -11,9 +11,10 @@ import pytest
 from tests.training.test_run import small_config
 from unjam.errors import InputError, MissingPartError, UnjamError
 from unjam.files import to_json
-from unjam.training.config import load_config
+from unjam.training.config import load_config, to_toml
 from unjam.training.executors import CommandLine, Processes
 from unjam.training.search import (
+    JOURNAL,
     Choice,
     Range,
     Trial,
@@ -186,6 +187,19 @@ def test_a_search_goes_on_with_more_trials_but_not_with_others(tmp_path: Path, t
         search(BASE, space_of(["trpo.target_kl=0.001..0.2"]), 6, tmp_path, 1)
     with pytest.raises(InputError, match="is of another configuration"):
         search(small_config(seed=1), SPACE, 6, tmp_path, 1)
+
+
+def test_values_that_nobody_offered_are_not_tried(tmp_path: Path, trainings: Trainings) -> None:
+    optuna, space = pytest.importorskip("optuna"), space_of(["expert=pi,bcm"])
+    (tmp_path / "config.toml").write_text(to_toml(BASE))
+    backend = optuna.storages.journal.JournalFileBackend(str(tmp_path / JOURNAL))
+    study = optuna.create_study(study_name="search", storage=optuna.storages.JournalStorage(backend))
+    study.ask({"expert": optuna.distributions.CategoricalDistribution(["code.py:of_others"])})
+    with pytest.raises(
+        InputError, match=r"^out: expert: 'code\.py:of_others' in journal\.log was not offered"
+    ):
+        search(BASE, space, 3, tmp_path, 1)
+    assert trainings.done == []
 
 
 def test_a_folder_with_something_else_is_left_alone(tmp_path: Path) -> None:

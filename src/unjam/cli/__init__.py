@@ -12,6 +12,7 @@ import typer
 from unjam import __version__
 from unjam.cli.drive import assess, drive, watch
 from unjam.cli.machine import bench, doctor
+from unjam.cli.options import with_trust
 from unjam.cli.parts import drivers, fit_drivers, scenarios
 from unjam.cli.results import certify, evaluate, export, model, report, verify
 from unjam.cli.runs import runs
@@ -47,11 +48,13 @@ def _root(
     pass
 
 
+MAY_RUN_CODE = (drive, assess, train, evaluate, model, search, export, verify, watch)
+"""verbs that take folders which can name Python code"""
 for verb in (
     *(scenarios, drivers, drive, assess, train, evaluate, model, fit_drivers),
     *(report, tune, search, reproduce, export, certify, verify, watch, bench, doctor),
 ):
-    app.command()(verb)
+    app.command()(with_trust(verb) if verb in MAY_RUN_CODE else verb)
 app.add_typer(runs)
 
 

@@ -3,6 +3,7 @@
 import inspect
 import os
 from collections.abc import Callable
+from contextlib import nullcontext
 from functools import wraps
 from itertools import count
 from pathlib import Path
@@ -14,6 +15,7 @@ from unjam.errors import wrong, wrong_name
 from unjam.learners.settings import AGENTS
 from unjam.parameters import parse_assignments
 from unjam.training.executors import EXECUTORS, Executor
+from unjam.trust import FLAG, trusting_code
 
 ScenarioArgument = Annotated[
     str, typer.Argument(help="A scenario's name (`unjam scenarios` lists them), or your own .sumocfg file.")
@@ -69,6 +71,22 @@ def with_options(**groups: Callable[..., Any]) -> Callable[[Callable[..., None]]
         return called
 
     return give
+
+
+def with_trust(verb: Callable[..., None]) -> Callable[..., None]:
+    """Give a verb the option with which it runs the Python code that folders of others name."""
+    option = Annotated[bool, typer.Option(FLAG, help="Run Python code that a folder names.")]
+    signature = inspect.signature(verb)
+    added = inspect.Parameter("trust_code", inspect.Parameter.KEYWORD_ONLY, default=False, annotation=option)
+
+    @wraps(verb)
+    def called(*, trust_code: bool, **given: Any) -> None:
+        with trusting_code() if trust_code else nullcontext():
+            verb(**given)
+
+    parameters = [*signature.parameters.values(), added]
+    called.__signature__ = signature.replace(parameters=parameters)  # pyright: ignore[reportAttributeAccessIssue]
+    return called
 
 
 def scenario_changes(

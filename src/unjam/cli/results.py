@@ -207,7 +207,7 @@ def certify(
     from unjam.files import check_folder
     from unjam.reports.certificate import write_certificate
 
-    controller, target = read_controller(file, trust_code=False), out or file.with_suffix(".html")
+    controller, target = read_controller(file), out or file.with_suffix(".html")
     check_folder(target)
     found = certificate_of(controller)
     add_certificate(file, controller, found)
@@ -224,27 +224,24 @@ def certify(
 
 def verify(
     file: Annotated[Path, typer.Argument(help="A .unjam file, or the folder of a training run.")],
-    trust_code: Annotated[
-        bool, typer.Option("--trust-code", help="Run the Python code that the controller of a folder names.")
-    ] = False,
     json: JsonOption = False,
 ) -> None:
     """Check a controller: hashes, shapes, names, and that its forms agree on its recorded sample.
 
-    Nothing of it is executed without --trust-code. Exit code 2 and one line where something is wrong.
+    Exit code 2 and one line where something is wrong, or where a folder names Python code that is not yours.
 
     Examples:
 
       unjam verify ring.unjam
 
-      unjam verify runs/mine --trust-code            (its expert is a Python file of yours)
+      unjam verify runs/mine --trust-code            (its expert is a Python file that you trust)
     """
     from rich.markup import escape
 
     go_on_limited(f"controller: {str(file)!r}")
     from unjam.controller.verify import verify_controller
 
-    verified = verify_controller(file, trust_code)
+    verified = verify_controller(file)
     if json:
         print_json({"file": str(file), "ok": True, "verified": {each.name: each.found for each in verified}})
         return

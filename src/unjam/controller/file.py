@@ -23,6 +23,7 @@ from unjam.errors import InputError
 from unjam.files import DAMAGED, to_json, write_whole
 from unjam.physics.arrays import Floats
 from unjam.tree import leaves
+from unjam.trust import check_trusted
 from unjam.worlds.drive import drive
 from unjam.worlds.world import RecordedWorld
 
@@ -92,10 +93,10 @@ def load_controller(path: Path | str) -> Driver:
     return read_controller(path).driver
 
 
-def read_controller(path: Path | str, trust_code: bool = True) -> Controller:
+def read_controller(path: Path | str) -> Controller:
     """Return what a `.unjam` file holds, checked; raise `InputError` as `load_controller`.
 
-    Python code that it names runs only where the file lies in a run folder, and `trust_code` says so.
+    Python code that it names runs only where the file lies in a run folder, and the code is trusted.
     """
     path = Path(path)
     file = path / f"controller{SUFFIX}" if path.is_dir() else path
@@ -107,7 +108,7 @@ def read_controller(path: Path | str, trust_code: bool = True) -> Controller:
         if manifest["format"] not in READABLE:
             raise InputError(f"controller {file.name}: format {manifest['format']!r} is unknown")
         _check_hashes(file.name, manifest["sha256"], parts)
-        _check_code(file.name, manifest["driver"], path.is_dir(), trust_code)
+        _check_code(file.name, manifest["driver"], path.is_dir())
         arrays = load(parts[WEIGHTS])
         driver = driver_from_recipe(manifest["driver"], arrays)
         unknown = arrays.keys() - recipe_of(driver)[1].keys()
@@ -132,19 +133,16 @@ def _check_hashes(name: str, hashes: dict[str, str], parts: dict[str, bytes]) ->
             raise InputError(f"controller {name}: damaged: {part} does not have the hash that it names")
 
 
-def _check_code(name: str, recipe: Any, in_folder: bool, trusted: bool) -> None:
-    """Raise `InputError` where a driver is Python code that a stranger may have named, or that has changed.
-
-    A file by itself may come from anywhere; so may a folder, unless it is `trusted`.
-    """
+def _check_code(name: str, recipe: Any, in_folder: bool) -> None:
+    """Raise `InputError` where a driver is Python code that a stranger may have named, or has changed."""
     for found in code_of(recipe):
-        code = Path(found["path"])
-        if not (in_folder and trusted):
+        code = Path(found["path"]).resolve()
+        if not in_folder:
             alone = "a file by itself may not run; use the run folder"
-            why = "runs only with --trust-code" if in_folder else alone
-            raise InputError(f"controller {name}: its expert is Python code ({code.name}), which {why}")
+            raise InputError(f"controller {name}: its expert is Python code ({code.name}), which {alone}")
         if code.is_file() and hash_of(code.read_bytes()) != found["sha256"]:
             raise InputError(f"controller {name}: its expert {str(code)!r} has changed since")
+        check_trusted(f"controller {name}", code)
 
 
 def pack_parts(parts: dict[str, bytes]) -> bytes:

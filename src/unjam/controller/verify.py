@@ -60,17 +60,13 @@ class Verified:
     found: str
 
 
-def verify_controller(path: Path | str, trust_code: bool = False) -> list[Verified]:
-    """Return what was checked of a `.unjam` file, or of a run folder; nothing of it is executed.
-
-    Args:
-        path: the file, or the folder.
-        trust_code: whether Python code that a run folder names may be executed all the same.
+def verify_controller(path: Path | str) -> list[Verified]:
+    """Return what was checked of a `.unjam` file, or of a run folder; no code runs that is not trusted.
 
     Raises:
         InputError: the first thing that is wrong, in one line; also where there is code that is not trusted.
     """
-    controller = read_controller(path, trust_code)
+    controller = read_controller(path)
     driver, manifest, parts = controller.driver, controller.manifest, controller.parts
     sizes = ", ".join(f"{name} {len(part):,} bytes" for name, part in parts.items() if name != MANIFEST)
     weights = f"finite, of the shapes that the driver needs; SHA-256 {manifest['sha256'][WEIGHTS]}"

@@ -22,6 +22,7 @@ from unjam.drivers.local_state import SECTIONS_AHEAD, LocalState
 from unjam.errors import InputError
 from unjam.physics.arrays import Array
 from unjam.tree import leaves, mapped
+from unjam.trust import remember
 
 TOLERANCE = 1e-12
 
@@ -68,6 +69,7 @@ class FileReference:
         spec = importlib.util.spec_from_file_location(module_name, path)
         if spec is None or spec.loader is None:
             raise InputError(f"driver file: {str(path)!r} is not a Python file")
+        remember(path)  # what a folder names was checked before it comes here
         module = importlib.util.module_from_spec(spec)
         sys.modules[module_name] = module
         sys.path.insert(0, str(path.parent))  # so that the file may import its neighbours

@@ -1,5 +1,6 @@
 """Everything that decides what a training run does: one validated configuration, as TOML and flags."""
 
+import os
 import tomllib
 from collections.abc import Sequence
 from dataclasses import asdict, field, replace
@@ -22,9 +23,13 @@ from unjam.scenarios import make_scenario
 from unjam.scenarios.scenario import Scenario
 from unjam.training.presets import preset_values
 from unjam.training.seeds import TRAINING_BELOW
+from unjam.trust import check_values
 from unjam.virtual.settings import VirtualSettings
 from unjam.worlds.batch.world import why_not
 from unjam.worlds.episode import Task
+
+CONFIG = "config.toml"
+"""the configuration in a folder of a run, or of a search"""
 
 
 def _plain(road: dict[str, Any]) -> dict[str, Any]:
@@ -194,9 +199,13 @@ def load_config(
     Keys of `changes` may have dots: `trpo.gamma`.
 
     Raises:
-        InputError: an unknown key or preset, a value out of range, an unreadable file.
+        InputError: an unknown key or preset, a value out of range, an unreadable file; or a file in a run
+            folder names Python code that is not trusted.
     """
-    given = changed(read_toml(file) if file is not None else {}, nested(changes or {}))
+    read = read_toml(file) if file is not None else {}
+    if file is not None and (file.parent / CONFIG).is_file():  # by itself it is the user's own
+        check_values(f"config file {file}", read)
+    given = changed(read, nested(changes or {}))
     values: dict[str, Any] = {}
     if preset:
         started = preset_values(preset, str(given.get("scenario", RunConfig.scenario)))
@@ -206,6 +215,8 @@ def load_config(
 
 def read_toml(path: Path) -> dict[str, Any]:
     """Return the content of a TOML file; raise `InputError` where it is missing or not TOML."""
+    if os.path.exists(path) and not os.path.isfile(path):
+        raise InputError(f"config file {path}: not a file: a directory, a pipe or a device")
     try:
         return tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:

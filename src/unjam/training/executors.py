@@ -24,6 +24,7 @@ from unjam.errors import MissingPartError, UnjamError, error_named
 from unjam.files import make_folder, write_whole
 from unjam.parameters import build
 from unjam.processes import bound, end_with_parent
+from unjam.trust import FLAG, is_all_trusted
 
 if TYPE_CHECKING:  # the command line asks which executors there are: it is to be quick
     from unjam.training.config import RunConfig
@@ -63,7 +64,7 @@ def training_command(config: "RunConfig", folder: Path, plan: Path, log: Path) -
 
     make_folder(plan.parent)
     write_whole(plan, to_toml(config))
-    once = ["--workers", str(config.workers)]
+    once = ["--workers", str(config.workers), *([FLAG] if is_all_trusted() else [])]
     return CommandLine(
         ["train", "--config", str(plan), *once, "--out", str(folder)],
         log,

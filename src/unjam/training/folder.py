@@ -23,7 +23,7 @@ from unjam.processes import LOCK, owned
 from unjam.reports.results import read_progress
 from unjam.scenarios import scenario_recipe
 from unjam.scenarios.scenario import Scenario
-from unjam.training.config import RunConfig, load_config, to_toml
+from unjam.training.config import RunConfig, load_config, read_toml, to_toml
 from unjam.worlds.reward import make_reward
 
 if TYPE_CHECKING:
@@ -35,7 +35,7 @@ from unjam.drivers.from_file import FileReference, is_file_reference
 from unjam.drivers.registry import recipe_of
 from unjam.errors import wrong
 from unjam.kernels import kernels
-from unjam.parameters import flat
+from unjam.parameters import build, flat
 from unjam.scenarios.own_network import OwnNetwork
 from unjam.sumo_files import read_sumo_files
 from unjam.worlds.episode import Task
@@ -111,11 +111,15 @@ def start_folder(folder: Path, config: RunConfig) -> None:
     write_whole(folder / MANIFEST, to_json(manifest(), indent=1))
 
 
-def read_config(folder: Path) -> RunConfig:
-    """Return the configuration of a run folder; raise `InputError` where it is none."""
+def read_config(folder: Path, to_run: bool = True) -> RunConfig:
+    """Return the configuration of a run folder; raise `InputError` where it is none.
+
+    With `to_run` also where it names Python code that is not trusted: else nothing of it may be made.
+    """
     if not (folder / "config.toml").is_file():
         raise InputError(f"run: {str(folder)!r} is not a run folder: it has no config.toml")
-    return load_config(folder / "config.toml")
+    path = folder / "config.toml"
+    return load_config(path) if to_run else build(RunConfig, read_toml(path), "")
 
 
 def continue_folder(folder: Path, config: RunConfig) -> None:

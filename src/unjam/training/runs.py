@@ -67,7 +67,7 @@ def _run_folders(under: Path) -> Iterator[Path]:
         if {"config.toml", MANIFEST} <= set(files):
             below.clear()  # the roads of a run are no runs
             try:
-                read_config(Path(place))
+                read_config(Path(place), to_run=False)
             except UnjamError:  # of another unjam, or somebody else's
                 continue
             yield Path(place)
@@ -75,7 +75,7 @@ def _run_folders(under: Path) -> Iterator[Path]:
 
 def read_run(folder: Path, name: str = "") -> Run:
     """Return how far a run is; raise `InputError` where the folder is none of a run."""
-    config, progress = read_config(folder), read_progress(folder)
+    config, progress = read_config(folder, to_run=False), read_progress(folder)
     if not (folder / MANIFEST).is_file():
         raise InputError(f"run: {str(folder)!r} is not a run folder: it has no {MANIFEST}")
     try:

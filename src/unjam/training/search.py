@@ -19,7 +19,7 @@ from unjam.parameters import changed, nested, parse_value
 from unjam.reports.results import read_progress, validations_of
 from unjam.training.config import RunConfig, load_config, to_toml
 from unjam.training.executors import CommandLine, Executor, OnLine, running, training_command
-from unjam.training.folder import check_possible, make_new_folder
+from unjam.training.folder import check_possible, make_new_folder, read_config
 
 if TYPE_CHECKING:
     from optuna import Study
@@ -211,7 +211,7 @@ def _study(base: RunConfig, space: Space, folder: Path) -> "Study":
     known = (folder / CONFIG).is_file()
     if not known:
         make_new_folder(folder, ", or that of a search")
-    if known and load_config(folder / CONFIG) != base:
+    if known and read_config(folder, to_run=False) != base:
         raise InputError(f"out: {str(folder)!r} is of another configuration; allowed: a new folder")
     write_whole(folder / CONFIG, to_toml(base))
     storage = JournalStorage(JournalFileBackend(str(folder / JOURNAL)))
@@ -231,6 +231,8 @@ def _proposed(study: "Study", space: Space, trials: int) -> Iterator[tuple[int, 
     """Yield number and values of what is to be tried: what was stopped, then new ones, so many in all."""
     for stopped in [trial for trial in study.get_trials() if trial.state.name == "RUNNING"]:
         if stopped.params.keys() == space.keys():
+            for key, value in stopped.params.items():
+                _check_offered(key, value, space[key])
             yield stopped.number, stopped.params
         else:
             _tell(study, stopped.number, None)  # it was stopped before it had all its values
@@ -239,6 +241,12 @@ def _proposed(study: "Study", space: Space, trials: int) -> Iterator[tuple[int, 
         for key, values in space.items():
             values.suggest(trial, key)
         yield trial.number, trial.params
+
+
+def _check_offered(key: str, value: Any, values: Range | Choice) -> None:
+    """Raise `InputError` where a value that a folder holds is a text not offered: it may name code."""
+    if not isinstance(value, int | float) and value not in values.ends:
+        raise InputError(f"out: {key}: {value!r} in {JOURNAL} was not offered; allowed: a new folder")
 
 
 def _tell(study: "Study", number: int, gain: float | None) -> None:
