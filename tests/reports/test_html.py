@@ -297,8 +297,8 @@ def test_several_folders_are_compared_side_by_side(tmp_path: Path) -> None:
     assert page.drivers[:4] == ["human", "pi", "ring-001: trained", "ring-002: trained"]
     assert [driver["name"] for driver in page.replay["drivers"]] == page.drivers[:4]
     [lead] = [text for text in page.texts["p"] if "held-out seeds" in text]
-    assert "ring-001: On 3" in lead
-    assert "ring-002: On 3" in lead
+    assert "ring-001: Beside people alone on ring, 3 held-out seeds" in lead
+    assert "ring-002: Beside people alone on ring, 3 held-out seeds" in lead
     assert page.texts["h3"] == ["ring-001", "ring-002"], "how to repeat each"
     assert text.count('alt="Return against') == 1, "both learn in one picture"
 
