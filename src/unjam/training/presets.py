@@ -76,6 +76,9 @@ GATHERING_PACER = "pacer:varying=true,gathering_speed=1.934,gathering_gap=0.445,
 CLOSING_ABSORBER = "jam-absorber:gap_gain=0,push=0.9,speed_gain=0.8"
 """the expert that gets furthest on the merge"""
 
+EXPERT_SEEN = ["local", "expert_acceleration", "expert_memory"]
+"""features where what to add depends on what the expert is about"""
+
 LITTLE_NOISE = {"exploration_std": 0.015, "learn_exploration": False}
 """exploration that neither grows nor vanishes, on experts that much of it upsets"""
 BEST: dict[str, dict[str, Any]] = {
@@ -110,7 +113,7 @@ BEST: dict[str, dict[str, Any]] = {
         "reward": "eq16",
         "steps": 720_000,
         "policy": {
-            "observe": ["local", "expert_acceleration", "expert_memory", "place"],
+            "observe": [*EXPERT_SEEN, "place"],
             "remember": True,
             "exploration_std": 0.2,
             "learn_exploration": False,
@@ -123,7 +126,7 @@ BEST: dict[str, dict[str, Any]] = {
     "merge": {
         "expert": CLOSING_ABSORBER,
         "steps": 300_000,
-        "policy": {"observe": ["local", "expert_acceleration", "expert_memory"], "exploration_std": 0.4},
+        "policy": {"observe": EXPERT_SEEN, "exploration_std": 0.4},
         "trpo": {"batch_steps": 6000, "gamma": 0.998, "gae_lambda": 0.99},
         "virtual": {"virtual_ratio": 0.0},
         "evaluation": {"every": 10, "validation_episodes": 32},
@@ -156,7 +159,7 @@ QUICK: dict[str, dict[str, Any]] = {
         "reward": "eq16",
         "steps": 300_000,
         "policy": {
-            "observe": ["local", "expert_acceleration", "expert_memory", "place"],
+            "observe": [*EXPERT_SEEN, "place"],
             "exploration_std": 0.3,
         },
         "virtual": {"virtual_ratio": 0.0},
@@ -184,17 +187,17 @@ DEMO: dict[str, dict[str, Any]] = {
     },
 }
 """the preset `demo` where it is another: on the road that a first visit sees"""
+BY_ROAD = {"best": BEST, "quick": QUICK, "demo": DEMO}
+"""presets that differ from road to road"""
 
 
 def preset_values(preset: str, scenario: str) -> dict[str, Any]:
     """Return what a preset changes on a scenario; raise `InputError` where there is no such preset."""
-    by_road = {"best": BEST, "quick": QUICK}
-    if preset in by_road:
-        if scenario not in BEST:
-            raise wrong("scenario", scenario, f"with the preset {preset}: {', '.join(BEST)}")
-        return by_road[preset][scenario]
-    if preset == "demo" and scenario in DEMO:
-        return DEMO[scenario]
-    if preset not in PRESETS:
-        raise wrong_name("preset", preset, [*PRESETS, *by_road])
-    return PRESETS[preset]
+    by_road = BY_ROAD.get(preset, {})
+    if scenario in by_road:
+        return by_road[scenario]
+    if preset in PRESETS:
+        return PRESETS[preset]
+    if by_road:
+        raise wrong("scenario", scenario, f"with the preset {preset}: {', '.join(by_road)}")
+    raise wrong_name("preset", preset, dict.fromkeys([*PRESETS, *BY_ROAD]))
