@@ -20,7 +20,7 @@ from unjam.drivers.follower_stopper import FollowerStopper
 from unjam.files import to_json, write_whole
 from unjam.measures.drivable import DRIVABLE
 from unjam.measures.statistics import crossed_estimate, estimate
-from unjam.measures.table import cell_of
+from unjam.measures.table import PEOPLE, cell_of
 from unjam.physics.arrays import Floats
 from unjam.scenarios.figure_eight import FigureEight
 from unjam.scenarios.ring import Ring
@@ -32,7 +32,6 @@ from unjam.worlds.workers import Workers
 
 SEEDS = 10
 """of each length or radius"""
-PEOPLE = "human"
 PI_TUNED = "PI, tuned"
 FROM_GAP, FROM_GAP_JAMMED = "PI from its gap, tuned", "PI from its gap, tuned in a jam"
 PI_LONG = (

@@ -24,7 +24,7 @@ from unjam.drivers.sensors import Sensors
 from unjam.files import to_json, write_whole
 from unjam.measures.drivable import DRIVABLE
 from unjam.measures.statistics import estimate
-from unjam.measures.table import cell_of
+from unjam.measures.table import PEOPLE, cell_of
 from unjam.scenarios.figure_eight import FigureEight
 from unjam.scenarios.ring import Ring
 from unjam.scenarios.scenario import Scenario
@@ -49,7 +49,6 @@ ROADS: dict[str, str] = {
 }
 """what ships for closed roads, and the road that it is for"""
 IMPAIRED_DRIVERS = ("unjam:best", "unjam:ring-best", "unjam:ring-jammed-best", "unjam:ring-jammed-tuned")
-PEOPLE = "human"
 ROOM = {"shorter": (8, 10), "as trained on": (10, 12), "longer": (13, 18)}
 """road for each vehicle [m], from and to"""
 KEPT = ("return", "mean_speed", "min_headway", "cav_max_braking")

@@ -19,6 +19,7 @@ from unjam.measures.drivable import drivable_in_all
 from unjam.measures.gain import MOST, WORST, Rows, gain, mean_gain, scaled, worth
 from unjam.measures.metrics import measure
 from unjam.measures.statistics import signed
+from unjam.measures.table import PEOPLE
 from unjam.reports.figures import INK, new_figure
 from unjam.scenarios.scenario import Scenario
 from unjam.studies.study import Study, StudyFolder, about_study
@@ -28,7 +29,6 @@ from unjam.worlds.workers import EpisodeTask, Workers
 
 EPISODES = 10
 """of each driver on each road"""
-PEOPLE = "human"
 TUNED: dict[str, tuple[str, ...]] = {
     "rings": ("pi", "unjam:ring-tuned", "unjam:rings-tuned", "follower-stopper"),
     "figure-eights": ("unjam:figure-eight-tuned", "pacer:varying=true"),
