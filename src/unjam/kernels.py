@@ -20,7 +20,7 @@ from typing import Any
 CHOICE = "UNJAM_KERNELS"
 SETTINGS = {
     "OPENBLAS_CORETYPE": "Haswell",
-    # Products here are small: threads wait for each other, and where others compute too they wait long.
+    # Threads round products of thousands of rows by the number of cores; at small ones they only wait.
     "OPENBLAS_NUM_THREADS": "1",
     "NPY_DISABLE_CPU_FEATURES": "X86_V4 AVX512_ICL AVX512_SPR",
     "ATEN_CPU_CAPABILITY": "avx2",
