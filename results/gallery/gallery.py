@@ -67,12 +67,12 @@ def seen_from_above(road: str, seconds: float) -> None:
 
 def main(names: Sequence[str]) -> None:
     """Drive, draw and write the cards; what is driven anew has a manifest of its own."""
-    target = HERE / "gallery.json"
+    target, about = HERE / "gallery.json", manifest()  # later the pictures are a change of the tree
     if not names:
         film("ring-jammed", "ring-tuned")
         for road, seconds in SEEN_AT.items():
             seen_from_above(road, seconds)
-    found = json.loads(target.read_text()) if names else {"manifest": manifest(), "cards": {}}
+    found = json.loads(target.read_text()) if names else {"manifest": about, "cards": {}}
     cards = found["cards"]
     for name in names or ROADS:
         road, changes = ROADS[name]
@@ -94,7 +94,7 @@ def main(names: Sequence[str]) -> None:
             "braking": estimate_of(driven, "cav_max_braking").mean,
             "drivable": verdicts(result.rows)[label],
             "domain": json.loads(certified)["domain"] if certified else None,
-            **({"manifest": manifest()} if names else {}),
+            **({"manifest": about} if names else {}),
         }
         print(name, cards[name]["beside people alone"], flush=True)
     target.write_text(to_json(found, indent=1) + "\n")
