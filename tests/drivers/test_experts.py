@@ -29,6 +29,7 @@ EXPERTS = [
     "ovm",
     "pacer",
     "pacer:harmonics=[7,-0.8,0.7,-1.3,0.7]",
+    "pacer:varying=true",
     "jam-absorber",
     "jam-absorber:first_position=-1000,last_position=1000,jam_speed=15",
     "jam-absorber:gap_gain=0,push=0.9,speed_gain=0.8",

@@ -3,11 +3,12 @@ import pytest
 import torch
 
 from tests.conftest import random_network
-from unjam.drivers import IDM, LocalState, PISaturation, ResidualDriver, check_driver
+from unjam.drivers import IDM, Driver, LocalState, PISaturation, ResidualDriver, check_driver
 from unjam.drivers.driver import single_row
 from unjam.drivers.from_file import random_state
 from unjam.drivers.network import Network
 from unjam.drivers.observation import observation_size
+from unjam.drivers.wrappers import Remembering
 from unjam.tree import mapped
 
 ALL_PARTS = ("local", "expert_acceleration", "expert_memory", "loop_length", "place", "route_position")
@@ -49,12 +50,13 @@ def test_keeps_the_contract_of_drivers(hold: int, parts: tuple) -> None:
 
 
 @pytest.mark.parametrize("hold", [1, 4])
-def test_plain_numbers_give_what_arrays_give(hold: int) -> None:
-    expert = PISaturation()
+@pytest.mark.parametrize("expert", [PISaturation(), Remembering(PISaturation(), 0.1)])
+def test_plain_numbers_give_what_arrays_give(expert: Driver, hold: int) -> None:
     driver = ResidualDriver(expert, random_network(observation_size(ALL_PARTS, expert)), 1.0, ALL_PARTS, hold)
     generator = np.random.default_rng(2)
     memory = driver.initial_memory(1)
     numbers = single_row(memory)
+    assert driver.plain_numbers
     for _ in range(25):
         state = random_state(generator, 1)
         expected, memory = driver.act(state, memory)

@@ -105,6 +105,8 @@ class Pacer(Formula):
 
     def _needed(self, loop: Array) -> Iterable[float]:
         """Return the laps of those pacers that drive somebody; of tensors, which may be traced, all."""
+        if isinstance(loop, float):
+            return [min(self._tuned, key=lambda lap: abs(loop - lap))]
         if not isinstance(loop, np.ndarray):
             return self._tuned
         laps = np.array([*self._tuned])

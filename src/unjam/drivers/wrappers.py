@@ -51,6 +51,11 @@ class Around(Wrapper):
     driver: Driver
 
     @property
+    def plain_numbers(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Whether the other driver takes plain numbers."""
+        return self.driver.plain_numbers
+
+    @property
     def inner(self) -> dict[str, Driver]:
         """The other driver."""
         return {INNER: self.driver}
@@ -102,6 +107,7 @@ class Impaired(Around):
     """Passes what it sees, with noise, to another driver, and hands on what that one said a while ago."""
 
     tensors: ClassVar[bool] = False  # pyright: ignore[reportIncompatibleMethodOverride]
+    plain_numbers: ClassVar[bool] = False  # pyright: ignore[reportIncompatibleMethodOverride]
 
     driver: Driver
     delay: NotNegative = 0.0
@@ -160,11 +166,6 @@ class Filtered(Around):
     safety: SafetyFilter
     time_step: float
     """time between two decisions [s]"""
-
-    @property
-    def plain_numbers(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Whether the other driver takes plain numbers."""
-        return self.driver.plain_numbers
 
     @cached_property
     def limits(self) -> Limits:  # pyright: ignore[reportIncompatibleVariableOverride]
