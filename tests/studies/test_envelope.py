@@ -3,7 +3,7 @@ from pathlib import Path
 import pytest
 
 from unjam.controller import SHIPPED, certificate, shipped_names
-from unjam.scenarios import Ring
+from unjam.scenarios import OnRamp, Ring
 from unjam.studies import envelope
 from unjam.studies.envelope import ENVELOPE
 from unjam.studies.study import StudyFolder
@@ -23,15 +23,24 @@ def test_its_rings_are_those_of_the_promise() -> None:
     assert min(low for low, _ in of_22) < 220 < 270 < max(high for _, high in of_22)
 
 
+def test_where_sumo_does_not_keep_cars_apart_only_the_filter_does() -> None:
+    for roads in (envelope.alone(envelope.rings()), envelope.lanes()):
+        for _, road in roads:
+            assert road.actuation == "raw"
+            assert road.safety.active
+
+
 def test_every_table_of_its_page_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     one = "unjam:ring-gap-tuned"
     monkeypatch.setattr(envelope, "ROADS", {one: "ring"})
-    monkeypatch.setattr(envelope, "IMPAIRED_DRIVERS", (one,))
-    for name in ("SEEDS", "SEEDS_IMPAIRED"):
+    for name in ("IMPAIRED_DRIVERS", "OF_LANES"):
+        monkeypatch.setattr(envelope, name, (one,))
+    for name in ("SEEDS", "SEEDS_RAW", "SEEDS_IMPAIRED"):
         monkeypatch.setattr(envelope, name, 1)
     short = Ring(length=(60, 60), vehicles=5, horizon=60)
     for name in ("rings", "figure_eights"):
         monkeypatch.setattr(envelope, name, lambda: iter([("a short ring", short)]))
+    monkeypatch.setattr(envelope, "lanes", lambda: iter([("a short lane", OnRamp(lanes=1, horizon=60))]))
     monkeypatch.setattr(envelope, "impaired", lambda warmup: iter([("late", short)]))
     monkeypatch.setattr(certificate, "GENERATIONS", 1)
     monkeypatch.setattr(certificate, "STRING_SHARES", ())
@@ -42,4 +51,5 @@ def test_every_table_of_its_page_is_written(tmp_path: Path, monkeypatch: pytest.
     assert {name: len(table) for name, table in tables.items()} == dict.fromkeys(tables, 1)
     assert tables["worst"].loc[0, "contacts"] == 0
     assert tables["rings"].loc[0, "drivable on"] == "1 of 1 roads"
+    assert tables["rings-raw"].loc[0, ["decisions", "in contact"]].tolist() == ["60", 0]
     assert tables["impaired"].columns.tolist() == ["cars", "human", one]

@@ -1,7 +1,8 @@
 """How far from its own road a shipped controller stays drivable, and what late cars and wrong sensors cost.
 
 Rings from 5 to 44 vehicles, shorter and longer than trained on, jammed or not, with one to three CAVs; figure
-eights smaller and larger; and the usual ring with cars that obey late, and whose sensors err.
+eights smaller and larger; the rings and a lane of a motorway without SUMO's own safety; and the usual ring
+with cars that obey late, and whose sensors err.
 """
 
 from collections.abc import Iterator
@@ -26,6 +27,7 @@ from unjam.measures.drivable import DRIVABLE
 from unjam.measures.statistics import estimate
 from unjam.measures.table import PEOPLE, cell_of
 from unjam.scenarios.figure_eight import FigureEight
+from unjam.scenarios.on_ramp import OnRamp
 from unjam.scenarios.ring import Ring
 from unjam.scenarios.scenario import Scenario
 from unjam.studies.study import Study, StudyFolder, judged, read_part
@@ -35,7 +37,7 @@ from unjam.worlds.workers import Workers
 
 SEEDS = 2
 """of each driver on each road"""
-SEEDS_IMPAIRED = 8
+SEEDS_RAW, SEEDS_IMPAIRED = 5, 8
 ROADS: dict[str, str] = {
     "unjam:best": "ring-jammed",
     "unjam:ring-best": "ring",
@@ -48,11 +50,18 @@ ROADS: dict[str, str] = {
     "unjam:figure-eight-tuned": "figure-eight",
 }
 """what ships for closed roads, and the road that it is for"""
+OF_LANES = ("unjam:on-ramp-tuned", *(name for name, road in ROADS.items() if road != "figure-eight"))
 IMPAIRED_DRIVERS = ("unjam:best", "unjam:ring-best", "unjam:ring-jammed-best", "unjam:ring-jammed-tuned")
 ROOM = {"shorter": (8, 10), "as trained on": (10, 12), "longer": (13, 18)}
 """road for each vehicle [m], from and to"""
-KEPT = ("return", "mean_speed", "min_headway", "cav_max_braking")
+KEPT = ("return", "mean_speed", "min_headway", "cav_max_braking", "steps", "collisions")
 """of each episode"""
+LANES: dict[str, dict[str, Any]] = {
+    "a free lane": {"inflow": 1200.0, "calm_inflow": 1200.0},
+    "a full lane": {"inflow": 2400.0, "calm_inflow": 2000.0},
+    "a full lane, half of all automated": {"inflow": 2400.0, "calm_inflow": 2000.0, "cav_share": 0.5},
+}
+"""one lane of a motorway, onto which nobody cuts in, by label"""
 IMPAIRED: dict[str, dict[str, Any]] = {
     "at once, exact": {},
     "lag 0.2 s": {"actuator": Actuator(lag=0.2)},
@@ -89,6 +98,19 @@ def figure_eights() -> Iterator[tuple[str, FigureEight]]:
         yield f"radius {low} to {high} m", FigureEight(radius=(low, high))
 
 
+def alone(roads: Iterator[tuple[str, Ring]]) -> Iterator[tuple[str, Ring]]:
+    """Yield rings on which SUMO does not keep CAVs apart."""
+    for name, road in roads:
+        yield name, replace(road, actuation="raw")
+
+
+def lanes() -> Iterator[tuple[str, OnRamp]]:
+    """Yield lanes of a motorway on which the filter keeps CAVs apart, and not SUMO, by name."""
+    for name, changes in LANES.items():
+        nobody = OnRamp(lanes=1, ramp_flow=0.0, calm_ramp_flow=0.0, horizon=900)
+        yield name, replace(nobody, actuation="raw", safety=SafetyFilter(), **changes)
+
+
 def impaired(warmup: int) -> Iterator[tuple[str, Ring]]:
     """Yield the usual ring with cars that are worse, by what is worse about them."""
     for words, changes in IMPAIRED.items():
@@ -99,6 +121,8 @@ def _write(studies: StudyFolder, seeds: int, folder: Path, workers: int) -> None
     parts: dict[str, tuple[Iterator[tuple[str, Scenario]], tuple[str, ...], int]] = {
         "rings": (rings(), tuple(ROADS), SEEDS),
         "figure-eights": (figure_eights(), tuple(ROADS), SEEDS),
+        "rings-raw": (alone(rings()), tuple(ROADS), SEEDS_RAW),
+        "lanes-raw": (lanes(), OF_LANES, SEEDS_RAW),
         "impaired": (impaired(0), IMPAIRED_DRIVERS, SEEDS_IMPAIRED),
         "impaired-jammed": (impaired(GROWN), IMPAIRED_DRIVERS, SEEDS_IMPAIRED),
     }
@@ -175,6 +199,27 @@ def domain_table(part: str, folder: Path) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
+def contact_table(part: str, folder: Path) -> pd.DataFrame:
+    """Return how many touched somebody, and how close they came, where SUMO does not keep CAVs apart."""
+    roads = read_part(folder, part)
+    found: list[dict[str, Any]] = []
+    for driver in next(iter(roads.values())):
+        episodes = [row for each in roads.values() for row in each[driver]["episodes"]]
+        if driver == PEOPLE:
+            continue
+        found.append(
+            {
+                "controller": driver,
+                "episodes": len(episodes),
+                "decisions": f"{sum(row['steps'] for row in episodes):,}",
+                "in contact": sum(row["collisions"] for row in episodes),
+                "smallest headway [s]": f"{_closest(episodes):.2f}",
+                "hardest braking [m/s²]": f"{max(row['cav_max_braking'] for row in episodes):.1f}",
+            }
+        )
+    return pd.DataFrame(found)
+
+
 def impaired_table(part: str, folder: Path) -> pd.DataFrame:
     """Return what each controller earns with cars that are worse, and whether it is drivable with them."""
     rows: list[dict[str, Any]] = []
@@ -194,10 +239,11 @@ ENVELOPE = Study(
     title="how far from its own road a shipped controller stays drivable, also late and with wrong sensors",
     runs=lambda seeds: [],
     write=_write,
-    minutes=15.0,
+    minutes=30.0,
     tables={
         "worst": worst_table,
         **{part: partial(domain_table, part) for part in ("rings", "figure-eights")},
+        **{part: partial(contact_table, part) for part in ("rings-raw", "lanes-raw")},
         **{part: partial(impaired_table, part) for part in ("impaired", "impaired-jammed")},
     },
 )
