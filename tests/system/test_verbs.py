@@ -4,6 +4,7 @@ import json
 import signal
 import subprocess
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -171,19 +172,32 @@ def test_assess_answers_in_words_in_json_and_on_a_page(unjam: Run, tmp_path: Pat
     assert unjam("report", "said", pictures=False).returncode == 0, "the rows are those of drive"
 
 
-@pytest.mark.slow
-def test_assess_that_is_interrupted_leaves_nothing_half_written(unjam: Run, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("question", "first_words"),
+    [
+        pytest.param(
+            (*QUESTION, "-n", "5000", "--precision", "1e-9"),
+            ("assessing", "choosing"),
+            marks=pytest.mark.slow,
+        ),
+        (("drive", "ring", "-d", "pi", "-n", "5000"), ("driving",)),
+    ],
+)
+def test_what_is_interrupted_says_so_and_leaves_nothing(
+    question: Sequence[str], first_words: tuple[str, ...], unjam: Run, tmp_path: Path
+) -> None:
     straight(tmp_path, '<flow id="f" type="car" route="along" begin="0" end="20" period="2"/>', length=100.0)
-    command = [str(UNJAM), *QUESTION, "-n", "5000", "--precision", "1e-9", "--out", "said"]
+    command = [str(UNJAM), *question, "--out", "said"]
     with subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True) as process:
         assert process.stderr is not None
-        assert "choosing" in process.stderr.readline()
+        assert process.stderr.readline().startswith(first_words)
         workers = children_of(process.pid)
         process.send_signal(signal.SIGINT)
         _, words = process.communicate(timeout=10)
     assert process.returncode == 130
+    assert words.splitlines()[-1] == "unjam: interrupted"
     assert "Traceback" not in words
-    assert not list((tmp_path / "said").iterdir())
+    assert not (tmp_path / "said").exists()
     wait_until(lambda: not any(Path(f"/proc/{worker}").exists() for worker in workers))
 
 

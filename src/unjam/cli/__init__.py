@@ -81,7 +81,8 @@ def _run() -> int:
         for text in sys.argv[1:]:
             if any("\ud800" <= letter <= "\udfff" for letter in text):  # bytes that are no letters
                 raise wrong("arguments", text, "text in UTF-8")
-        return app(standalone_mode=False) or 0
+        code = app(standalone_mode=False) or 0
+        return _say("interrupted", code) if code == INTERRUPTED else code  # which typer says without a word
     except UnjamError as error:
         return _say(str(error), error.exit_code)
     except ModuleNotFoundError as error:

@@ -7,7 +7,7 @@ are made at the end of iterations: written whole, checked by hash, two generatio
 import json
 import shutil
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -89,15 +89,19 @@ def make_new_folder(folder: Path, otherwise: str = "") -> None:
 
 @contextmanager
 def new_and_owned(folder: Path) -> Iterator[None]:
-    """Make a folder, and hold it for this process alone.
+    """Make a folder, and hold it for this process alone; one that stays empty is removed again.
 
     Raises:
         InputError: it holds something already, or another process holds it.
     """
     make_new_folder(folder)
-    with owned(folder):
-        make_new_folder(folder)  # another may have written it until just now
-        yield
+    try:
+        with owned(folder):
+            make_new_folder(folder)  # another may have written it until just now
+            yield
+    finally:
+        with suppress(OSError):  # it holds something: all went well
+            folder.rmdir()
 
 
 def start_folder(folder: Path, config: RunConfig) -> None:
