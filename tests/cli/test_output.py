@@ -1,13 +1,18 @@
 """Can a table of metrics be read, however narrow the terminal?"""
 
+import sys
 from io import StringIO
+from pathlib import Path
 from typing import Any
 
 import pytest
 from rich.console import Console
 
 from unjam.cli import output
+from unjam.cli.train import _Progress
 from unjam.measures.metrics import METRICS
+from unjam.training import evaluate
+from unjam.training.config import RunConfig
 
 USUAL: dict[str, Any] = {"status": "completed", "reason": "", **dict.fromkeys(METRICS, 1.0)}
 LABELS = ("human", "pi", "idm", "a_long_file_of_mine.py:a_long_name_of_mine")
@@ -44,3 +49,17 @@ def test_where_there_is_room_all_drivers_stand_in_one_table(monkeypatch: pytest.
 
 def test_a_driver_by_itself_is_compared_with_nobody(monkeypatch: pytest.MonkeyPatch) -> None:
     assert printed(monkeypatch, 120, ("pi",))[0].split() == ["metric", "unit", "pi"]
+
+
+def test_the_judgement_after_a_training_shows_how_far_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    text = StringIO()
+    monkeypatch.setattr(output, "aside", Console(file=text, width=200))
+    monkeypatch.setattr(sys.modules[_Progress.__module__], "aside", output.aside)
+    monkeypatch.setattr(output, "LINE_SECONDS", -1.0)
+    monkeypatch.setattr(evaluate, "steps_to_judge", lambda config, folder: 3000)
+    with _Progress(RunConfig(), Path("run")) as shown:
+        for episode, steps in ((("pi", 0), 500), (("pi", 1), 500), (("pi", 0), 1500)):
+            shown.judging(episode, steps)
+    words = "evaluating on held-out seeds"
+    counted = [f"{words}: {steps} of 3,000 steps" for steps in ("500", "1,000", "2,000")]
+    assert text.getvalue().splitlines() == [words, *counted]

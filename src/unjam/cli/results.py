@@ -43,7 +43,7 @@ def evaluate(
     from unjam.reports.html import write_report
     from unjam.reports.results import read_results
     from unjam.reports.story import lead_of
-    from unjam.training.evaluate import comparison, judge
+    from unjam.training.evaluate import judge, steps_to_judge
     from unjam.training.folder import read_config
     from unjam.training.train import TrainResult, gain_of
     from unjam.worlds.workers import Workers
@@ -56,7 +56,7 @@ def evaluate(
         raise InputError(f"run: {str(run)!r} is of several roads; allowed: the folder of one of them")
     if not (run / "controller.unjam").is_file():
         raise InputError(f"run: {str(run)!r} has no controller yet; go on with: unjam train --resume {run}")
-    total = len(comparison(config, run, list(DRIVERS))) * episodes * config.make_scenario().horizon
+    total = steps_to_judge(config, run, list(DRIVERS), episodes)
     target = out or run
     make_folder(target)
     with owned(target):

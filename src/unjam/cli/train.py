@@ -3,7 +3,7 @@
 from contextlib import nullcontext
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -25,6 +25,9 @@ from unjam.cli.output import Counted, after_training, aside, console, print_json
 from unjam.errors import InputError
 from unjam.files import make_folder
 from unjam.processes import owned
+
+if TYPE_CHECKING:
+    from unjam.training.config import RunConfig
 
 LINE_EVERY = 5
 """iterations between two plain lines of progress where there is no terminal"""
@@ -97,7 +100,7 @@ def train(
     if resume is None and (steps := steps_to_train(config)) > MUCH_MORE * config.steps:
         aside.print(f"note: iterations are whole: {steps:,} steps will be trained, not {config.steps:,}")
     board = tensorboard_into(folder) if tensorboard else None
-    progress = nullcontext() if json else _Progress(config.steps, folder)
+    progress = nullcontext() if json else _Progress(config, folder)
     with resumable(folder, workers), progress as shown:
 
         def row_written(row: dict[str, Any]) -> None:
@@ -130,10 +133,13 @@ def train(
 class _Progress(Counted):
     """Progress of training: a bar with the newest returns on a terminal, plain lines elsewhere."""
 
-    def __init__(self, steps: int, folder: Path) -> None:
-        super().__init__(f"training into {folder}", "steps", steps)
-        self._steps = steps
+    def __init__(self, config: "RunConfig", folder: Path) -> None:
+        super().__init__(f"training into {folder}", "steps", config.steps)
+        self._config, self._folder = config, folder
+        self._steps = config.steps
         self._validated = "-"
+        self._judged: dict[tuple[str, int], int] = {}
+        self._to_judge = 0
 
     def iteration(self, row: dict[str, Any]) -> None:
         """Show a row of progress."""
@@ -146,13 +152,19 @@ class _Progress(Counted):
         if self._plain and (row["iteration"] % LINE_EVERY == 1 or steps >= self._steps):
             aside.print(f"iteration {row['iteration']}: {steps:,} of {self._steps:,} steps, {words}")
 
-    def judging(self, key: tuple[str, int], steps: int) -> None:
-        """Say once that the training is over."""
-        if self._validated != "":
-            self._validated = ""
-            self._bar.update(self._task, description=JUDGING)
+    def judging(self, episode: tuple[str, int], steps: int) -> None:
+        """Show how far the judgement is that follows the training."""
+        from unjam.training.evaluate import steps_to_judge
+
+        if not self._judged:
+            roads = self._config.roads().items()
+            self._to_judge = sum(steps_to_judge(road, self._folder / name) for name, road in roads)
+            self._label = JUDGING
+            self._bar.reset(self._task, description=JUDGING, total=self._to_judge)
             if self._plain:
                 aside.print(JUDGING)
+        self._judged[episode] = steps
+        self(sum(self._judged.values()), self._to_judge)
 
 
 @with_options(asked=asked_run)

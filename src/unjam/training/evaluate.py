@@ -192,6 +192,15 @@ def comparison(config: RunConfig, folder: Path, baselines: Sequence[str]) -> dic
     return {**drivers, **expert, TRAINED: make_driver(str(folder), scenario.decision_step)}
 
 
+def steps_to_judge(
+    config: RunConfig, folder: Path, baselines: Sequence[str] | None = None, episodes: int | None = None
+) -> int:
+    """Return how many decisions `judge` makes at most."""
+    chosen = config.evaluation
+    drivers = comparison(config, folder, chosen.baselines if baselines is None else baselines)
+    return len(drivers) * (episodes or chosen.episodes) * config.make_scenario().horizon
+
+
 def judge(
     folder: Path,
     config: RunConfig,

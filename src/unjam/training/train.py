@@ -4,6 +4,7 @@ import time
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -151,13 +152,21 @@ def _train_owned(
             held.enter_context(owned(place))
         Trainer(folder, config, workers, on_iteration).train()
         rows = {
-            name: judge(folder / name, road, workers, progress=progress).rows
+            name: judge(
+                folder / name, road, workers, progress=progress and partial(_on_road, progress, name)
+            ).rows
             for name, road in config.roads().items()
         }
     if config.virtual.virtual_ratio > 0 and not config.tasks:
         write_model_facts(folder, config)
     write_report([folder / name for name in rows], folder / "report.html")
     return rows
+
+
+def _on_road(progress: Progress, name: str, episode: tuple[str, int], steps: int) -> None:
+    """Tell how far an episode is; those of another road are others."""
+    driver, number = episode
+    progress((f"{name} {driver}".strip(), number), steps)
 
 
 def gain_of(config: RunConfig, rows: Rows) -> Estimate | None:
