@@ -1,5 +1,7 @@
 import base64
+import json
 import zlib
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -11,7 +13,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from tests.reports.open_roads import merge_episode, own_episode, shown_from
-from unjam.reports.html import NO_VALUE, _share, _squeezed, replay_data
+from unjam.reports.html import NO_VALUE, REPLAY_SECONDS, _share, _squeezed, replay_data
 from unjam.reports.results import Shown
 
 
@@ -104,6 +106,18 @@ def test_a_replay_takes_less_than_a_third_of_its_numbers(shown: Shown) -> None:
     (driver,) = data["drivers"]
     sent = sum(len(each["data"]) for name in ("speeds", "places") for each in driver[name])
     assert sent < 4 * 4 * driver["vehicles"] * data["frames"] / 3
+
+
+def test_a_replay_of_a_crowd_can_be_sent(shown: Shown) -> None:
+    generator, times = np.random.default_rng(0), 3_000 // shown.speeds.shape[1]
+    speeds = np.tile(shown.speeds, (1, times))
+    unlike = generator.normal(size=(speeds.shape[1], 3)).astype(np.float32)
+    places = np.tile(shown.places, (1, times, 1)) + 20.0 * unlike + speeds[..., None] * unlike
+    names = [str(number) for number in range(speeds.shape[1])]
+    crowd = replace(shown, speeds=speeds + unlike[:, 0], places=places, vehicle_ids=names, cav_ids=names[:9])
+    data = replay_data([crowd, crowd])
+    assert 10 < data["frames"] < shown.times[-1] / REPLAY_SECONDS
+    assert len(json.dumps(data)) < 5e6
 
 
 def test_of_nobody_there_is_nothing_to_play(tmp_path: Path) -> None:

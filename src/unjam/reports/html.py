@@ -4,6 +4,7 @@ import base64
 import json
 from collections.abc import Sequence
 from dataclasses import replace
+from heapq import heappop, heappush
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -47,6 +48,8 @@ from unjam.scenarios.scenario import VEHICLE_LENGTH
 MOST_PANELS = 6
 MOST_FRAMES = 600
 """of a replay: between two, vehicles go straight on"""
+MOST_CELLS = 600_000
+"""vehicles times frames of a replay's drivers together: some three megabytes"""
 NO_VALUE = 65535
 """stands for NaN among the numbers of a replay"""
 REPLAY_SECONDS = 0.5
@@ -160,11 +163,16 @@ def _references(results: Sequence[Results]) -> dict[str, float]:
 
 
 def replay_data(panels: Sequence[Shown]) -> dict[str, Any]:
-    """Return what the page's replay needs: positions and speeds at a few frames a second."""
+    """Return what the page's replay needs: positions and speeds at a few frames a second.
+
+    Of a crowd there are fewer frames, for the page has to be sent.
+    """
     if not panels:
         return {"drivers": []}
     longest = max(episode.times[-1] for episode in panels)
-    step = max(REPLAY_SECONDS, longest / MOST_FRAMES, *(episode.step for episode in panels))
+    crowd = sum(int((~np.isnan(episode.speeds)).sum(axis=1).max()) for episode in panels)
+    most = min(MOST_FRAMES, max(1, MOST_CELLS // max(1, crowd)))
+    step = max(REPLAY_SECONDS, longest / most, *(episode.step for episode in panels))
     frames = 1 + int(longest / step + 1e-9)
     return {
         "step": step,
@@ -226,12 +234,16 @@ def _share(there: np.ndarray, chosen: np.ndarray) -> list[list[int]]:
         if there[:, vehicle].any()
     }
     groups: list[list[int]] = []
+    busy: list[tuple[int, int]] = []  # a heap: until which frame, which group
     for vehicle in sorted(stays, key=lambda vehicle: stays[vehicle][0]):
-        free = [group for group in groups if stays[group[-1]][1] + 1 < stays[vehicle][0]]
-        if free:
-            free[0].append(vehicle)
+        first, last = map(int, stays[vehicle])
+        if busy and busy[0][0] + 1 < first:
+            _, number = heappop(busy)
+            groups[number].append(vehicle)
         else:
+            number = len(groups)
             groups.append([vehicle])
+        heappush(busy, (last, number))
     return groups
 
 
