@@ -21,9 +21,10 @@ BEYOND_LIMIT = 1.01
 """share of the limit above which the report explains how that can be"""
 LESS, MORE = "less", "more"
 BETTER = {
+    **dict.fromkeys(("mean_speed", "mean_speed_steady", "throughput_veh_per_h"), MORE),
     **dict.fromkeys(("travel_time", "delay", "backlog_veh", "fuel_ml_per_km", "share_standing"), LESS),
-    **dict.fromkeys(("throughput_veh_per_h", "mean_speed", "mean_speed_steady", "min_ttc"), MORE),
     **dict.fromkeys(("speed_std_fleet", "speed_std_fleet_steady", "time_to_dissolve"), LESS),
+    "min_ttc": MORE,
     **dict.fromkeys(
         ("people_max_braking", "people_beyond_3_5", "people_beyond_4_5", "people_beyond_9"), LESS
     ),
