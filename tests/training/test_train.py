@@ -18,9 +18,10 @@ from unjam.errors import InputError, UnjamError
 from unjam.measures.metrics import METRICS
 from unjam.reports.results import read_progress, read_results
 from unjam.training.config import RunConfig
+from unjam.training.evaluate import gain_of
 from unjam.training.folder import read_config
 from unjam.training.seeds import held_out_seeds
-from unjam.training.train import TrainResult, gain_of, train
+from unjam.training.train import TrainResult, train
 from unjam.worlds.episode import run_episode
 from unjam.worlds.workers import Workers
 

@@ -43,9 +43,9 @@ def evaluate(
     from unjam.reports.html import write_report
     from unjam.reports.results import read_results
     from unjam.reports.story import lead_of
-    from unjam.training.evaluate import judge, steps_to_judge
+    from unjam.training.evaluate import gain_of, judge, steps_to_judge
     from unjam.training.folder import read_config
-    from unjam.training.train import TrainResult, gain_of
+    from unjam.training.train import TrainResult
     from unjam.worlds.workers import Workers
 
     if humans is not None and out is None:

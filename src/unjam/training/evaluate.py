@@ -23,7 +23,7 @@ from unjam.errors import InputError, error_named, wrong
 from unjam.files import make_folder, to_json, write_whole
 from unjam.manifest import manifest
 from unjam.measures.metrics import measure
-from unjam.measures.statistics import summarise
+from unjam.measures.statistics import Estimate, paired_difference, summarise
 from unjam.reports.html import write_report
 from unjam.reports.results import ABOUT_SHOWN, packed, shown_of
 from unjam.scenarios import make_scenario, scenario_recipe
@@ -230,6 +230,13 @@ def judge(
     save_evaluation(out or folder, found, about)
     raise_failures(found)
     return found
+
+
+def gain_of(config: RunConfig, rows: Rows) -> Estimate | None:
+    """Return what the trained controller earns beyond its expert, same seeds paired."""
+    if config.expert == "none":
+        return None
+    return paired_difference(rows[TRAINED], rows[config.make_expert().describe()], "return")
 
 
 def _hashes(controllers: dict[str, str]) -> dict[str, str]:

@@ -19,12 +19,12 @@ from unjam.kernels import child_would_be_pinned
 from unjam.learners.algorithm_1 import Collected, Iteration, Validated, algorithm_1, begin_training
 from unjam.learners.imagination import full_policy
 from unjam.measures.metrics import measure
-from unjam.measures.statistics import Estimate, paired_difference
+from unjam.measures.statistics import Estimate
 from unjam.processes import owned
 from unjam.reports.html import write_report
 from unjam.reports.results import read_progress
 from unjam.training.config import RunConfig, episodes_of_iteration, to_toml
-from unjam.training.evaluate import TRAINED, Progress, Rows, judge, raise_failure
+from unjam.training.evaluate import Progress, Rows, gain_of, judge, raise_failure
 from unjam.training.executors import OnIteration, train_apart
 from unjam.training.export import KeptControllers
 from unjam.training.folder import (
@@ -151,12 +151,10 @@ def _train_owned(
             make_folder(place)
             held.enter_context(owned(place))
         Trainer(folder, config, workers, on_iteration).train()
-        rows = {
-            name: judge(
-                folder / name, road, workers, progress=progress and partial(_on_road, progress, name)
-            ).rows
-            for name, road in config.roads().items()
-        }
+        rows: dict[str, Rows] = {}
+        for name, road in config.roads().items():
+            of_road = partial(_on_road, progress, name) if progress else None
+            rows[name] = judge(folder / name, road, workers, progress=of_road).rows
     if config.virtual.virtual_ratio > 0 and not config.tasks:
         write_model_facts(folder, config)
     write_report([folder / name for name in rows], folder / "report.html")
@@ -167,13 +165,6 @@ def _on_road(progress: Progress, name: str, episode: tuple[str, int], steps: int
     """Tell how far an episode is; those of another road are others."""
     driver, number = episode
     progress((f"{name} {driver}".strip(), number), steps)
-
-
-def gain_of(config: RunConfig, rows: Rows) -> Estimate | None:
-    """Return what the trained controller earns beyond its expert, same seeds paired."""
-    if config.expert == "none":
-        return None
-    return paired_difference(rows[TRAINED], rows[config.make_expert().describe()], "return")
 
 
 class Trainer:
