@@ -1,5 +1,6 @@
 import warnings
 from contextlib import closing
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -7,6 +8,7 @@ import pytest
 from pettingzoo.test import parallel_api_test, parallel_seed_test
 
 import unjam
+from tests.worlds.sumo.own_roads import straight
 from unjam.drivers import Constant
 from unjam.scenarios import make_scenario
 from unjam.worlds.episode import run_episode
@@ -53,6 +55,28 @@ def test_the_same_seed_gives_the_same_observations() -> None:
 
 def test_passes_the_seed_test_of_pettingzoo() -> None:
     parallel_seed_test(lambda: unjam.parallel_env("ring", **SHORT), num_cycles=10)
+
+
+def test_on_an_own_network_cavs_are_called_in_order_of_entry(tmp_path: Path) -> None:
+    flow = '<flow id="cav_1" type="car" route="along" begin="0" end="60" period="2"/>'
+    file = str(straight(tmp_path, flow, length=300.0))
+    road = {"cav_share": 0.6, "cavs": 3, "horizon": 400}
+    expected = run_episode(make_scenario(file, road), Constant(acceleration=0.2), (4,))
+    environment = unjam.parallel_env(file, **road)
+    assert environment.possible_agents == ["cav_0", "cav_1", "cav_2"]
+    first, _ = environment.reset(seed=4)
+    assert list(first) == ["cav_0"]
+    seen: dict[str, list[Any]] = {}
+    while environment.agents:
+        actions = dict.fromkeys(environment.agents, np.array([0.2]))
+        observations, *_ = environment.step(actions)
+        for agent in actions:
+            seen.setdefault(agent, []).append(observations[agent])
+    environment.close()
+    assert list(seen) == ["cav_0", "cav_1", "cav_2"]
+    driven = [float(10.0 * speeds[5][0]) for speeds in seen.values()]
+    assert driven == pytest.approx([each.states.speed[6] for each in expected.trajectories], abs=1e-5)
+    assert len(expected.cav_ids) == 3
 
 
 MERGE: Any = {"horizon": 60, "cav_share": 0.3}

@@ -3,6 +3,7 @@ import subprocess
 import sys
 import warnings
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -12,6 +13,7 @@ from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as check_env_of_sb3
 
 import unjam
+from tests.worlds.sumo.own_roads import straight
 from unjam.drivers import Constant
 from unjam.drivers.registry import named_driver
 from unjam.environments.single import RoadEnv
@@ -25,6 +27,7 @@ NAMES = {
     "unjam/Merge-v0": "merge",
     "unjam/OnRamp-v0": "on-ramp",
 }
+OWN = "unjam/OwnNetwork-v0"
 OPEN = ("unjam/Merge-v0", "unjam/OnRamp-v0")
 SHORT: Any = {"horizon": 60}
 
@@ -119,6 +122,25 @@ def test_on_the_merge_the_episode_ends_when_the_cav_leaves(expert: str) -> None:
     with pytest.raises(InputError, match="cavs"):
         RoadEnv("merge")
     environment.close()
+
+
+def test_on_an_own_network_the_first_that_the_share_picks_is_driven(tmp_path: Path) -> None:
+    flow = '<flow id="car" type="car" route="along" begin="0" end="60" period="2"/>'
+    road: Any = {"cav_share": 0.5, "horizon": 300}
+    file = str(straight(tmp_path, flow, length=200.0))
+    expected = run_episode(make_scenario(file, {**road, "cavs": 1}), Constant(acceleration=-0.1), (2,))
+    environment = gymnasium.make(OWN, scenario=file, **road)
+    check_env(environment.unwrapped)
+    environment.reset(seed=2)
+    speeds, done = [], False
+    while not done:
+        observation, _, terminated, truncated, _ = environment.step(np.array([-0.1], np.float32))
+        speeds.append(10.0 * observation[0])
+        done = terminated or truncated
+    environment.close()
+    (driven,) = expected.trajectories
+    assert len(speeds) == len(driven.states.speed)
+    np.testing.assert_allclose(speeds[:-1], driven.states.speed[1:], atol=1e-5)
 
 
 def test_a_collision_terminates_and_does_not_truncate() -> None:
@@ -228,5 +250,5 @@ def test_wrong_arguments_get_one_clear_line(arguments: Any, words: str) -> None:
 def test_gymnasium_knows_the_environments_after_importing_unjam() -> None:
     code = "import unjam, gymnasium; print(sorted(n for n in gymnasium.registry if n.startswith('unjam/')))"
     ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert ran.stdout.strip() == str(sorted(NAMES))
+    assert ran.stdout.strip() == str(sorted([*NAMES, OWN]))
     assert unjam.__version__

@@ -124,7 +124,7 @@ def test_recipe_makes_the_same_scenario_again(tmp_path: Path) -> None:
 
 
 def test_its_vehicles_are_not_known_before(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="its vehicles are known to SUMO alone"):
+    with pytest.raises(InputError, match="cavs: None is not allowed here"):
         own(tmp_path).possible_cavs()
 
 

@@ -1,6 +1,6 @@
 """A road with several CAVs as a PettingZoo environment."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, ClassVar
 
 import numpy as np
@@ -16,7 +16,7 @@ class ParallelRoad(ParallelEnv[str, Any, Any]):
 
     Action and observation of each are those of `RoadEnv`. On the merge `agents` changes: a CAV appears at the
     first decision after it entered, and is truncated when it leaves; while none is on the road, time goes on
-    by itself.
+    by itself. On a network of your own they are called cav_0, cav_1, ... as they enter, at most `cavs`.
     """
 
     metadata: ClassVar[dict[str, Any]] = {"name": "unjam_road_v0", "render_modes": []}  # pyright: ignore
@@ -33,6 +33,8 @@ class ParallelRoad(ParallelEnv[str, Any, Any]):
         self._road = SteppedRoad(scenario, changes, reward, expert, observe)
         self.possible_agents = list(self._road.scenario.possible_cavs())
         self.agents: list[str] = []
+        self._agents: dict[str, str] = {}
+        """by vehicle"""
         self.render_mode = None
         self.observation_spaces = dict.fromkeys(self.possible_agents, self._road.observation_space)
         self.action_spaces = dict.fromkeys(self.possible_agents, self._road.action_space)
@@ -50,7 +52,8 @@ class ParallelRoad(ParallelEnv[str, Any, Any]):
     ) -> tuple[dict[str, Any], dict[str, Any]]:
         """Start an episode: that of `seed`; without one, the next after the last seed's."""
         observations = self._road.reset(seed, np.random.default_rng())
-        self.agents = list(self._road.traffic.cavs)
+        self._agents.clear()
+        self.agents = self._named(self._road.traffic.cavs)
         return dict(zip(self.agents, observations, strict=True)), {agent: {} for agent in self.agents}
 
     def step(self, actions: dict[str, Any]) -> tuple[dict[str, Any], ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
@@ -60,18 +63,29 @@ class ParallelRoad(ParallelEnv[str, Any, Any]):
         acted = self.agents
         done = self._road.step([float(np.asarray(actions[agent]).reshape(())) for agent in acted])
         ended = done.terminated or done.truncated
-        seen = {**done.left, **dict(zip(done.cavs, done.observations, strict=True))}
+        there = self._named(done.cavs)
+        left = dict(zip(self._named(done.left), done.left.values(), strict=True))
+        seen = {**left, **dict(zip(there, done.observations, strict=True))}
         # Who enters as the episode ends never was an agent.
         observations = {name: seen[name] for name in seen if name in acted or not ended}
         agents = list(observations)
-        self.agents = [] if ended else done.cavs
+        self.agents = [] if ended else there
         return (
             observations,
             {agent: done.reward if agent in acted else 0.0 for agent in agents},
             dict.fromkeys(agents, done.terminated),
-            {agent: done.truncated or (agent in done.left and not done.terminated) for agent in agents},
+            {agent: done.truncated or (agent in left and not done.terminated) for agent in agents},
             {agent: {"terms": done.terms} for agent in agents},
         )
+
+    def _named(self, vehicles: Iterable[str]) -> list[str]:
+        """Return the agents that drive these vehicles; where names cannot be foretold, in order of entry."""
+        for name in vehicles:
+            if name not in self._agents:
+                taken = self._agents.values()
+                free = [agent for agent in self.possible_agents if agent not in taken]
+                self._agents[name] = name if name in free else free[0]
+        return [self._agents[name] for name in vehicles]
 
     def render(self) -> None:
         """Draw nothing."""

@@ -193,6 +193,8 @@ class RoadEnv(gymnasium.Env[Observations, NDArray[Any]]):
     ``gymnasium.make("unjam/Ring-v0")``, ``"unjam/FigureEight-v0"``, ``"unjam/Merge-v0"``,
     ``"unjam/OnRamp-v0"``; every parameter of
     the scenario can be given: ``gymnasium.make("unjam/Ring-v0", scenario="ring-jammed", length=(230, 230))``.
+    On a network of your own the CAV is the first that the share picks, in a confined process:
+    ``gymnasium.make("unjam/OwnNetwork-v0", scenario="my.sumocfg", cav_share=0.1)``.
 
     ===========  ===================================================================================
     Action       ``Box(-limit, limit, (1,), float32)``: acceleration [m/s2], limit 1 by default; with
@@ -276,7 +278,8 @@ class RoadEnv(gymnasium.Env[Observations, NDArray[Any]]):
         from unjam.reports.film import draw_road
 
         traffic = self._road.traffic
-        fastest = 2.0 * traffic.road.limit_speed
+        limit = traffic.road.limit_speed
+        fastest = 2.0 * limit if np.isfinite(limit) else self._road.scenario.top_speed  # of your own: unknown
         return np.asarray(draw_road(traffic.scene(), fastest, f"mean {np.mean(traffic.speeds):.1f} m/s"))
 
     def close(self) -> None:

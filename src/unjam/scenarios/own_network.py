@@ -11,7 +11,7 @@ from pydantic import Field, model_validator
 from pydantic.dataclasses import dataclass
 
 from unjam.errors import InputError, wrong
-from unjam.parameters import STRICT, NotNegative, Positive, build
+from unjam.parameters import STRICT, Count, NotNegative, Positive, build
 from unjam.scenarios.road import OwnRoad
 from unjam.scenarios.scenario import Scenario
 from unjam.sumo_files import read_sumo_files
@@ -45,6 +45,8 @@ class OwnNetwork(Scenario):
     """share of the vehicles that become CAVs, cars and the like alone"""
     cav_types: tuple[str, ...] = ()
     """vehicle types all of whose vehicles become CAVs"""
+    cavs: Count | None = None
+    """at most so many CAVs: the first of these that enter"""
     begin: NotNegative | None = None
     """time at which SUMO begins [s]; None: as its configuration says. Who departs before is left out"""
     end: Positive | None = None
@@ -92,6 +94,7 @@ class OwnNetwork(Scenario):
             cav_types=self.cav_types,
             cars=frozenset(name for name, attributes in files.types.items() if is_car(attributes)),
             cav_seed=int(generator.integers(2**31)),
+            cavs=self.cavs,
         )
 
     @property
@@ -100,10 +103,14 @@ class OwnNetwork(Scenario):
         return "as the vehicle types of its files say"
 
     def possible_cavs(self) -> tuple[str, ...]:
-        """Return nothing: which vehicles there will be is known to SUMO alone."""
-        raise InputError(
-            "scenario: your own network is not allowed here: its vehicles are known to SUMO alone"
-        )
+        """Return names for as many CAVs as there may be; what their vehicles are called SUMO alone knows.
+
+        Raises:
+            InputError: nobody says how many there may be.
+        """
+        if self.cavs is None:
+            raise InputError("cavs: None is not allowed here on your own network; allowed: at most how many")
+        return tuple(f"cav_{number}" for number in range(self.cavs))
 
     def facts(self) -> list[tuple[str, str]]:
         """Return the road's own facts for `unjam scenarios`."""

@@ -236,3 +236,5 @@ class OwnRoad(OpenRoad):
     """vehicle types that the share may pick"""
     cav_seed: int
     """which vehicles the share picks"""
+    cavs: int | None = None
+    """at most so many of them, the first that enter"""

@@ -27,15 +27,27 @@ class OwnTraffic(LaneTraffic[OwnRoad]):
         self._routes: Counter[tuple[str, ...]] = Counter()
         self._log_edges: list[list[tuple[str, int, float]]] = []
         self._allowed: list[float] = []
+        self._picked = 0
+        """vehicles that have entered and are CAVs"""
         super().start(controlled, on_progress)
 
     @property
     def expects_cavs(self) -> bool:
         """Whether a CAV may still enter: while anybody may, as SUMO alone knows who will."""
-        return not self.over
+        return not self.over and self._room
+
+    @property
+    def _room(self) -> bool:
+        """Whether there may be one more CAV."""
+        return self.road.cavs is None or self._picked < self.road.cavs
 
     def _is_cav(self, name: str) -> bool:
-        """Whether a vehicle is a CAV: by its type, or by a draw that depends on its id and the seed alone.
+        found = self._room and self._is_chosen(name)
+        self._picked += found
+        return found
+
+    def _is_chosen(self, name: str) -> bool:
+        """Whether a vehicle may be a CAV: by its type, or by a draw of its id and the seed alone.
 
         So the same vehicles are CAVs whoever drives them, also where one enters later for it.
         """
