@@ -126,10 +126,13 @@ def _write(studies: StudyFolder, seeds: int, folder: Path, workers: int) -> None
         "impaired": (impaired(0), IMPAIRED_DRIVERS, SEEDS_IMPAIRED),
         "impaired-jammed": (impaired(GROWN), IMPAIRED_DRIVERS, SEEDS_IMPAIRED),
     }
-    worst = {controller: _worst_cases(controller, road) for controller, road in ROADS.items()}
-    write_whole(folder / "worst.json", to_json(worst))
+    if not (folder / "worst.json").is_file():
+        worst = {controller: _worst_cases(controller, road) for controller, road in ROADS.items()}
+        write_whole(folder / "worst.json", to_json(worst))
+    missing = [part for part in parts if not (folder / f"{part}.json").is_file()]
     with Workers(workers) as pool:
-        for part, (roads, drivers, count) in parts.items():
+        for part in missing:
+            roads, drivers, count = parts[part]
             found = {}
             for name, road in roads:
                 made = {driver: make_driver(driver, road.decision_step) for driver in (PEOPLE, *drivers)}
