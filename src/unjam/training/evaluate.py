@@ -9,7 +9,6 @@ from contextlib import nullcontext
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from shutil import rmtree
 from typing import Any
 
 from safetensors.numpy import save
@@ -306,7 +305,5 @@ def drive(
             named = {label: label for label in drivers}
             save_evaluation(folder, found, {**about, "controllers": _hashes(named), "notes": notes})
             report = write_report([folder], folder / "report.html")
-    if folder is not None and not ran:  # there is nothing to look at
-        rmtree(folder)
-        folder = None
-    return DriveResult(scenario, found.rows, folder, report, found.shown, notes)
+    kept = folder if ran else None  # there is nothing to look at
+    return DriveResult(scenario, found.rows, kept, report, found.shown, notes)
