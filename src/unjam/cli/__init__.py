@@ -16,6 +16,7 @@ from unjam.cli.options import with_trust
 from unjam.cli.parts import drivers, fit_drivers, scenarios
 from unjam.cli.results import certify, evaluate, export, model, report, verify
 from unjam.cli.runs import runs
+from unjam.cli.sign import keys, sign
 from unjam.cli.train import reproduce, search, train
 from unjam.cli.tune import tune
 from unjam.errors import DISK_ERRNOS, InputError, UnjamError, disk_error, without_train, wrong
@@ -52,7 +53,7 @@ MAY_RUN_CODE = (drive, assess, train, evaluate, model, search, export, verify, w
 """verbs that take folders which can name Python code"""
 for verb in (
     *(scenarios, drivers, drive, assess, train, evaluate, model, fit_drivers),
-    *(report, tune, search, reproduce, export, certify, verify, watch, bench, doctor),
+    *(report, tune, search, reproduce, export, certify, keys, sign, verify, watch, bench, doctor),
 ):
     app.command()(with_trust(verb) if verb in MAY_RUN_CODE else verb)
 app.add_typer(runs)
