@@ -49,7 +49,7 @@ def _root(
     pass
 
 
-MAY_RUN_CODE = (drive, assess, train, evaluate, model, search, export, verify, watch)
+MAY_RUN_CODE = (drive, assess, train, evaluate, model, search, export, certify, verify, watch)
 """verbs that take folders which can name Python code"""
 for verb in (
     *(scenarios, drivers, drive, assess, train, evaluate, model, fit_drivers),

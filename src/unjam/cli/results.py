@@ -203,12 +203,13 @@ def certify(
       unjam certify ring.unjam
     """
     from unjam.controller.certificate import certificate_of
-    from unjam.controller.file import add_certificate, check_unsigned, read_controller
+    from unjam.controller.file import add_certificate, check_unsigned, controller_file, read_controller
     from unjam.drivers.wrappers import Filtered
     from unjam.files import check_folder
     from unjam.reports.certificate import write_certificate
 
-    controller, target = read_controller(file), out or file.with_suffix(".html")
+    controller, file = read_controller(file), controller_file(file)
+    target = out or file.with_suffix(".html")
     check_folder(target)
     check_unsigned(controller)
     found = certificate_of(controller)

@@ -127,8 +127,7 @@ def read_controller(path: Path | str) -> Controller:
 
     Python code that it names runs only where the file lies in a run folder, and the code is trusted.
     """
-    path = Path(path)
-    file = path / f"controller{SUFFIX}" if path.is_dir() else path
+    path, file = Path(path), controller_file(path)
     if not os.path.isfile(file):
         raise InputError(f"controller: {str(file)!r} does not exist")
     try:
@@ -147,6 +146,12 @@ def read_controller(path: Path | str) -> Controller:
         return Controller(driver, manifest, parts, signed_by)
     except NONE_OF_OURS as error:
         raise InputError(f"controller {file.name}: not a controller: {error}") from None
+
+
+def controller_file(path: Path | str) -> Path:
+    """Return the file of a controller: that of a run folder, or the path itself."""
+    path = Path(path)
+    return path / f"controller{SUFFIX}" if path.is_dir() else path
 
 
 def hash_of(part: bytes) -> str:
