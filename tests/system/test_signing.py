@@ -1,14 +1,17 @@
 """Signing a controller, and telling who signed it, as a user does."""
 
 import json
+import re
 import stat
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
 from tests.controller.test_signature import FORGED, NO_PRIVATE_KEYS, forge
 from tests.controller.test_verify import content_of
-from tests.system.conftest import Run
+from tests.system.conftest import ROOT, Run
 from tests.system.test_wrong_inputs import one_line
 from unjam.controller.file import WEIGHTS, pack_parts, unpack_parts
 
@@ -43,6 +46,22 @@ def test_what_was_signed_is_verified_and_drives(unjam: Run, tmp_path: Path, make
         in unjam("verify", "it.unjam", "--signer", "maker.pub").stdout
     )
     assert unjam(*DRIVE, "it.unjam").returncode == 0
+
+
+def test_the_documented_check_without_unjam_agrees(unjam: Run, tmp_path: Path, maker: str) -> None:
+    assert unjam("sign", "it.unjam", "--key", "maker.key").returncode == 0
+    (tmp_path / "it.unjam").rename(tmp_path / "ring.unjam")
+    page = (ROOT / "docs/controller.md").read_text()
+    (program,) = re.findall(r"```python\n((?:(?!```).)*maker\.verify.*?)```", page, re.DOTALL)
+
+    def run() -> "subprocess.CompletedProcess[str]":
+        command = [sys.executable, "-c", program]
+        return subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+
+    assert run().returncode == 0
+    assert unjam("keys", "other").returncode == 0
+    (tmp_path / "other.pub").replace(tmp_path / "maker.pub")
+    assert "InvalidSignature" in run().stderr
 
 
 def test_a_signature_that_is_gone_is_missed_by_who_wants_one(unjam: Run, maker: str) -> None:
