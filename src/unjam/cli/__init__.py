@@ -91,9 +91,13 @@ def _run() -> int:
     except OSError as error:
         if error.errno in DISK_ERRNOS:
             return _say(str(disk_error(error, error.filename or "output")), 74)
+        if error.filename is None and not _is_somewhere():
+            return _say("working folder: it was removed; allowed: one that is there", InputError.exit_code)
         return _say(f"{error.filename or 'system'}: {error.strerror or error}", InputError.exit_code)
     except RecursionError:
         return _say("input: it is nested too deep", InputError.exit_code)
+    except OverflowError as error:
+        return _say(f"input: a number is too large: {error}", InputError.exit_code)
     except MemoryError:
         return _say("memory: there is not enough for this", InputError.exit_code)
     except (KeyboardInterrupt, typer.Abort):
@@ -104,6 +108,14 @@ def _run() -> int:
         if hasattr(error, "format_message"):  # what typer says of a wrong command line
             return _say(f"{error.format_message()}{_given(error)}", 2)  # pyright: ignore[reportAttributeAccessIssue]
         raise
+
+
+def _is_somewhere() -> bool:
+    """Return whether the folder still is there that this process works in."""
+    try:
+        return os.path.isdir(os.getcwd())
+    except FileNotFoundError:
+        return False
 
 
 def _given(error: Exception) -> str:
