@@ -172,6 +172,11 @@ def test_only_the_command_line_prints_with_its_libraries() -> None:
     assert {part_of(module) for module in found} == {"cli"}
 
 
+def test_signatures_are_checked_in_one_place() -> None:
+    assert importers({"cryptography"}) == {"controller/signature.py"}
+    assert "cryptography" not in loaded_by("import unjam.controller.verify")
+
+
 @pytest.mark.parametrize("package", ["pickle", "cloudpickle", "dill", "joblib", "marshal", "shelve", "yaml"])
 def test_nothing_reads_files_that_can_run_code(package: str) -> None:
     assert importers({package}) == set()
@@ -234,7 +239,7 @@ except SystemExit as end:
 def test_help_loads_nothing_that_takes_time(arguments: list[str]) -> None:
     found = loaded_by(HELP.format(arguments=arguments))
     assert "typer" in found
-    assert not found & (TORCH | {"libsumo", "traci", "matplotlib", "pandas", "scipy"})
+    assert not found & (TORCH | {"libsumo", "traci", "matplotlib", "pandas", "scipy", "cryptography"})
 
 
 @pytest.mark.parametrize(

@@ -7,6 +7,8 @@ import pytest
 import unjam
 from tests.controller.test_verify import ABOUT, content_of
 from unjam.controller import controller_bytes
+from unjam.controller.file import add_signature, read_controller
+from unjam.controller.signature import make_keys, read_private_key
 from unjam.controller.verify import verify_controller
 from unjam.drivers.from_file import FileDriver
 from unjam.errors import DiskError, InputError
@@ -31,6 +33,17 @@ def test_code_that_a_folder_names_runs_where_it_is_trusted_alone(
     with pytest.raises(InputError, match="it runs only with --trust-code"):
         unjam.verify_controller(tmp_path)
     assert unjam.verify_controller(tmp_path, trust_code=True)[-1].name == "manifest"
+
+
+def test_who_signed_a_controller_is_checked_in_a_limited_process(tmp_path: Path) -> None:
+    path, made = tmp_path / "it.unjam", make_keys(tmp_path / "maker")
+    path.write_bytes(content_of())
+    with pytest.raises(InputError, match=r"^controller: it is not signed; allowed: signed by "):
+        unjam.verify_controller(path, signer=made.public)
+    add_signature(path, read_controller(path), read_private_key(made.private))
+    assert unjam.verify_controller(path, signer=made.public) == verify_controller(path, made.public)
+    with pytest.raises(InputError, match=r"^signer: '--none' does not exist"):
+        unjam.verify_controller(path, signer="--none")
 
 
 @pytest.mark.usefixtures("without_pictures")

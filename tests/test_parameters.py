@@ -15,6 +15,7 @@ from unjam.parameters import (
     Positive,
     build,
     parse_assignments,
+    parse_toml,
     parse_value,
 )
 
@@ -120,3 +121,30 @@ def test_refuses_what_assigns_nothing(text: str) -> None:
 @given(st.integers() | st.booleans() | st.floats(allow_nan=False, allow_infinity=False))
 def test_numbers_come_back_as_they_were_written(value: float) -> None:
     assert parse_value(str(value).lower()) == value
+
+
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        ({"needed": 2**64}, "it.needed: a number of 65 bits is not allowed; allowed: at most 63"),
+        ({"needed": 1.0, "inner": {"size": -(2**70)}}, "it.inner.size: a number of 71 bits is not"),
+        (
+            {"needed": 1.0, "names": ["a", "b\0"]},
+            r"it.names: 'b\x00' is not allowed; allowed: a text without NUL",
+        ),
+    ],
+)
+def test_huge_integers_and_nul_are_refused(values: dict[str, Any], words: str) -> None:
+    with pytest.raises(InputError) as caught:
+        build(Outer, values, "it")
+    assert str(caught.value).startswith(words)
+
+
+@pytest.mark.parametrize("part", ["a", '"a b"', "'a'"])
+def test_a_key_of_many_parts_is_refused_before_it_takes_memory(part: str) -> None:
+    deep = " . ".join([part] * 100_000)
+    for text in (f"{deep} = 1", f"[{deep}]", f"a = {{{deep} = 1}}"):
+        with pytest.raises(ValueError, match="a key of more than 100 parts"):
+            parse_toml(text)
+    assert parse_toml(f"{'.'.join([part] * 50)} = 1")
+    assert parse_toml(f"a = {[0.5] * 1000}\nb = '{'../' * 50}'")

@@ -11,7 +11,7 @@ from typing import Any
 
 from safetensors import SafetensorError
 
-from unjam.errors import DISK_ERRNOS, DiskError, disk_error
+from unjam.errors import DISK_ERRNOS, DiskError, InputError, disk_error
 
 DAMAGED = (
     *(OSError, ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RecursionError),
@@ -40,6 +40,30 @@ def write_whole(path: Path, content: bytes | str) -> None:
     except OSError as error:
         temporary.unlink(missing_ok=True)
         raise _disk(error, path) from None
+
+
+def write_new(path: Path, content: bytes, mode: int) -> None:
+    """Write a file that is not there yet, whole or not at all; from the first byte on it has this `mode`.
+
+    Raises:
+        InputError: there is one.
+        DiskError: the disk is full or cannot be written.
+    """
+    try:
+        descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)
+    except FileExistsError:
+        raise InputError(f"file: {str(path)!r} exists; allowed: a new one") from None
+    except OSError as error:
+        raise _disk(error, path) from None
+    try:
+        with open(descriptor, "wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        sync_folder(path.parent)
+    except BaseException as error:
+        path.unlink(missing_ok=True)
+        raise (_disk(error, path) if isinstance(error, OSError) else error) from None
 
 
 def write_folder(folder: Path, files: dict[str, bytes | str]) -> None:

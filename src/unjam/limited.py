@@ -17,7 +17,9 @@ from unjam.processes import bound
 from unjam.trust import FLAG
 
 
-def verify_controller(path: Path | str, trust_code: bool = False) -> list[Verified]:
+def verify_controller(
+    path: Path | str, trust_code: bool = False, signer: Path | str | None = None
+) -> list[Verified]:
     """Return what was checked of a `.unjam` file, or of a run folder; no code runs that is not trusted.
 
     It is read as `unjam verify` reads it: in a process of its own, with little memory and time, which may
@@ -26,11 +28,13 @@ def verify_controller(path: Path | str, trust_code: bool = False) -> list[Verifi
     Args:
         path: the file, or the folder.
         trust_code: whether Python code that a run folder names runs all the same.
+        signer: file of the public key that must have signed it; None where anybody may have, or nobody.
 
     Raises:
-        InputError: the first thing that is wrong, in one line; also where there is code that is not trusted.
+        InputError: the first thing that is wrong, in one line; also where there is code that is not trusted,
+            or somebody else has signed it, or nobody.
     """
-    options = [FLAG] if trust_code else []
+    options = [*([FLAG] if trust_code else []), *([] if signer is None else [f"--signer={signer}"])]
     found = _answer("verify", *options, "--", str(path))["verified"]
     return [Verified(name, words) for name, words in found.items()]
 

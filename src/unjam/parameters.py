@@ -1,11 +1,12 @@
 """How unjam's frozen dataclasses check what they are given: types, ranges, unknown names."""
 
+import re
 from collections.abc import Sequence
 from typing import Annotated, Any, TypeVar
 
 from pydantic import BeforeValidator, ConfigDict, Field, TypeAdapter, ValidationError
 
-from unjam.errors import InputError, did_you_mean
+from unjam.errors import InputError, did_you_mean, wrong
 
 STRICT = ConfigDict(extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
 """Configuration of every parameter dataclass: an unknown name or a NaN is an error, not a surprise.
@@ -29,6 +30,13 @@ def as_range(value: Any) -> Any:
 OneOrRange = BeforeValidator(as_range)
 """lets a parameter that is a range be a single number too"""
 
+INTEGER_BITS = 63
+"""of the size of an integer"""
+
+DEEPEST_KEY = 100
+"""parts of a key between its dots"""
+_DEEP_KEY = re.compile(rf"""(?:(?:[\w-]+|"[^"\n]*"|'[^'\n]*')[ \t]*\.[ \t]*){{{DEEPEST_KEY}}}""")
+
 Checked = TypeVar("Checked")
 
 
@@ -37,10 +45,30 @@ def build(kind: type[Checked], values: dict[str, Any], field: str) -> Checked:
 
     `field` says where the values come from, for the message.
     """
+    _check_values(values, field)
     try:
         return TypeAdapter(kind).validate_python(values)
     except ValidationError as error:
         raise InputError(one_line(error, field, kind)) from None
+
+
+def _check_values(value: Any, name: str) -> None:
+    """Raise `InputError` where `value` holds what no file of ours can: a huge integer, or NUL in a text.
+
+    TOML has 64 bits for integers; longer ones fit into no array, no float, and cannot always be written.
+    With NUL in its name no file can be asked for.
+    """
+    if isinstance(value, dict):
+        for key, inner in value.items():
+            _check_values(inner, f"{name}.{key}".strip("."))
+    elif isinstance(value, list | tuple):
+        for inner in value:
+            _check_values(inner, name)
+    elif isinstance(value, int) and value.bit_length() > INTEGER_BITS:
+        found = f"a number of {value.bit_length()} bits"
+        raise InputError(f"{name}: {found} is not allowed; allowed: at most {INTEGER_BITS}")
+    elif isinstance(value, str) and "\0" in value:
+        raise wrong(name, value, "a text without NUL")
 
 
 def one_line(error: ValidationError, field: str, kind: Any) -> str:
@@ -66,12 +94,24 @@ def _names_at(kind: Any, path: Sequence[object]) -> list[str]:
     return list(getattr(kind, "__pydantic_fields__", {}))
 
 
-def parse_value(text: str) -> Any:
-    """Return what `text` means as a TOML value (number, boolean, list); itself where it is none."""
+def parse_toml(text: str) -> dict[str, Any]:
+    """Return what a text in TOML says.
+
+    Raises:
+        ValueError, RecursionError: it is none, or nested without end: a key of many parts takes memory as
+            the square of their number.
+    """
     import tomllib
 
+    if _DEEP_KEY.search(text):
+        raise ValueError(f"a key of more than {DEEPEST_KEY} parts")
+    return tomllib.loads(text)
+
+
+def parse_value(text: str) -> Any:
+    """Return what `text` means as a TOML value (number, boolean, list); itself where it is none."""
     try:
-        return tomllib.loads(f"value = {text}")["value"]
+        return parse_toml(f"value = {text}")["value"]
     except (ValueError, RecursionError):  # also of a number too long to be one
         return text
 

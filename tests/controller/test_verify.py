@@ -53,7 +53,7 @@ def names(path: Path) -> list[str]:
 
 def test_a_whole_controller_is_verified(tmp_path: Path) -> None:
     path = written(tmp_path, content_of())
-    assert names(path) == ["parts", "driver", "weights", "manifest", "sample"]
+    assert names(path) == ["parts", "signature", "driver", "weights", "manifest", "sample"]
     assert "40 decisions, its driver within 0.0e+00 m/s2" in verify_controller(path)[-1].found
 
 
@@ -89,12 +89,12 @@ def test_a_feature_of_a_folder_is_code_too(tmp_path: Path, monkeypatch: pytest.M
 
 def test_a_controller_of_a_run_has_no_sample_and_is_verified(tmp_path: Path) -> None:
     (tmp_path / "controller.unjam").write_bytes(controller_bytes(HELD, ABOUT))
-    assert names(tmp_path) == ["parts", "driver", "weights", "manifest"]
+    assert names(tmp_path) == ["parts", "signature", "driver", "weights", "manifest"]
 
 
 def test_a_controller_of_the_first_format_has_no_description_and_is_verified(tmp_path: Path) -> None:
     path = changed(tmp_path, lambda manifest: manifest.update(format=1), controller_bytes(HELD, ABOUT))
-    assert names(path) == ["parts", "driver", "weights"]
+    assert names(path) == ["parts", "signature", "driver", "weights"]
 
 
 @pytest.mark.parametrize(

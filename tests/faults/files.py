@@ -8,12 +8,28 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 import torch
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
+from tests.controller.test_signature import forge
 from tests.controller.test_verify import HELD, content_of, mutated
 from tests.faults.outcome import Outcome, one_line
 from tests.pictures import empty_pictures
 from unjam.controller import controller_bytes, load_controller
+from unjam.controller.file import (
+    CERTIFICATE,
+    GRAPH,
+    MANIFEST,
+    PARTS,
+    SIGNATURE,
+    WEIGHTS,
+    add_signature,
+    pack_parts,
+    read_controller,
+    unpack_parts,
+)
+from unjam.controller.signature import make_keys, read_private_key, signature_of
 from unjam.controller.verify import verify_controller
 from unjam.errors import DiskError, InputError
 from unjam.reports.html import write_report
@@ -103,6 +119,50 @@ def controllers(count: int, folder: Path, generator: np.random.Generator) -> Out
         assert controller_bytes(load_controller(path), {}) == whole
         outcome.happened["nothing was lost"] += 1
     return outcome
+
+
+def signatures(count: int, folder: Path, generator: np.random.Generator) -> Outcome:
+    """Change a signed controller as a forger would, who makes all hashes fit, or its signature."""
+    outcome, path, maker = Outcome(), folder / "it.unjam", make_keys(folder / "maker")
+    key, other = read_private_key(maker.private), Ed25519PrivateKey.generate()
+    path.write_bytes(content_of(parts={GRAPH: b"drawn", CERTIFICATE: b"{}"}))
+    add_signature(path, read_controller(path), key)
+    whole = unpack_parts(path)
+    while outcome.injected < count:
+        parts = dict(whole)
+        kind, part = str(generator.choice(FORGERIES)), str(generator.choice(PARTS[1:-1]))
+        if kind == "a part changed":
+            parts[part] = any_mutation(parts[part], generator)
+        elif kind == "a part gone" and part != WEIGHTS:
+            del parts[part]
+        elif kind == "its manifest changed":
+            parts[MANIFEST] = with_junk(json.loads(parts[MANIFEST]), generator).encode()
+        elif kind == "its signature changed":
+            parts[SIGNATURE] = any_mutation(parts[SIGNATURE], generator)
+        elif kind == "signed by another":
+            del parts[SIGNATURE]
+            parts[SIGNATURE] = signature_of(parts, other)
+        elif kind == "its signature taken away":
+            del parts[SIGNATURE]
+        if parts == whole:
+            continue
+        path.write_bytes(pack_parts(parts) if kind == "its manifest changed" else forge(parts))
+        signed = kind not in ("signed by another", "its signature taken away")
+        for read in (
+            lambda: verify_controller(path, maker.public),
+            *([lambda: read_controller(path)] * signed),
+        ):
+            with pytest.raises(InputError) as caught:
+                read()
+            one_line(caught.value)
+        outcome.happened[f"{kind}: refused in one line"] += 1
+    return outcome
+
+
+FORGERIES = (
+    *("a part changed", "a part gone", "its manifest changed", "its signature changed", "signed by another"),
+    "its signature taken away",
+)
 
 
 def configurations(count: int, folder: Path, generator: np.random.Generator) -> Outcome:

@@ -1,6 +1,7 @@
 """All faults that are injected, by name."""
 
-from tests.faults.files import checkpoints, configurations, controllers, full_disks, results
+from tests.faults.files import checkpoints, configurations, controllers, full_disks, results, signatures
+from tests.faults.inputs import inputs
 from tests.faults.outcome import Fault
 from tests.faults.processes import hostile, killed_runs, lost_workers, networks, resets
 from tests.faults.trust import caches, cheats, codes, crash_points, lineages, locks, sandboxes
@@ -31,7 +32,11 @@ FAULTS: dict[str, Fault] = {
     ),
     "cached networks": Fault("network in the cache edited, cut, emptied or removed", caches, 8, 300),
     "code in folders": Fault(
-        "controller of a run folder that names Python code, looked at by verify", codes, 12, 300
+        "run folder that names Python code, given to verify, drive, watch, assess, train, search, evaluate, "
+        "export and certify",
+        codes,
+        quick=16,
+        long=300,
     ),
     "drivers that change": Fault(
         "driver that changes all that it is shown, on every kind of road", cheats, quick=5, long=200
@@ -52,4 +57,17 @@ FAULTS: dict[str, Fault] = {
     "lost workers": Fault("worker killed, crashed or stopped in an episode", lost_workers, quick=2, long=200),
     "resets": Fault("episodes one after the other in one process", resets, quick=100, long=10_000),
     "killed runs": Fault("training run killed (signal 9)", killed_runs, quick=4, long=12, slow=True),
+    "signatures": Fault(
+        "signed controller changed by a forger who makes the hashes fit, signed by another, or not at all",
+        signatures,
+        quick=60,
+        long=1000,
+    ),
+    "inputs": Fault(
+        "command line with names too long, odd or no text, configurations without end, NUL, special files, "
+        "weights that are none; with a closed output, in a removed folder, with few file descriptors",
+        inputs,
+        quick=11,
+        long=200,
+    ),
 }

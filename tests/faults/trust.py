@@ -4,6 +4,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
+from contextlib import chdir
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
@@ -15,6 +16,7 @@ import pytest
 
 from tests.controller.test_file import residual
 from tests.faults.outcome import Outcome, one_line
+from tests.system.test_code_of_others import VERBS
 from tests.test_processes import holder
 from tests.test_sandbox import TRIES
 from tests.training.test_belonging import of_expert, of_network, of_reward, with_checkpoint
@@ -26,6 +28,7 @@ from tests.worlds.sumo.test_network_files import edges_of
 from tests.worlds.test_episode import insists
 from tests.worlds.test_record import fingerprint
 from unjam import sandbox
+from unjam.cli import app
 from unjam.controller import controller_bytes
 from unjam.controller.verify import verify_controller
 from unjam.drivers import Driver, LocalState, PISaturation
@@ -35,7 +38,7 @@ from unjam.errors import EpisodeError, InputError
 from unjam.processes import owned
 from unjam.scenarios import Ring, make_scenario
 from unjam.training import folder as run_folder
-from unjam.training.folder import STATE, belonging, last_state
+from unjam.training.folder import STATE, belonging, last_state, start_folder
 from unjam.worlds.episode import run_episode
 from unjam.worlds.sumo import networks
 from unjam.worlds.sumo.apart import SimulationApart
@@ -218,23 +221,39 @@ def caches(count: int, folder: Path, generator: np.random.Generator) -> Outcome:
 
 
 def codes(count: int, folder: Path, generator: np.random.Generator) -> Outcome:
-    """Let a run folder's controller name Python code, somewhere within it, and verify it."""
+    """Let a run folder name Python code, in its controller and in its configuration; try it with any verb."""
     outcome = Outcome()
     for number in range(count):
         place = folder / str(number)
-        place.mkdir()
-        code, ran = place / "code.py", place / "ran"
+        run, code, ran = place / "run", place / "run" / "code.py", place / "ran"
+        start_folder(run, small_config(expert=f"{code}:gentle", road__horizon=20))
+        (run / "best.toml").write_text((run / "config.toml").read_text())
+        straight(place, CARS)
         code.write_text(f"{GENTLE}seen = gentle\n")
         driver, where = _hidden(code, generator)
-        (place / "controller.unjam").write_bytes(controller_bytes(driver, {}))
         code.write_text(f"open({str(ran)!r}, 'w').close()\n" + code.read_text())
-        path = place if generator.random() < 0.5 else place / "controller.unjam"
-        with pytest.raises(InputError) as caught:
-            verify_controller(path)
+        (run / "controller.unjam").write_bytes(controller_bytes(driver, {}))
+        before = sorted(place.rglob("*"))
+        verb = list(TRIED)[number % len(TRIED)]
+        with chdir(place), pytest.raises(InputError, match="Python code") as caught:
+            TRIED[verb]()
         one_line(caught.value)
-        assert not ran.exists()
+        assert sorted(place.rglob("*")) == before
         outcome.happened[f"{where}: refused in one line, nothing ran"] += 1
+        shutil.rmtree(place)
     return outcome
+
+
+def _as_typed(words: Sequence[str]) -> Callable[[], object]:
+    return lambda: app(list(words), standalone_mode=False)
+
+
+TRIED: dict[str, Callable[[], object]] = {
+    "verify": lambda: verify_controller("run"),
+    "verify of the file": lambda: verify_controller("run/controller.unjam"),
+    **{verb: _as_typed(words) for verb, words in VERBS.items() if verb not in ("verify", "model")},
+}
+"""what a folder is given to, in this process; `verify` and `model` go on in a limited child"""
 
 
 def _hidden(code: Path, generator: np.random.Generator) -> tuple[Driver, str]:

@@ -9,6 +9,7 @@ from tests.system.conftest import Run
 from tests.system.test_wrong_inputs import one_line
 from tests.training.test_run import small_config
 from tests.worlds.sumo.own_roads import straight
+from unjam.cli import MAY_RUN_CODE
 from unjam.controller import controller_bytes
 from unjam.drivers.from_file import FileDriver
 from unjam.training.config import to_toml
@@ -68,6 +69,17 @@ def test_code_that_its_user_trusts_runs(verb: str, unjam: Run, ran: Path) -> Non
     done = unjam(*VERBS[verb], "--trust-code", pictures=False)
     assert done.returncode == 0, done.stderr
     assert ran.exists()
+
+
+def test_certify_goes_on_to_what_it_needs_where_the_code_is_trusted(unjam: Run, ran: Path) -> None:
+    done = unjam(*VERBS["certify"], "--trust-code")
+    assert (done.returncode, done.stdout, one_line(done.stderr)) == (2, "", True), done.stderr
+    assert "a controller without its safety filter and sample is not allowed" in done.stderr
+    assert ran.exists()
+
+
+def test_every_verb_that_can_be_told_so_knows_how_to_trust_code() -> None:
+    assert {words[0] for words in VERBS.values()} == {verb.__name__ for verb in MAY_RUN_CODE}
 
 
 def test_code_that_ran_is_trusted_until_it_changes(unjam: Run, tmp_path: Path, ran: Path) -> None:

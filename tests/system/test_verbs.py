@@ -56,7 +56,7 @@ VERBS = [
     "fit-drivers",
     "report",
 ]
-VERBS += ["report", "reproduce", "search", "export", "verify", "watch", "bench", "doctor"]
+VERBS += ["report", "reproduce", "search", "export", "keys", "sign", "verify", "watch", "bench", "doctor"]
 
 
 def document(ran: subprocess.CompletedProcess[str]) -> Any:

@@ -135,6 +135,15 @@ WRONG: dict[str, tuple[str, list[str]]] = {
     "configuration with a number too long": ("not TOML", ["train ring --config number.toml"]),
     "number too long": ("steps: '999", [f"train ring --set steps={'9' * 5000}"]),
     "expert with a NUL in its path": (r"'a\x00.py:x' is not allowed", ["train ring --config nul.toml"]),
+    "people that are a device": ("population: '/dev/zero'", ["drive ring --driver pi --humans /dev/zero"]),
+    "key of too many parts": ("a key of more than 100 parts", ["train ring --config deep.toml"]),
+    "hexadecimal number too long": ("steps: a number of 2000 bits", ["train ring --config long.toml"]),
+    "network with a NUL in its path": (r"scenario: 'a\x00.sumocfg'", ["train --config nuls.toml"]),
+    "weight of a reward too large": (
+        "released: headway: 1",
+        [f"drive ring --driver pi --reward released:headway=1{'0' * 400}"],
+    ),
+    "seed too large to tune with": ("seed: 4294967296", ["tune ring --seed 4294967296"]),
     "text that is not UTF-8": ("allowed: text in UTF-8", ["drive ring --driver pi --out a\udcff"]),
     "weights that are complex": ("complex64", ["verify complex.unjam"]),
     "weights that are booleans": ("bool", ["verify boolean.unjam"]),
@@ -159,6 +168,9 @@ def files(tmp_path: Path, my_drivers: Path) -> None:
         )
     (tmp_path / "nested.toml").write_text("a = " + "[" * 100_000)
     (tmp_path / "number.toml").write_text("steps = " + "9" * 5000)
+    (tmp_path / "deep.toml").write_text(f"a{'.a' * 50_000} = 1")
+    (tmp_path / "long.toml").write_text(f"steps = 0x{'f' * 500}")
+    (tmp_path / "nuls.toml").write_text('scenario = "a\\u0000.sumocfg"')
     (tmp_path / "nul.toml").write_text('expert = "a\\u0000.py:x"')
     for name, kind in {"complex": np.complex64, "boolean": np.bool_}.items():
         (tmp_path / f"{name}.unjam").write_bytes(with_weights_of(kind))

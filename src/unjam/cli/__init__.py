@@ -16,6 +16,7 @@ from unjam.cli.options import with_trust
 from unjam.cli.parts import drivers, fit_drivers, scenarios
 from unjam.cli.results import certify, evaluate, export, model, report, verify
 from unjam.cli.runs import runs
+from unjam.cli.sign import keys, sign
 from unjam.cli.train import reproduce, search, train
 from unjam.cli.tune import tune
 from unjam.errors import DISK_ERRNOS, InputError, UnjamError, disk_error, without_train, wrong
@@ -48,11 +49,11 @@ def _root(
     pass
 
 
-MAY_RUN_CODE = (drive, assess, train, evaluate, model, search, export, verify, watch)
+MAY_RUN_CODE = (drive, assess, train, evaluate, model, search, export, certify, verify, watch)
 """verbs that take folders which can name Python code"""
 for verb in (
     *(scenarios, drivers, drive, assess, train, evaluate, model, fit_drivers),
-    *(report, tune, search, reproduce, export, certify, verify, watch, bench, doctor),
+    *(report, tune, search, reproduce, export, certify, keys, sign, verify, watch, bench, doctor),
 ):
     app.command()(with_trust(verb) if verb in MAY_RUN_CODE else verb)
 app.add_typer(runs)
@@ -91,9 +92,13 @@ def _run() -> int:
     except OSError as error:
         if error.errno in DISK_ERRNOS:
             return _say(str(disk_error(error, error.filename or "output")), 74)
+        if error.filename is None and not _is_somewhere():
+            return _say("working folder: it was removed; allowed: one that is there", InputError.exit_code)
         return _say(f"{error.filename or 'system'}: {error.strerror or error}", InputError.exit_code)
     except RecursionError:
         return _say("input: it is nested too deep", InputError.exit_code)
+    except OverflowError as error:
+        return _say(f"input: a number is too large: {error}", InputError.exit_code)
     except MemoryError:
         return _say("memory: there is not enough for this", InputError.exit_code)
     except (KeyboardInterrupt, typer.Abort):
@@ -104,6 +109,14 @@ def _run() -> int:
         if hasattr(error, "format_message"):  # what typer says of a wrong command line
             return _say(f"{error.format_message()}{_given(error)}", 2)  # pyright: ignore[reportAttributeAccessIssue]
         raise
+
+
+def _is_somewhere() -> bool:
+    """Return whether the folder still is there that this process works in."""
+    try:
+        return os.path.isdir(os.getcwd())
+    except FileNotFoundError:
+        return False
 
 
 def _given(error: Exception) -> str:

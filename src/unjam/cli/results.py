@@ -195,20 +195,23 @@ def certify(
     """Certify a controller: what is proven of it, worst cases, comfort, strings of vehicles, its domain.
 
     Leaders brake to standstill from every state of its sample, an adversary looks for contact, and others
-    sway at all frequencies. The certificate becomes a part of the file, which `unjam verify` tries again.
+    sway at all frequencies. The certificate becomes a part of the file, which `unjam verify` tries again; a
+    file that is signed already is refused.
 
     Example:
 
       unjam certify ring.unjam
     """
     from unjam.controller.certificate import certificate_of
-    from unjam.controller.file import add_certificate, read_controller
+    from unjam.controller.file import add_certificate, check_unsigned, controller_file, read_controller
     from unjam.drivers.wrappers import Filtered
     from unjam.files import check_folder
     from unjam.reports.certificate import write_certificate
 
-    controller, target = read_controller(file), out or file.with_suffix(".html")
+    controller, file = read_controller(file), controller_file(file)
+    target = out or file.with_suffix(".html")
     check_folder(target)
+    check_unsigned(controller)
     found = certificate_of(controller)
     add_certificate(file, controller, found)
     assert isinstance(controller.driver, Filtered)  # nothing else is certified
@@ -224,9 +227,13 @@ def certify(
 
 def verify(
     file: Annotated[Path, typer.Argument(help="A .unjam file, or the folder of a training run.")],
+    signer: Annotated[
+        Path | None,
+        typer.Option(help="Public key (.pub) that must have signed it.", show_default="anybody, or nobody"),
+    ] = None,
     json: JsonOption = False,
 ) -> None:
-    """Check a controller: hashes, shapes, names, and that its forms agree on its recorded sample.
+    """Check a controller: hashes, shapes, names, its signature, that its forms agree on its recorded sample.
 
     Exit code 2 and one line where something is wrong, or where a folder names Python code that is not yours.
 
@@ -234,16 +241,22 @@ def verify(
 
       unjam verify ring.unjam
 
+      unjam verify ring.unjam --signer maker.pub     (signed by this key, or exit code 2)
+
       unjam verify runs/mine --trust-code            (its expert is a Python file that you trust)
     """
     from rich.markup import escape
 
     go_on_limited(f"controller: {str(file)!r}")
-    from unjam.controller.verify import verify_controller
+    from unjam.controller.file import read_controller
+    from unjam.controller.verify import verify as check
 
-    verified = verify_controller(file)
+    controller = read_controller(file)
+    verified = {each.name: each.found for each in check(controller, signer)}
     if json:
-        print_json({"file": str(file), "ok": True, "verified": {each.name: each.found for each in verified}})
+        wanted = None if signer is None else str(signer)
+        who = {"signed_by": controller.signed_by, "signer": wanted}
+        print_json({"file": str(file), "ok": True, **who, "verified": verified})
         return
-    for each in verified:
-        console.print(f"[green]ok[/green] {each.name}: {escape(each.found)}", markup=True)
+    for name, found in verified.items():
+        console.print(f"[green]ok[/green] {name}: {escape(found)}", markup=True)

@@ -21,7 +21,10 @@ from unjam.cli.options import (
     with_options,
 )
 from unjam.cli.output import aside, console, print_json
-from unjam.errors import InputError
+from unjam.errors import InputError, wrong
+
+SEEDS_BELOW = 2**32
+"""what proposes settings takes no larger ones"""
 
 
 @with_options(road=scenario_changes)
@@ -72,6 +75,8 @@ def tune(
     from unjam.worlds.reward import make_reward
     from unjam.worlds.workers import Workers
 
+    if seed >= SEEDS_BELOW:
+        raise wrong("seed", seed, f"less than {SEEDS_BELOW}")
     changes = road | assignments(settings)
     if is_family(scenario):
         if changes or reward:

@@ -9,7 +9,7 @@ import zipfile
 import zlib
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from safetensors.numpy import load, save
@@ -27,6 +27,9 @@ from unjam.trust import check_trusted
 from unjam.worlds.drive import drive
 from unjam.worlds.world import RecordedWorld
 
+if TYPE_CHECKING:
+    from unjam.controller.signature import Ed25519PrivateKey
+
 SUFFIX = ".unjam"
 FORMAT = 3
 """schema version of the manifest"""
@@ -35,13 +38,17 @@ READABLE = (1, 2, FORMAT)
 remembered"""
 MANIFEST, WEIGHTS = "manifest.json", "weights.safetensors"
 SAMPLE, GRAPH, CERTIFICATE = "sample.safetensors", "controller.onnx", "certificate.json"
-PARTS = (MANIFEST, WEIGHTS, SAMPLE, GRAPH, CERTIFICATE)
+SIGNATURE = "signature.json"
+PARTS = (MANIFEST, WEIGHTS, SAMPLE, GRAPH, CERTIFICATE, SIGNATURE)
 """all that an archive may hold; sample and graph are there where it was exported, the certificate where it
-was certified"""
+was certified, the signature where it was signed: in this order then"""
 LARGEST_PART = 64 * 2**20
 """bytes of one part"""
 NONE_OF_OURS = (*DAMAGED, zipfile.BadZipFile, zlib.error, EOFError, MemoryError, RuntimeError)
 """what reading can raise where a file is none; `RuntimeError`: of a kind that zipfile does not know"""
+
+UNIX = 3
+"""of the systems that an archive can name"""
 
 ANSWER = "acceleration"
 """the answer's name in a sample and in a graph"""
@@ -55,6 +62,8 @@ class Controller:
     manifest: dict[str, Any]
     parts: dict[str, bytes]
     """content of the archive, by name"""
+    signed_by: str | None = None
+    """fingerprint of the key that signed it; None where nobody did"""
 
 
 def controller_bytes(driver: Driver, about: dict[str, Any], parts: dict[str, bytes] | None = None) -> bytes:
@@ -76,11 +85,31 @@ def controller_bytes(driver: Driver, about: dict[str, Any], parts: dict[str, byt
 
 
 def add_certificate(file: Path, controller: Controller, certificate: dict[str, Any]) -> None:
-    """Write a controller's file once more, with its certificate among its parts and their hashes."""
+    """Write a controller's file once more, with its certificate among its parts and their hashes.
+
+    Raises:
+        InputError: it is signed: it would no longer be what was signed.
+    """
+    check_unsigned(controller)
     parts = {**controller.parts, CERTIFICATE: to_json(certificate, indent=1).encode()}
     del parts[MANIFEST]
     manifest = {**controller.manifest, "sha256": {name: hash_of(part) for name, part in parts.items()}}
     write_whole(file, pack_parts({MANIFEST: to_json(manifest, indent=1).encode(), **parts}))
+
+
+def check_unsigned(controller: Controller) -> None:
+    """Raise `InputError` where a controller is signed, and must stay as it is."""
+    if controller.signed_by is not None:
+        signed = f"controller: a file that is signed (by {controller.signed_by}) is not allowed"
+        raise InputError(f"{signed}; allowed: one that is not: certify it first, then sign it")
+
+
+def add_signature(file: Path, controller: Controller, key: "Ed25519PrivateKey") -> None:
+    """Write a controller's file once more, signed with `key` and by nobody else."""
+    from unjam.controller.signature import signature_of
+
+    parts = {name: controller.parts[name] for name in PARTS if name in controller.parts.keys() - {SIGNATURE}}
+    write_whole(file, pack_parts({**parts, SIGNATURE: signature_of(parts, key)}))
 
 
 def load_controller(path: Path | str) -> Driver:
@@ -98,8 +127,7 @@ def read_controller(path: Path | str) -> Controller:
 
     Python code that it names runs only where the file lies in a run folder, and the code is trusted.
     """
-    path = Path(path)
-    file = path / f"controller{SUFFIX}" if path.is_dir() else path
+    path, file = Path(path), controller_file(path)
     if not os.path.isfile(file):
         raise InputError(f"controller: {str(file)!r} does not exist")
     try:
@@ -108,15 +136,22 @@ def read_controller(path: Path | str) -> Controller:
         if manifest["format"] not in READABLE:
             raise InputError(f"controller {file.name}: format {manifest['format']!r} is unknown")
         _check_hashes(file.name, manifest["sha256"], parts)
+        signed_by = _signed_by(file, parts) if SIGNATURE in parts else None
         _check_code(file.name, manifest["driver"], path.is_dir())
         arrays = load(parts[WEIGHTS])
         driver = driver_from_recipe(manifest["driver"], arrays)
         unknown = arrays.keys() - recipe_of(driver)[1].keys()
         if unknown:
             raise InputError(f"controller {file.name}: weights {min(unknown)!r} belong to no network")
-        return Controller(driver, manifest, parts)
+        return Controller(driver, manifest, parts, signed_by)
     except NONE_OF_OURS as error:
         raise InputError(f"controller {file.name}: not a controller: {error}") from None
+
+
+def controller_file(path: Path | str) -> Path:
+    """Return the file of a controller: that of a run folder, or the path itself."""
+    path = Path(path)
+    return path / f"controller{SUFFIX}" if path.is_dir() else path
 
 
 def hash_of(part: bytes) -> str:
@@ -125,12 +160,27 @@ def hash_of(part: bytes) -> str:
 
 
 def _check_hashes(name: str, hashes: dict[str, str], parts: dict[str, bytes]) -> None:
-    """Raise `InputError` unless the manifest names the hash of every other part, and of nothing else."""
-    if hashes.keys() != parts.keys() - {MANIFEST}:
+    """Raise `InputError` unless the manifest names the hash of every other part, and of nothing else.
+
+    The signature, which is over the manifest, has none there.
+    """
+    if hashes.keys() != parts.keys() - {MANIFEST, SIGNATURE}:
         raise InputError(f"controller {name}: damaged: its parts are not those that it names")
     for part, content in parts.items():
-        if part != MANIFEST and hash_of(content) != hashes[part]:
+        if part in hashes and hash_of(content) != hashes[part]:
             raise InputError(f"controller {name}: damaged: {part} does not have the hash that it names")
+
+
+def _signed_by(file: Path, parts: dict[str, bytes]) -> str:
+    """Return the fingerprint of the key that signed `parts`; raise `InputError` where that does not fit."""
+    from unjam.controller.signature import forged, signer_of  # which takes its time, and few need
+
+    ordered = {name: parts[name] for name in PARTS if name in parts}
+    signed = {name: part for name, part in ordered.items() if name != SIGNATURE}
+    fingerprint = signer_of(file.name, signed, parts[SIGNATURE])
+    if file.read_bytes() != pack_parts(ordered):  # an archive has room for more than its parts
+        raise forged(file.name)
+    return fingerprint
 
 
 def _check_code(name: str, recipe: Any, in_folder: bool) -> None:
@@ -150,7 +200,9 @@ def pack_parts(parts: dict[str, bytes]) -> bytes:
     content = io.BytesIO()
     with zipfile.ZipFile(content, "w", zipfile.ZIP_STORED) as archive:
         for name, part in parts.items():
-            archive.writestr(zipfile.ZipInfo(name), part)  # of a fixed date
+            entry = zipfile.ZipInfo(name)  # of a fixed date
+            entry.create_system = UNIX  # on any system
+            archive.writestr(entry, part)
     return content.getvalue()
 
 

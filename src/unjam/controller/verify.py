@@ -21,6 +21,7 @@ from unjam.controller.file import (
     GRAPH,
     MANIFEST,
     SAMPLE,
+    SIGNATURE,
     WEIGHTS,
     Controller,
     Floats,
@@ -60,18 +61,29 @@ class Verified:
     found: str
 
 
-def verify_controller(path: Path | str) -> list[Verified]:
+def verify_controller(path: Path | str, signer: Path | str | None = None) -> list[Verified]:
     """Return what was checked of a `.unjam` file, or of a run folder; no code runs that is not trusted.
+
+    Args:
+        path: the file, or the folder.
+        signer: file of the public key that must have signed it; None where anybody may have, or nobody.
 
     Raises:
         InputError: the first thing that is wrong, in one line; also where there is code that is not trusted.
     """
-    controller = read_controller(path)
-    driver, manifest, parts = controller.driver, controller.manifest, controller.parts
-    sizes = ", ".join(f"{name} {len(part):,} bytes" for name, part in parts.items() if name != MANIFEST)
+    return verify(read_controller(path), signer)
+
+
+def verify(controller: Controller, signer: Path | str | None = None) -> list[Verified]:
+    """Return what was checked of a controller that was read; arguments and errors as `verify_controller`."""
+    signature = _check_signer(controller.signed_by, signer)
+    driver, manifest = controller.driver, controller.manifest
+    parts = {name: part for name, part in controller.parts.items() if name not in (MANIFEST, SIGNATURE)}
+    sizes = ", ".join(f"{name} {len(part):,} bytes" for name, part in parts.items())
     weights = f"finite, of the shapes that the driver needs; SHA-256 {manifest['sha256'][WEIGHTS]}"
     verified = [
         Verified("parts", f"{sizes}; each has the hash that the manifest names"),
+        Verified("signature", signature),
         Verified("driver", driver.describe()),
         *([Verified("road", f"made for the {road}")] if (road := road_of(manifest)) else []),
         Verified("weights", weights),
@@ -91,6 +103,20 @@ def verify_controller(path: Path | str) -> list[Verified]:
     if CERTIFICATE in parts:
         verified.append(Verified("certificate", _check_certificate(controller)))
     return verified
+
+
+def _check_signer(found: str | None, signer: Path | str | None) -> str:
+    """Return what is told of who signed a controller; raise `InputError` where it was not `signer`."""
+    if signer is None:
+        known = "compare that with what its maker told you, or give a public key (--signer)"
+        return "none: who made it is not said" if found is None else f"of the key {found}: {known}"
+    from unjam.controller.signature import read_public_key  # which takes its time, and few need
+
+    wanted = read_public_key(Path(signer))
+    if found != wanted:
+        how = "it is not signed" if found is None else f"it is signed by another key, {found}"
+        raise InputError(f"controller: {how}; allowed: signed by {str(signer)!r}, {wanted}")
+    return f"of {str(signer)!r}, the key {found}"
 
 
 def _short(value: Any) -> str:

@@ -6,6 +6,7 @@ is ever executed.
 
 import hashlib
 import json
+import os
 from dataclasses import asdict, dataclass, field
 from functools import lru_cache
 from pathlib import Path
@@ -16,7 +17,7 @@ from safetensors.numpy import load, save
 
 from unjam import __version__
 from unjam.drivers.network import Network, network_arrays, network_from_arrays
-from unjam.errors import InputError
+from unjam.errors import InputError, wrong
 from unjam.files import DAMAGED, to_json, write_whole
 from unjam.parameters import build
 from unjam.physics.arrays import Array, clip, namespace
@@ -127,10 +128,11 @@ def read_population(path: Path | str) -> Population:
         InputError: there is none, or it is damaged, or not a population.
     """
     path = Path(path)
-    try:
-        stamp = path.stat()
-    except OSError:
-        raise InputError(f"population: {str(path)!r} does not exist") from None
+    if not os.path.exists(path):
+        raise InputError(f"population: {str(path)!r} does not exist")
+    if not os.path.isfile(path):  # a device would be read without end
+        raise wrong("population", str(path), "a file of `unjam fit-drivers`")
+    stamp = path.stat()
     return _read(path, stamp.st_mtime_ns, stamp.st_size)
 
 

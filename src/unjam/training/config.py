@@ -1,7 +1,6 @@
 """Everything that decides what a training run does: one validated configuration, as TOML and flags."""
 
 import os
-import tomllib
 from collections.abc import Sequence
 from dataclasses import asdict, field, replace
 from math import ceil
@@ -18,7 +17,7 @@ from unjam.drivers.observation import observed
 from unjam.drivers.wrappers import Remembering
 from unjam.errors import InputError
 from unjam.learners.settings import Agents, PolicySettings
-from unjam.parameters import STRICT, Count, CountOrNone, Positive, build, changed, nested
+from unjam.parameters import STRICT, Count, CountOrNone, Positive, build, changed, nested, parse_toml
 from unjam.scenarios import make_scenario
 from unjam.scenarios.scenario import Scenario
 from unjam.training.presets import preset_values
@@ -218,7 +217,7 @@ def read_toml(path: Path) -> dict[str, Any]:
     if os.path.exists(path) and not os.path.isfile(path):
         raise InputError(f"config file {path}: not a file: a directory, a pipe or a device")
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
+        return parse_toml(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise InputError(f"config file {path}: {error.strerror}") from None
     except (ValueError, RecursionError) as error:  # also a number too long, NUL in the path

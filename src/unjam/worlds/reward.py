@@ -1,7 +1,7 @@
 """Rewards: named terms, and their sum. One place for the actual and the virtual environment."""
 
 from collections.abc import Callable
-from math import isfinite
+from sys import float_info
 from typing import NamedTuple
 
 from unjam.drivers.from_file import FileReference, is_file_reference
@@ -174,7 +174,8 @@ def make_reward(text: str) -> Reward:
     """
     name, weights = split_parameters(text)
     for term, weight in weights.items():
-        if isinstance(weight, bool) or not isinstance(weight, int | float) or not isfinite(weight):
+        number = isinstance(weight, int | float) and not isinstance(weight, bool)
+        if not number or not abs(weight) <= float_info.max:  # NaN is not either
             raise wrong(f"reward {name}: {term}", weight, "a number")
     if is_file_reference(name):
         reward = _own_reward(name)

@@ -1,0 +1,161 @@
+"""Who made a controller: Ed25519 keys, the signature that a file carries, and whether it fits.
+
+What is signed is a text: a line that says what it is, one with the public key, and the SHA-256 and name of
+each other part, sorted by name, the manifest among them. Whoever imports this loads `cryptography`, so it is
+imported where there are keys or signatures alone.
+"""
+
+import hashlib
+import json
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+from unjam.errors import InputError, MissingPartError, wrong
+from unjam.files import check_folder, to_json, write_new
+
+try:
+    from cryptography.exceptions import InvalidSignature, UnsupportedAlgorithm
+    from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
+    from cryptography.hazmat.primitives.serialization import (
+        Encoding,
+        NoEncryption,
+        PrivateFormat,
+        PublicFormat,
+        load_pem_private_key,
+        load_pem_public_key,
+    )
+except ImportError:
+    needs = "cryptography is not installed; signatures need it"
+    raise MissingPartError(f"{needs}: pip install cryptography") from None
+
+PRIVATE, PUBLIC = ".key", ".pub"
+"""what the names of key files end in"""
+PRIVATE_KEY = "an Ed25519 private key in PEM without a password, as `unjam keys` writes it"
+PUBLIC_KEY = "an Ed25519 public key in PEM, as `unjam keys` writes it"
+ITS_OWNERS, EVERYBODYS = 0o600, 0o644
+"""who may read a file"""
+LARGEST_KEY = 10_000
+"""bytes of a key's file"""
+SIGNED = "unjam controller, signature 1"
+"""the first line of what is signed: nothing else that is signed with the same key can be taken for it"""
+
+
+@dataclass(frozen=True)
+class KeyPair:
+    """The files of a private and a public key, and which key it is."""
+
+    private: Path
+    public: Path
+    fingerprint: str
+
+
+def make_keys(name: Path) -> KeyPair:
+    """Write a new pair of keys beside each other: `NAME.key`, for its owner alone, and `NAME.pub`.
+
+    Raises:
+        InputError: there is a file of one of both names.
+        DiskError: they cannot be written; neither is there then.
+    """
+    if not name.name:
+        raise wrong("name", str(name), "what the names of two new files begin with")
+    private, public = (name.with_name(name.name + ending) for ending in (PRIVATE, PUBLIC))
+    check_folder(private)
+    for file in (private, public):
+        if os.path.lexists(file):
+            raise wrong("name", str(name), f"one of which there are no keys yet: {str(file)!r} exists")
+    key = Ed25519PrivateKey.generate()
+    known = key.public_key()
+    secret = key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption())
+    write_new(private, secret, ITS_OWNERS)
+    try:
+        shown = known.public_bytes(Encoding.PEM, PublicFormat.SubjectPublicKeyInfo)
+        write_new(public, shown, EVERYBODYS)
+    except BaseException:
+        private.unlink()
+        raise
+    return KeyPair(private, public, fingerprint_of(known))
+
+
+def read_private_key(file: Path) -> Ed25519PrivateKey:
+    """Return the key of a file; raise `InputError` where it is no Ed25519 private key in PEM."""
+    content = _key_bytes("key", file, PRIVATE_KEY)
+    try:
+        key = load_pem_private_key(content, None)
+    except TypeError:  # it wants a password
+        raise InputError(f"key: {str(file)!r} is encrypted; allowed: {PRIVATE_KEY}") from None
+    except (ValueError, UnsupportedAlgorithm):
+        raise wrong("key", str(file), PRIVATE_KEY) from None
+    if not isinstance(key, Ed25519PrivateKey):
+        raise wrong("key", str(file), PRIVATE_KEY)
+    return key
+
+
+def read_public_key(file: Path) -> str:
+    """Return the fingerprint of a file's key; raise `InputError` where it is no Ed25519 public key in PEM."""
+    content = _key_bytes("signer", file, PUBLIC_KEY)
+    try:
+        key = load_pem_public_key(content)
+    except (ValueError, UnsupportedAlgorithm):
+        raise wrong("signer", str(file), PUBLIC_KEY) from None
+    if not isinstance(key, Ed25519PublicKey):
+        raise wrong("signer", str(file), PUBLIC_KEY)
+    return fingerprint_of(key)
+
+
+def fingerprint_of(key: Ed25519PublicKey) -> str:
+    """Return the SHA-256 of a public key in DER: `openssl pkey -pubin -outform DER | sha256sum`."""
+    return hashlib.sha256(key.public_bytes(Encoding.DER, PublicFormat.SubjectPublicKeyInfo)).hexdigest()
+
+
+def signature_of(parts: dict[str, bytes], key: Ed25519PrivateKey) -> bytes:
+    """Return the part of an archive that says who signed its other `parts`; the same for the same of both."""
+    known = key.public_key()
+    raw = known.public_bytes_raw()
+    return _written(known, raw, key.sign(_message(parts, raw)))
+
+
+def signer_of(name: str, parts: dict[str, bytes], part: bytes) -> str:
+    """Return the fingerprint of the key that signed `parts`, as `part` says, of the controller `name`.
+
+    Raises:
+        InputError: it is not a signature, or it does not fit.
+    """
+    none_of_ours = InputError(f"controller {name}: its signature is not one that unjam writes")
+    try:
+        said = json.loads(part)
+        raw, signature = bytes.fromhex(said["public_key"]), bytes.fromhex(said["signature"])
+        key = Ed25519PublicKey.from_public_bytes(raw)
+    except (ValueError, LookupError, TypeError, RecursionError):
+        raise none_of_ours from None
+    if part != _written(key, raw, signature):  # something else stands there too
+        raise none_of_ours
+    try:
+        key.verify(signature, _message(parts, raw))
+    except InvalidSignature:
+        raise forged(name) from None
+    return fingerprint_of(key)
+
+
+def forged(name: str) -> InputError:
+    """Return the error for a controller that is whole, but not what was signed."""
+    return InputError(f"controller {name}: forged: it was changed after it was signed")
+
+
+def _message(parts: dict[str, bytes], raw: bytes) -> bytes:
+    hashes = [f"{hashlib.sha256(part).hexdigest()}  {name}" for name, part in sorted(parts.items())]
+    return "".join(f"{line}\n" for line in (SIGNED, f"public key {raw.hex()}", *hashes)).encode()
+
+
+def _written(key: Ed25519PublicKey, raw: bytes, signature: bytes) -> bytes:
+    said = {"fingerprint": fingerprint_of(key), "public_key": raw.hex(), "signature": signature.hex()}
+    return to_json({"algorithm": "Ed25519", **said}, indent=1).encode()
+
+
+def _key_bytes(field: str, file: Path, allowed: str) -> bytes:
+    """Return the content of a key's file; a pipe or a device is not waited for."""
+    if not os.path.exists(file):
+        raise InputError(f"{field}: {str(file)!r} does not exist; allowed: {allowed}")
+    if not os.path.isfile(file) or os.path.getsize(file) > LARGEST_KEY:
+        raise wrong(field, str(file), allowed)
+    return file.read_bytes()

@@ -1,0 +1,382 @@
+"""Is it found out what was changed after it was signed, and who signed."""
+
+import hashlib
+import io
+import json
+import os
+import stat
+import subprocess
+import sys
+import tempfile
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
+from cryptography.hazmat.primitives.asymmetric.rsa import generate_private_key
+from cryptography.hazmat.primitives.serialization import (
+    BestAvailableEncryption,
+    Encoding,
+    KeySerializationEncryption,
+    NoEncryption,
+    PrivateFormat,
+    PublicFormat,
+)
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.controller.test_file import written
+from tests.controller.test_verify import content_of, refused
+from unjam.controller import load_controller, shipped_file
+from unjam.controller.file import (
+    CERTIFICATE,
+    GRAPH,
+    MANIFEST,
+    PARTS,
+    SAMPLE,
+    SIGNATURE,
+    WEIGHTS,
+    add_certificate,
+    add_signature,
+    hash_of,
+    pack_parts,
+    read_controller,
+    unpack_parts,
+)
+from unjam.controller.signature import fingerprint_of, make_keys, read_private_key, read_public_key
+from unjam.controller.verify import verify_controller
+from unjam.errors import DiskError, InputError
+
+KEY, OTHER = (Ed25519PrivateKey.from_private_bytes(bytes([number] * 32)) for number in (1, 2))
+FINGERPRINT = fingerprint_of(KEY.public_key())
+FORGED = "controller it.unjam: forged: it was changed after it was signed"
+NONE = "controller it.unjam: its signature is not one that unjam writes"
+ALL = {GRAPH: b"drawn", CERTIFICATE: b"{}"}
+"""parts that nobody looks into before the signature"""
+
+
+def signed(folder: Path, key: Ed25519PrivateKey = KEY, parts: dict[str, bytes] | None = None) -> Path:
+    path = written(folder, content_of(parts=parts))
+    add_signature(path, read_controller(path), key)
+    return path
+
+
+def forge(parts: dict[str, bytes]) -> bytes:
+    """An archive of changed parts, with a manifest that names their hashes."""
+    manifest = json.loads(parts[MANIFEST])
+    manifest["sha256"] = {name: hash_of(part) for name, part in parts.items() if name in PARTS[1:-1]}
+    return pack_parts({**parts, MANIFEST: json.dumps(manifest, indent=1).encode()})
+
+
+def public_file(folder: Path, key: Ed25519PrivateKey = KEY) -> Path:
+    path = folder / "maker.pub"
+    path.write_bytes(key.public_key().public_bytes(Encoding.PEM, PublicFormat.SubjectPublicKeyInfo))
+    return path
+
+
+def found(path: Path, signer: Path | None = None) -> str:
+    return next(each.found for each in verify_controller(path, signer) if each.name == "signature")
+
+
+def test_who_signed_is_told(tmp_path: Path) -> None:
+    path = signed(tmp_path)
+    assert found(path).startswith(f"of the key {FINGERPRINT}: compare that with ")
+    assert found(path, public_file(tmp_path)) == f"of {str(tmp_path / 'maker.pub')!r}, the key {FINGERPRINT}"
+    assert read_controller(path).signed_by == FINGERPRINT
+
+
+def test_a_file_without_a_signature_is_read_as_before(tmp_path: Path) -> None:
+    path = written(tmp_path, content_of())
+    assert found(path) == "none: who made it is not said"
+    assert read_controller(path).signed_by is None
+    assert read_controller(shipped_file("ring-best")).signed_by is None
+
+
+def test_the_other_parts_stay_as_they_are_and_a_signature_is_reproducible(tmp_path: Path) -> None:
+    path = signed(tmp_path)
+    parts, content = unpack_parts(path), path.read_bytes()
+    assert parts.pop(SIGNATURE)
+    assert pack_parts(parts) == content_of()
+    add_signature(path, read_controller(path), KEY)
+    assert path.read_bytes() == content
+
+
+def test_another_key_takes_the_place_of_the_first(tmp_path: Path) -> None:
+    path = signed(tmp_path)
+    add_signature(path, read_controller(path), OTHER)
+    once = path.read_bytes()
+    assert read_controller(path).signed_by == fingerprint_of(OTHER.public_key())
+    assert signed(tmp_path, OTHER).read_bytes() == once
+
+
+def test_what_is_signed_is_what_the_documentation_says(tmp_path: Path) -> None:
+    parts = unpack_parts(signed(tmp_path, parts=ALL))
+    said = json.loads(parts.pop(SIGNATURE))
+    lines = ["unjam controller, signature 1", f"public key {said['public_key']}"]
+    lines += [f"{hashlib.sha256(parts[name]).hexdigest()}  {name}" for name in sorted(parts)]
+    key = Ed25519PublicKey.from_public_bytes(bytes.fromhex(said["public_key"]))
+    key.verify(bytes.fromhex(said["signature"]), "".join(f"{line}\n" for line in lines).encode())
+    assert len(lines) == 2 + 5
+    der = key.public_bytes(Encoding.DER, PublicFormat.SubjectPublicKeyInfo)
+    assert said["fingerprint"] == hashlib.sha256(der).hexdigest()
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    name=st.sampled_from([WEIGHTS, SAMPLE, GRAPH, CERTIFICATE]),
+    place=st.floats(0, 1, exclude_max=True),
+    bits=st.integers(1, 255),
+)
+def test_a_part_that_was_changed_with_its_hash_is_forged(name: str, place: float, bits: int) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        parts = unpack_parts(signed(Path(folder), parts=ALL))
+        changed = bytearray(parts[name])
+        changed[int(place * len(changed))] ^= bits
+        assert refused(written(Path(folder), forge({**parts, name: bytes(changed)}))) == FORGED
+        with pytest.raises(InputError) as caught:
+            load_controller(Path(folder, "it.unjam"))
+        assert str(caught.value) == FORGED
+
+
+@settings(max_examples=60, deadline=None)
+@given(place=st.floats(0, 1, exclude_max=True), bits=st.integers(1, 255))
+def test_no_byte_of_a_signed_file_can_be_another(place: float, bits: int) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        content = bytearray(signed(Path(folder)).read_bytes())
+        content[int(place * len(content))] ^= bits
+        assert refused(written(Path(folder), bytes(content)))
+
+
+@pytest.mark.parametrize("name", [SAMPLE, GRAPH, CERTIFICATE])
+def test_a_part_that_is_gone_is_missed(tmp_path: Path, name: str) -> None:
+    parts = unpack_parts(signed(tmp_path, parts=ALL))
+    del parts[name]
+    assert refused(written(tmp_path, forge(parts))) == FORGED
+
+
+def test_a_part_that_was_added_is_noticed(tmp_path: Path) -> None:
+    parts = unpack_parts(signed(tmp_path))
+    assert refused(written(tmp_path, forge({**parts, CERTIFICATE: b"{}"}))) == FORGED
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda manifest: manifest.update(scenario="merge"),
+        lambda manifest: manifest.update(metrics={"gain": 1e9}),
+        lambda manifest: manifest["driver"].update(hold=1),
+        lambda manifest: manifest.pop("unjam"),
+    ],
+)
+def test_a_manifest_that_was_changed_is_forged(tmp_path: Path, change: Callable[[Any], object]) -> None:
+    parts = unpack_parts(signed(tmp_path))
+    manifest = json.loads(parts[MANIFEST])
+    change(manifest)
+    assert (
+        refused(written(tmp_path, pack_parts({**parts, MANIFEST: json.dumps(manifest).encode()}))) == FORGED
+    )
+
+
+def test_a_wrong_hash_is_damage_in_a_signed_file_too(tmp_path: Path) -> None:
+    parts = unpack_parts(signed(tmp_path))
+    path = written(tmp_path, pack_parts({**parts, WEIGHTS: parts[WEIGHTS][:-1] + b"x"}))
+    assert (
+        refused(path)
+        == "controller it.unjam: damaged: weights.safetensors does not have the hash that it names"
+    )
+
+
+def test_what_lies_in_an_archive_beside_its_parts_is_forged(tmp_path: Path) -> None:
+    content = signed(tmp_path).read_bytes()
+    with_comment = io.BytesIO(content)
+    with zipfile.ZipFile(with_comment, "a") as archive:
+        archive.comment = b"drives better"
+    parts = unpack_parts(tmp_path / "it.unjam")
+    backwards = pack_parts(dict(reversed(parts.items())))
+    dated = content.replace(b"\x00\x00\x21\x00", b"\x00\x00\x22\x00")
+    for other in (with_comment.getvalue(), b"#!/bin/sh\n" + content, backwards, dated):
+        assert other != content
+        assert refused(written(tmp_path, other)) == FORGED
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda said: said.update(public_key=OTHER.public_key().public_bytes_raw().hex()), NONE),
+        (lambda said: said.update(fingerprint="0" * 64), NONE),
+        (lambda said: said.update(algorithm="none"), NONE),
+        (lambda said: said.update(public_key=said["public_key"].upper() + " "), NONE),
+        (lambda said: said.update(public_key="00"), NONE),
+        (lambda said: said.update(public_key=5), NONE),
+        (lambda said: said.update(more=1), NONE),
+        (lambda said: said.pop("signature"), NONE),
+        (lambda said: said.update(signature=""), FORGED),
+        (lambda said: said.update(signature="00" * 64), FORGED),
+    ],
+)
+def test_a_signature_of_another_form_is_refused(
+    tmp_path: Path, change: Callable[[Any], object], words: str
+) -> None:
+    parts = unpack_parts(signed(tmp_path))
+    said = json.loads(parts[SIGNATURE])
+    change(said)
+    assert (
+        refused(written(tmp_path, pack_parts({**parts, SIGNATURE: json.dumps(said, indent=1).encode()})))
+        == words
+    )
+
+
+@pytest.mark.parametrize(
+    "part", [b"", b"[]", b"null", b"\xff", b"{}", b"[" * 100_000, b'{"public_key": "\\ud800"}']
+)
+def test_nonsense_for_a_signature_is_refused(tmp_path: Path, part: bytes) -> None:
+    parts = unpack_parts(signed(tmp_path))
+    assert refused(written(tmp_path, pack_parts({**parts, SIGNATURE: part}))) == NONE
+
+
+def test_the_signature_of_another_controller_does_not_fit(tmp_path: Path) -> None:
+    other = unpack_parts(signed(tmp_path, parts=ALL))[SIGNATURE]
+    parts = unpack_parts(signed(tmp_path))
+    assert refused(written(tmp_path, pack_parts({**parts, SIGNATURE: other}))) == FORGED
+
+
+def test_with_a_signer_another_or_none_is_refused(tmp_path: Path) -> None:
+    signer = public_file(tmp_path)
+    other = fingerprint_of(OTHER.public_key())
+    for content, how in (
+        (signed(tmp_path, OTHER).read_bytes(), f"it is signed by another key, {other}"),
+        (content_of(), "it is not signed"),
+    ):
+        with pytest.raises(InputError) as caught:
+            verify_controller(written(tmp_path, content), signer)
+        assert str(caught.value) == f"controller: {how}; allowed: signed by {str(signer)!r}, {FINGERPRINT}"
+
+
+def test_a_signed_file_is_not_certified_again(tmp_path: Path) -> None:
+    path = signed(tmp_path)
+    before = path.read_bytes()
+    with pytest.raises(InputError, match="allowed: one that is not: certify it first, then sign it"):
+        add_certificate(path, read_controller(path), {})
+    assert path.read_bytes() == before
+
+
+def test_keys_are_read_as_they_were_made(tmp_path: Path) -> None:
+    made = make_keys(tmp_path / "maker")
+    assert (made.private, made.public) == (tmp_path / "maker.key", tmp_path / "maker.pub")
+    assert read_public_key(made.public) == made.fingerprint
+    assert fingerprint_of(read_private_key(made.private).public_key()) == made.fingerprint
+    assert make_keys(tmp_path / "other").fingerprint != made.fingerprint
+
+
+def test_a_private_key_is_its_owners_alone(tmp_path: Path) -> None:
+    before = os.umask(0)
+    try:
+        made = make_keys(tmp_path / "maker")
+    finally:
+        os.umask(before)
+    assert stat.S_IMODE(made.private.stat().st_mode) == 0o600
+    assert stat.S_IMODE(made.public.stat().st_mode) == 0o644
+
+
+@pytest.mark.parametrize("ending", [".key", ".pub"])
+def test_files_that_are_there_are_not_written_over(tmp_path: Path, ending: str) -> None:
+    (tmp_path / f"maker{ending}").symlink_to(tmp_path / "nowhere")
+    with pytest.raises(InputError, match="one of which there are no keys yet"):
+        make_keys(tmp_path / "maker")
+    assert [path.name for path in tmp_path.iterdir()] == [f"maker{ending}"]
+
+
+def test_where_the_second_file_cannot_be_written_there_is_no_first(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(descriptor: int) -> None:
+        if len(list(tmp_path.iterdir())) == 2:
+            raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(DiskError):
+        make_keys(tmp_path / "maker")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("name", ["", ".", "/", "nowhere/maker"])
+def test_a_name_of_no_files_is_refused(tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises((InputError, DiskError)) as caught:
+        make_keys(Path(name))
+    assert "\n" not in str(caught.value)
+    assert list(tmp_path.iterdir()) == []
+
+
+def pem(key: Any, encryption: KeySerializationEncryption | None = None) -> bytes:
+    return key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, encryption or NoEncryption())
+
+
+RSA = generate_private_key(65537, 2048)
+NO_PRIVATE_KEYS = {
+    "RSA": (pem(RSA), "is not allowed"),
+    "encrypted": (pem(KEY, BestAvailableEncryption(b"secret")), "is encrypted"),
+    "empty": (b"", "is not allowed"),
+    "a public key": (
+        KEY.public_key().public_bytes(Encoding.PEM, PublicFormat.SubjectPublicKeyInfo),
+        "is not allowed",
+    ),
+    "DER": (KEY.private_bytes(Encoding.DER, PrivateFormat.PKCS8, NoEncryption()), "is not allowed"),
+    "cut": (pem(KEY)[:60], "is not allowed"),
+    "torn": (pem(KEY).replace(b"MC4CAQ", b"MC4CAR"), "is not allowed"),
+    "too large": (pem(KEY) + b"\n" * 20_000, "is not allowed"),
+}
+
+
+@pytest.mark.parametrize("name", NO_PRIVATE_KEYS)
+def test_what_is_no_private_key_is_refused(tmp_path: Path, name: str) -> None:
+    content, words = NO_PRIVATE_KEYS[name]
+    (tmp_path / "maker.key").write_bytes(content)
+    with pytest.raises(InputError) as caught:
+        read_private_key(tmp_path / "maker.key")
+    path = str(tmp_path / "maker.key")
+    allowed = "an Ed25519 private key in PEM without a password, as `unjam keys` writes it"
+    assert str(caught.value) == f"key: {path!r} {words}; allowed: {allowed}"
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"",
+        pem(KEY),
+        RSA.public_key().public_bytes(Encoding.PEM, PublicFormat.SubjectPublicKeyInfo),
+        b"\xff" * 99,
+    ],
+)
+def test_what_is_no_public_key_is_refused(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / "maker.pub").write_bytes(content)
+    with pytest.raises(
+        InputError, match=r"^signer: .* is not allowed; allowed: an Ed25519 public key in PEM"
+    ):
+        read_public_key(tmp_path / "maker.pub")
+
+
+def test_a_pipe_a_folder_or_nothing_is_no_key(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    for name, words in (("pipe", "is not allowed"), (".", "is not allowed"), ("none", "does not exist")):
+        for read in (read_private_key, read_public_key):
+            with pytest.raises(InputError, match=words):
+                read(tmp_path / name)
+
+
+def test_only_signatures_need_what_checks_them(tmp_path: Path) -> None:
+    signed(tmp_path)
+    (tmp_path / "cryptography.py").write_text("raise ImportError('gone')")
+    program = "import sys\nfrom unjam.controller import load_controller\nload_controller(sys.argv[1])\n"
+    command = [sys.executable, "-c", program]
+    environment = {**os.environ, "PYTHONPATH": f"{tmp_path}:{os.environ.get('PYTHONPATH', '')}"}
+
+    def run(path: Path) -> "subprocess.CompletedProcess[str]":
+        words = [*command, str(path)]
+        return subprocess.run(words, capture_output=True, text=True, env=environment, check=False)
+
+    assert run(shipped_file("ring-best")).returncode == 0
+    ran = run(tmp_path / "it.unjam")
+    assert "MissingPartError: cryptography is not installed; signatures need it" in ran.stderr

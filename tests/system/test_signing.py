@@ -1,0 +1,144 @@
+"""Signing a controller, and telling who signed it, as a user does."""
+
+import json
+import re
+import stat
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.controller.test_signature import FORGED, NO_PRIVATE_KEYS, forge
+from tests.controller.test_verify import content_of
+from tests.system.conftest import ROOT, Run
+from tests.system.test_wrong_inputs import one_line
+from unjam.controller.file import WEIGHTS, pack_parts, unpack_parts
+
+DRIVE = ("drive", "ring", "--set", "horizon=5", "--set", "warmup=0", "-n", "1", "--no-report", "--driver")
+
+
+@pytest.fixture
+def maker(unjam: Run, tmp_path: Path) -> str:
+    """The fingerprint of `maker.pub`, beside whose private key lies a controller."""
+    (tmp_path / "it.unjam").write_bytes(content_of())
+    return json.loads(unjam("keys", "maker", "--json").stdout)["fingerprint"]
+
+
+def refused(unjam: Run, *words: str) -> str:
+    ran = unjam(*words)
+    assert (ran.returncode, ran.stdout) == (2, ""), ran.stderr
+    assert one_line(ran.stderr), ran.stderr
+    return ran.stderr
+
+
+def test_what_was_signed_is_verified_and_drives(unjam: Run, tmp_path: Path, maker: str) -> None:
+    plain = json.loads(unjam("verify", "it.unjam", "--json").stdout)
+    assert (plain["signed_by"], plain["signer"]) == (None, None)
+    ran = unjam("sign", "it.unjam", "--key", "maker.key")
+    assert (ran.stdout, ran.stderr) == (f"it.unjam: signed by {maker}\n", "")
+    told = json.loads(unjam("verify", "it.unjam", "--json").stdout)
+    assert (told["ok"], told["signed_by"], told["signer"]) == (True, maker, None)
+    told = json.loads(unjam("verify", "it.unjam", "--signer", "maker.pub", "--json").stdout)
+    assert (told["ok"], told["signed_by"], told["signer"]) == (True, maker, "maker.pub")
+    assert (
+        "ok signature: of 'maker.pub', the key "
+        in unjam("verify", "it.unjam", "--signer", "maker.pub").stdout
+    )
+    assert unjam(*DRIVE, "it.unjam").returncode == 0
+
+
+def test_the_documented_check_without_unjam_agrees(unjam: Run, tmp_path: Path, maker: str) -> None:
+    assert unjam("sign", "it.unjam", "--key", "maker.key").returncode == 0
+    (tmp_path / "it.unjam").rename(tmp_path / "ring.unjam")
+    page = (ROOT / "docs/controller.md").read_text()
+    (program,) = re.findall(r"```python\n((?:(?!```).)*maker\.verify.*?)```", page, re.DOTALL)
+
+    def run() -> "subprocess.CompletedProcess[str]":
+        command = [sys.executable, "-c", program]
+        return subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+
+    assert run().returncode == 0
+    assert unjam("keys", "other").returncode == 0
+    (tmp_path / "other.pub").replace(tmp_path / "maker.pub")
+    assert "InvalidSignature" in run().stderr
+
+
+def test_a_signature_that_is_gone_is_missed_by_who_wants_one(unjam: Run, maker: str) -> None:
+    assert "it is not signed" in refused(unjam, "verify", "it.unjam", "--signer", "maker.pub")
+    assert unjam("verify", "it.unjam").returncode == 0
+
+
+@pytest.mark.parametrize("verb", ["drive", "verify", "certify", "export", "sign"])
+def test_no_reader_takes_a_forged_controller(verb: str, unjam: Run, tmp_path: Path, maker: str) -> None:
+    assert unjam("sign", "it.unjam", "--key", "maker.key").returncode == 0
+    path = tmp_path / "it.unjam"
+    parts = unpack_parts(path)
+    changed = {**parts, WEIGHTS: parts[WEIGHTS][:-1] + b"?"}
+    words = {
+        "drive": (*DRIVE, "it.unjam"),
+        "verify": ("verify", "it.unjam"),
+        "certify": ("certify", "it.unjam"),
+        "export": ("export", "it.unjam", "--to", "other.unjam"),
+        "sign": ("sign", "it.unjam", "--key", "maker.key", "--replace"),
+    }[verb]
+    for content, why in ((forge(changed), FORGED), (pack_parts(changed), "controller it.unjam: damaged: ")):
+        path.write_bytes(content)
+        assert why in refused(unjam, *words)
+        assert path.read_bytes() == content
+    assert sorted(each.name for each in tmp_path.iterdir()) == ["it.unjam", "maker.key", "maker.pub"]
+
+
+def test_a_signed_file_is_not_certified_again(unjam: Run, tmp_path: Path, maker: str) -> None:
+    assert unjam("sign", "it.unjam", "--key", "maker.key").returncode == 0
+    before = (tmp_path / "it.unjam").read_bytes()
+    words = f"a file that is signed (by {maker}) is not allowed; allowed: one that is not: certify it first"
+    assert words in refused(unjam, "certify", "it.unjam")
+    assert (tmp_path / "it.unjam").read_bytes() == before
+    assert not (tmp_path / "it.html").exists()
+
+
+def test_what_another_has_signed_is_signed_again_on_demand_alone(unjam: Run, maker: str) -> None:
+    other = json.loads(unjam("keys", "other", "--json").stdout)["fingerprint"]
+    assert unjam("sign", "it.unjam", "--key", "maker.key").returncode == 0
+    assert unjam("sign", "it.unjam", "--key", "maker.key").returncode == 0
+    assert f"(it is signed by {maker}); or --replace" in refused(
+        unjam, "sign", "it.unjam", "--key", "other.key"
+    )
+    ran = unjam("sign", "it.unjam", "--key", "other.key", "--replace", "--json")
+    assert json.loads(ran.stdout) == {"file": "it.unjam", "fingerprint": other, "replaced": maker}
+    words = f"it is signed by another key, {other}; allowed: signed by 'maker.pub', {maker}"
+    assert words in refused(unjam, "verify", "it.unjam", "--signer", "maker.pub")
+
+
+def test_keys_are_made_once(unjam: Run, tmp_path: Path, maker: str) -> None:
+    before = (tmp_path / "maker.key").read_bytes()
+    assert "name: 'maker' is not allowed; allowed: one of which there are no " in refused(
+        unjam, "keys", "maker"
+    )
+    assert (tmp_path / "maker.key").read_bytes() == before
+    assert stat.S_IMODE((tmp_path / "maker.key").stat().st_mode) == 0o600
+    assert unjam("keys", "nowhere/maker").returncode == 74
+
+
+@pytest.mark.parametrize("name", ["RSA", "encrypted", "a public key"])
+@pytest.mark.usefixtures("maker")
+def test_other_keys_are_refused(name: str, unjam: Run, tmp_path: Path) -> None:
+    content, words = NO_PRIVATE_KEYS[name]
+    (tmp_path / "other.key").write_bytes(content)
+    before = (tmp_path / "it.unjam").read_bytes()
+    assert f"key: 'other.key' {words}; allowed: an Ed25519" in refused(
+        unjam, "sign", "it.unjam", "--key", "other.key"
+    )
+    assert (tmp_path / "it.unjam").read_bytes() == before
+    refused(unjam, "verify", "it.unjam", "--signer", "other.key")
+    refused(unjam, "sign", ".", "--key", "maker.key")
+    refused(unjam, "sign", "maker.pub", "--key", "maker.key")
+
+
+@pytest.mark.usefixtures("maker")
+def test_a_key_that_others_may_use_is_told_of(unjam: Run, tmp_path: Path) -> None:
+    (tmp_path / "maker.key").chmod(0o640)
+    ran = unjam("sign", "it.unjam", "--key", "maker.key")
+    assert ran.returncode == 0
+    assert ran.stderr == "note: others on this machine may use maker.key: chmod 600\n"
