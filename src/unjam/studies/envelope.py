@@ -243,6 +243,7 @@ ENVELOPE = Study(
     runs=lambda seeds: [],
     write=_write,
     minutes=30.0,
+    goes_on=True,
     tables={
         "worst": worst_table,
         **{part: partial(domain_table, part) for part in ("rings", "figure-eights")},

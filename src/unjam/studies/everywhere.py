@@ -22,7 +22,7 @@ from unjam.measures.statistics import signed
 from unjam.measures.table import PEOPLE
 from unjam.reports.figures import INK, new_figure
 from unjam.scenarios.scenario import Scenario
-from unjam.studies.study import Study, StudyFolder, about_study
+from unjam.studies.study import Study, StudyFolder
 from unjam.training.family import FAMILY, GROUPS
 from unjam.training.seeds import held_out_seeds, tuning_seeds
 from unjam.worlds.workers import EpisodeTask, Workers
@@ -68,7 +68,6 @@ def _driven(
 
 
 def _write(studies: StudyFolder, seeds: int, folder: Path, workers: int) -> None:
-    about_study(folder)
     made = [(number, name, road, road.make()) for number, (name, road) in enumerate(FAMILY.items())]
     with Workers(workers) as pool:
         for number, name, road, scenario in sorted(made, key=lambda each: not each[3].closed):  # quick first
@@ -149,5 +148,6 @@ EVERYWHERE_STUDY = Study(
     runs=lambda seeds: [],
     write=_write,
     minutes=60.0,
+    goes_on=True,
     tables={"seen": partial(table, ("seen",)), "held out": partial(table, HELD_OUT)},
 )

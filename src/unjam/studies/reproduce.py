@@ -14,7 +14,15 @@ from unjam.manifest import manifest
 from unjam.reports.results import EVALUATION_FILE
 from unjam.scenarios import SCENARIOS
 from unjam.studies import STUDIES, TOGETHER
-from unjam.studies.study import REFERENCES, ROADS, OnProgress, PlannedRun, Study, StudyFolder
+from unjam.studies.study import (
+    REFERENCES,
+    ROADS,
+    OnProgress,
+    PlannedRun,
+    Study,
+    StudyFolder,
+    about_study,
+)
 from unjam.training.config import load_config
 from unjam.training.evaluate import evaluate, raise_failures, save_evaluation
 from unjam.training.executors import Executor, run_all, training_command
@@ -104,8 +112,9 @@ def reproduce(
         study, target = STUDIES[name], studies.folder / name
         on_line(f"writing {name}: {study.title}")
         make_folder(target)
+        begun = about_study(target) if study.goes_on else manifest()
         study.write(studies, plan.seeds, target, workers)
-        about = {"study": name, "title": study.title, "seeds": plan.seeds, **manifest()}
+        about = {"study": name, "title": study.title, "seeds": plan.seeds, **begun}
         about["trainings"] = [_trained_by(run, studies) for run in study.runs(plan.seeds)]
         write_whole(target / "manifest.json", to_json(about, indent=1))
     return [studies.folder / name for name in plan.names]

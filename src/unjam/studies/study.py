@@ -259,5 +259,7 @@ class Study:
     """where drivers that do not learn are driven beside them"""
     minutes: float = 0.0
     """what it takes beside trainings and drives, on two cores"""
+    goes_on: bool = False
+    """whether `write` keeps what it finds of an earlier call; its manifest then says when it went on"""
     tables: Mapping[str, Callable[[Path], pd.DataFrame]] = field(default_factory=dict)
     """of its page, by name, made of what it wrote into a folder"""
