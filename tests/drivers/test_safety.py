@@ -1,5 +1,6 @@
 """Does the safety filter keep what docs/safety.md proves, whatever leaders and drivers do?"""
 
+from math import inf
 from typing import Any
 
 import numpy as np
@@ -156,7 +157,7 @@ def test_without_the_filter_the_same_cars_crash() -> None:
     assert (pursuit.ahead.gap < 0).any()
 
 
-@given(SPEEDS, SPEEDS, GAPS, st.floats(-3.0, 3.0), STEPS)
+@given(SPEEDS, SPEEDS, GAPS | st.just(inf), st.floats(-3.0, 3.0), STEPS)
 def test_one_car_in_plain_numbers_is_told_what_rows_and_tensors_are(
     speed: float, leader: float, gap: float, wanted: float, step: float
 ) -> None:
@@ -170,6 +171,13 @@ def test_one_car_in_plain_numbers_is_told_what_rows_and_tensors_are(
     )
     assert rows[0] == pytest.approx(told, abs=1e-9)
     assert tensors[0].item() == pytest.approx(told, abs=1e-9)
+
+
+@given(SPEEDS, SPEEDS, st.floats(-3.0, 3.0))
+def test_with_nobody_ahead_a_car_does_what_it_wants(speed: float, nobody: float, wanted: float) -> None:
+    for actuator, underway in ((None, None), (Actuator(lag=0.3), Underway(0.0))):
+        free = SafetyFilter().keep(wanted, Ahead(speed, nobody, inf), 0.1, actuator, underway)
+        assert free == wanted
 
 
 @given(SPEEDS, SPEEDS, GAPS, st.floats(-3.0, 3.0), st.floats(0.0, 2.0), st.floats(0.0, 2.0))

@@ -79,7 +79,11 @@ class Ahead(NamedTuple):
     leader_speed: Array
     """[m/s]"""
     gap: Array
-    """own front bumper to the leader's rear bumper [m]"""
+    """own front bumper to the leader's rear bumper; infinite where nobody is ahead [m]"""
+
+
+FAR = 1e6
+"""so far ahead nobody matters; formulas that count steps need a number that is finite [m]"""
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -145,7 +149,7 @@ class SafetyFilter:
     ) -> Array:
         """Return the highest acceleration that may be commanded; where none may, the hardest braking."""
         leader = at_least(ahead.leader_speed - self.speed_error, 0.0)
-        room = ahead.gap - (self.gap_error + self.standstill_gap)
+        room = at_most(ahead.gap, FAR) - (self.gap_error + self.standstill_gap)
         speed, arrives = ahead.speed, 0
         if actuator is not None and underway is not None:
             standing = actuator.equivalent_speed(0.0 * speed, Underway(0.0 * speed), self.braking, step)
