@@ -35,7 +35,8 @@ def commands(text: str) -> list[list[str]]:
     """The words of every command in the text's consoles, without what is said about it."""
     consoles = re.findall(r"```console\n(.*?)```", text, re.DOTALL)
     lines = [line for console in consoles for line in console.splitlines() if line.startswith("$ ")]
-    return [shlex.split(line.removeprefix("$ "), comments=True) for line in lines]
+    alone = [command for line in lines for command in line.removeprefix("$ ").split(" && ")]
+    return [shlex.split(command, comments=True) for command in alone]
 
 
 COMMANDS = commands(README)

@@ -30,7 +30,7 @@ app = typer.Typer(
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     rich_markup_mode="markdown",
-    epilog="Exit codes: 0 done, 2 wrong input, 3 missing part, 74 disk, 129/130/143 stopped.",
+    epilog="Exit codes: 0 done, 1 failed, 2 wrong input, 3 missing part, 74 disk, 129/130/143 stopped.",
 )
 
 
