@@ -187,10 +187,11 @@ def test_the_advantage_at_the_cut_goes_on_with_the_value_of_where_it_ended(share
     assert found[3] == pytest.approx(4.0 - values[3], abs=1e-4)
 
 
-def test_rollouts_begin_in_the_newest_episodes_and_are_as_many_as_asked(
-    shared: Simulation,
+@pytest.mark.parametrize(("begin", "episodes_begun"), [("newest", {2, 3}), ("all", {0, 1, 2, 3})])
+def test_rollouts_begin_in_the_episodes_asked_for_and_are_as_many(
+    shared: Simulation, begin: Any, episodes_begun: set[int]
 ) -> None:
-    imagination = RowImagination(replace(VIRTUAL, virtual_ratio=3.0), TASK, POLICY, 0)
+    imagination = RowImagination(replace(VIRTUAL, virtual_ratio=3.0, begin=begin), TASK, POLICY, 0)
     network = random_network(INPUTS, scale=0.1)
     driver = ResidualDriver(PISaturation(), network, 1.0, POLICY.observe, 10)
     for iteration in (1, 2):
@@ -201,7 +202,7 @@ def test_rollouts_begin_in_the_newest_episodes_and_are_as_many_as_asked(
     rollouts = cast(Rollouts, imagination.rollouts(network, 2))
     assert imagination.k_star == 30
     assert rollouts.rewards.numel() == 3 * 240 / 10
-    assert set(rollouts.start[:, 0]) == {2, 3}
+    assert set(rollouts.start[:, 0]) == episodes_begun
 
 
 def test_a_model_that_is_not_trusted_adds_nothing(shared: Simulation) -> None:

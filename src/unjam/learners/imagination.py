@@ -89,8 +89,9 @@ class Imagination(Generic[Model]):
     ) -> Experience | None:
         """Return what the policy `network` does in the virtual environment; None where it is not trusted.
 
-        Rollouts begin at random decisions of the newest actual episodes at which a residual was due. In all
-        `parts` of an iteration together they make `virtual_ratio` times as many decisions as those have.
+        Rollouts begin at random decisions at which a residual was due, `begin` says of which episodes. In all
+        `parts` of an iteration together they make `virtual_ratio` times as many decisions as the newest
+        actual episodes have.
         """
         raise NotImplementedError
 
@@ -123,11 +124,13 @@ class Imagination(Generic[Model]):
     def _starts(self, parts: int, seed: tuple[int, ...], driven: int) -> NDArray[np.int64]:
         """Return where a part of an iteration's rollouts of so many decisions begin, as `draw_starts`."""
         count = ceil(self.settings.virtual_ratio * self._actual / parts / driven)
-        return draw_starts(self.data, count, 1, seed, self._first)
+        since = self._first if self.settings.begin == "newest" else 0
+        return draw_starts(self.data, count, 1, seed, since)
 
     def _compare(self, earned: Floats, starts: NDArray[np.int64], driven: int, crashed: float) -> None:
         """Note what the policy that drove the actual episodes earned here and there, and its crashes."""
-        gap = return_gap(earned, starts, self.data, driven)
+        newest = [self.data.recordings[place].episode >= self._first for place in starts[:, 0]]
+        gap = return_gap(earned[newest], starts[newest], self.data, driven)
         self.facts |= {
             "return_virtual": gap and gap.virtual,
             "return_actual": gap and gap.actual,
