@@ -215,7 +215,7 @@ def contact_table(part: str, folder: Path) -> pd.DataFrame:
                 "controller": driver,
                 "episodes": len(episodes),
                 "decisions": f"{sum(row['steps'] for row in episodes):,}",
-                "in contact": sum(row["collisions"] for row in episodes),
+                "in contact": int(sum(row["collisions"] for row in episodes)),
                 "smallest headway [s]": f"{_closest(episodes):.2f}",
                 "hardest braking [m/s²]": f"{max(row['cav_max_braking'] for row in episodes):.1f}",
             }
