@@ -187,7 +187,9 @@ def test_the_advantage_at_the_cut_goes_on_with_the_value_of_where_it_ended(share
     assert found[3] == pytest.approx(4.0 - values[3], abs=1e-4)
 
 
-@pytest.mark.parametrize(("begin", "episodes_begun"), [("newest", {2, 3}), ("all", {0, 1, 2, 3})])
+@pytest.mark.parametrize(
+    ("begin", "episodes_begun"), [("newest", {2, 3}), ("all", {0, 1, 2, 3}), ("first", {0, 1, 2, 3})]
+)
 def test_rollouts_begin_in_the_episodes_asked_for_and_are_as_many(
     shared: Simulation, begin: Any, episodes_begun: set[int]
 ) -> None:
@@ -203,6 +205,7 @@ def test_rollouts_begin_in_the_episodes_asked_for_and_are_as_many(
     assert imagination.k_star == 30
     assert rollouts.rewards.numel() == 3 * 240 / 10
     assert set(rollouts.start[:, 0]) == episodes_begun
+    assert (set(rollouts.start[:, 1]) == {0}) == (begin == "first")
 
 
 def test_a_model_that_is_not_trusted_adds_nothing(shared: Simulation) -> None:

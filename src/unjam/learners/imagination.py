@@ -124,8 +124,9 @@ class Imagination(Generic[Model]):
     def _starts(self, parts: int, seed: tuple[int, ...], driven: int) -> NDArray[np.int64]:
         """Return where a part of an iteration's rollouts of so many decisions begin, as `draw_starts`."""
         count = ceil(self.settings.virtual_ratio * self._actual / parts / driven)
-        since = self._first if self.settings.begin == "newest" else 0
-        return draw_starts(self.data, count, 1, seed, since)
+        begin = self.settings.begin
+        since = self._first if begin == "newest" else 0
+        return draw_starts(self.data, count, 1, seed, since, at_first=begin == "first")
 
     def _compare(self, earned: Floats, starts: NDArray[np.int64], driven: int, crashed: float) -> None:
         """Note what the policy that drove the actual episodes earned here and there, and its crashes."""

@@ -84,14 +84,16 @@ class Rollouts:
 
 
 def draw_starts(
-    data: ActualData, rows: int, ahead: int, seed: Sequence[int], since: int = 0
+    data: ActualData, rows: int, ahead: int, seed: Sequence[int], since: int = 0, *, at_first: bool = False
 ) -> NDArray[np.int64]:
     """Return random decisions at which a residual was due, rows (recording, decision), shape (rows, 2).
 
-    At least `ahead` recorded decisions follow each, and its episode is number `since` or a later one; shape
-    (0, 2) where there are none such.
+    At least `ahead` recorded decisions follow each, and its episode is number `since` or a later one; with
+    `at_first` they are the first of a recording. Shape (0, 2) where there are none such.
     """
     choices = data.choices(ahead, since)
+    if at_first:
+        choices = choices[choices[:, 1] == 0]
     if len(choices) == 0:
         return choices
     return choices[np.random.default_rng(list(seed)).integers(len(choices), size=rows)]

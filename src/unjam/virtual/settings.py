@@ -54,9 +54,9 @@ class VirtualSettings:
     """estimator of the model error eps_m that sets the rollout length, see unjam.virtual.fitting"""
     virtual_ratio: NotNegative = 5.0
     """virtual decisions for each actual one that the agent learns from; 0: model-free"""
-    begin: Literal["newest", "all"] = "newest"
-    """of which actual episodes the decisions are at which rollouts begin: those of the newest policy, or all
-    that are kept, whose roads are more various"""
+    begin: Literal["newest", "all", "first"] = "newest"
+    """at which actual decisions rollouts begin: those of the newest policy's episodes; of all episodes that
+    are kept, whose roads are more various; or the first ones of all, so that what is imagined are episodes"""
     update: Literal["union", "sequential"] = "union"
     """how the agent learns from both: from all of them at once; or first from the actual ones, then `updates`
     times from virtual ones alone, each time with those of the newest policy, as the released code"""
