@@ -5,6 +5,7 @@ from unjam.studies.drivable import DRIVABLE_EIGHT, DRIVABLE_STUDY
 from unjam.studies.envelope import ENVELOPE
 from unjam.studies.everywhere import EVERYWHERE_STUDY
 from unjam.studies.figure_6 import FIGURE_6
+from unjam.studies.imagined import imagined
 from unjam.studies.robustness import FIGURE_10, ROBUSTNESS
 from unjam.studies.study import PAPERS_ROADS, Study
 from unjam.studies.theory import FIGURE_8, THEORY
@@ -46,6 +47,7 @@ STUDIES: dict[str, Study] = {
         ("best", "ours-with-model"),
         "ring-jammed",
     ),
+    "imagined": imagined("ring"),
     "robustness": ROBUSTNESS,
     "drivable": DRIVABLE_STUDY,
     "drivable-eight": DRIVABLE_EIGHT,

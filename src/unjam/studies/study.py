@@ -129,6 +129,15 @@ class Variant:
     """None: those of the preset"""
 
 
+SMALL = {"trpo.batch_steps": 12_000}
+IMAGINED = {
+    **SMALL,
+    "virtual.virtual_ratio": 7.0,
+    "virtual.model": "road",
+    "virtual.begin": "first",
+    "virtual.k_max": 3000,
+}
+"""iterations as large as those of `best` on the ring, of which an eighth is actual"""
 ALONE = {"expert": "none", "virtual.virtual_ratio": 0.0}
 VARIANTS: dict[str, Variant] = {
     "trpo": Variant("TRPO", "paper", ALONE),
@@ -147,6 +156,8 @@ VARIANTS: dict[str, Variant] = {
     "ours-with-model": Variant("ours with model", "quick", {"virtual.virtual_ratio": 5.0}),
     "ours-on-pi": Variant("ours on PI", "quick", {"expert": "pi"}),
     "best": Variant("ours, all its steps", "best", {}, None),
+    "best-few": Variant("ours, few steps", "best", SMALL, 756_000),
+    "best-imagined": Variant("ours, few steps and whole roads imagined", "best", IMAGINED, 756_000),
 }
 """the paper's methods with the paper's settings, and what we make of them"""
 

@@ -1,0 +1,60 @@
+"""What a virtual environment of whole roads saves: the same return from how many actual steps.
+
+The best method of a road, with the model and without it: on as few actual steps, and on all that it takes.
+"""
+
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from unjam.measures.statistics import over_trainings
+from unjam.measures.table import cell_of
+from unjam.studies.comparison import comparison_of
+from unjam.studies.study import VARIANTS, PlannedRun, Study, read_part
+from unjam.worlds.record import Floats
+
+MODELLED, FEW, MANY = COMPARED = ("best-imagined", "best-few", "best")
+LOOKS = (190_000, 380_000, 750_000, 1_500_000, 3_000_000, 6_000_000)
+"""actual steps after which trainings are looked at"""
+FEWER = 3
+"""how many times the actual steps the method may take without the model"""
+
+
+def efficiency(road: str, folder: Path) -> pd.DataFrame:
+    """Return what trainings earn on the validation seeds after so many actual steps, and what more it is."""
+    curves = read_part(folder, "curves")[road]
+    seen = {name: partial(_returns, curves[name], _first_look(road, name)) for name in COMPARED}
+    rows = [_row(VARIANTS[name].label, [seen[name](at) for at in LOOKS]) for name in COMPARED]
+    few = [seen[MODELLED](at) - seen[FEW](at) for at in LOOKS]
+    many = [seen[MODELLED](at) - seen[MANY](FEWER * at) for at in LOOKS]
+    rows.append(_row("with the model beyond as few steps without it", few, "+"))
+    rows.append(_row(f"with the model beyond {FEWER} times the steps without it", many, "+"))
+    return pd.DataFrame(rows)
+
+
+def _first_look(road: str, variant: str) -> int:
+    """Return after how many steps a training is validated for the first time."""
+    config = PlannedRun(road, variant, 0).config
+    return config.learner.batch_steps * (config.evaluation.every or 1)
+
+
+def _returns(curve: dict[str, list[float]], first: int, steps: int) -> Floats:
+    """Return what each training earns after so many steps; NaN before it is validated and after its end."""
+    trainings = curve["return_validation"]
+    if steps < first:
+        return np.full(len(trainings), np.nan)
+    return np.array([np.interp(steps, curve["steps"], each, np.nan, np.nan) for each in trainings])
+
+
+def _row(label: str, columns: list[Floats], sign: str = "") -> dict[str, str]:
+    cells = [str(cell_of(over_trainings(values.tolist()), 0, sign=sign)) for values in columns]
+    return {"": label, **dict(zip((f"{steps:,}" for steps in LOOKS), cells, strict=True))}
+
+
+def imagined(road: str) -> Study:
+    """Return the study of a road."""
+    compared = comparison_of(f"what a model of the whole road saves, on the {road}", COMPARED, road)
+    return replace(compared, tables={**compared.tables, "efficiency": partial(efficiency, road)})

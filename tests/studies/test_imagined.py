@@ -1,0 +1,24 @@
+"""Does the table say who needs fewer actual steps?"""
+
+import json
+from pathlib import Path
+
+from unjam.studies.imagined import COMPARED, imagined
+
+
+def test_returns_stand_beside_those_of_as_few_steps_and_of_three_times_as_many(tmp_path: Path) -> None:
+    steps, ends = [12_000.0, 756_000.0], [[2000.0], [2000.0], [2000.0]]
+    few = {"steps": steps, "return_validation": [[*end, 2063.0] for end in ends]}
+    modelled = {"steps": steps, "return_validation": [[*end, 2126.0] for end in ends]}
+    many = {
+        "steps": [96_000.0, 6_000_000.0],
+        "return_validation": [[1000.0, value] for value in (2e3, 2e3, 2e3)],
+    }
+    curves = dict(zip(COMPARED, (modelled, few, many), strict=True))
+    (tmp_path / "curves.json").write_text(json.dumps({"ring": curves}))
+    table = imagined("ring").tables["efficiency"](tmp_path).set_index("")
+    assert table.loc["ours, few steps and whole roads imagined", "750,000"] == "2125"
+    assert table.loc["ours, few steps", "1,500,000"] == "–"
+    assert table.loc["ours, all its steps", "380,000"] == "–"  # nobody had looked
+    assert table.loc["with the model beyond as few steps without it", "380,000"] == "+31"
+    assert table.loc["with the model beyond 3 times the steps without it", "750,000"].startswith("+7")
