@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from tests.training.test_run import STEPS, learn_with, small_config
 from unjam.errors import InputError
 from unjam.files import to_json
-from unjam.reports.model import waves
+from unjam.reports.model import wave_rows, waves
 from unjam.reports.results import MODEL_FILE, read_progress
 from unjam.training import model_facts
 from unjam.training.config import RunConfig
@@ -147,8 +147,13 @@ def test_a_run_that_imagines_whole_roads_shows_waves(tmp_path: Path) -> None:
     assert len(found["cavs"]) == 1
     titles = [axes.get_title(loc="left") or axes.get_title() for axes in waves(found).axes[:3]]
     assert titles == ["recorded", "imagined", "nothing changes"]
-    with pytest.raises(InputError, match="imagines whole roads"):
-        newest_model_facts(tmp_path / "run", config)
+    assert newest_model_facts(tmp_path / "run", config) == found
+    rows = dict(wave_rows(found))
+    speeds = np.array(found["waves"]["imagined"]["speeds"])
+    speeds = speeds[len(speeds) // 2 :]
+    assert rows["imagined"] == [
+        f"{n:.2f}" for n in (speeds.mean(), speeds.std(1).mean(), speeds.min(1).mean())
+    ]
 
 
 def test_a_run_that_imagines_whole_roads_goes_on_as_if_it_had_not_been_stopped(tmp_path: Path) -> None:

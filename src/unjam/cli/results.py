@@ -81,7 +81,8 @@ def model(
     """Show where the virtual environment of a run agrees with the actual one, and where it does not.
 
     All errors are root mean squares on episodes that no network learned from, beside those of the base alone
-    and beside how much there was to predict. The pictures are in the run's report, which is written anew.
+    and beside how much there was to predict. Of whole roads it shows what waves they have, beside an actual
+    one from whose start they were imagined. The pictures are in the run's report, which is written anew.
 
     Examples:
 
@@ -92,8 +93,8 @@ def model(
     from matplotlib import get_cachedir
 
     go_on_limited(f"model: {run}", run, Path(get_cachedir()))
+    from unjam.reports import model as of_model
     from unjam.reports.html import write_report
-    from unjam.reports.model import bound_of, cells, error_rows, headings, trust_of, verdict_of
     from unjam.reports.results import read_progress
     from unjam.training.folder import read_config
     from unjam.training.model_facts import newest_model_facts
@@ -106,11 +107,18 @@ def model(
     if json:
         print_json({"run": str(run), "report": str(report) if report else None, **facts})
         return
-    table = new_table(("root mean square", "unit"), headings(facts))
-    for row in error_rows(facts):
-        table.add_row(row["number"], row["unit"], *cells(row))
+    lines = [of_model.trust_of(read_progress(run))]
+    if "waves" in facts:
+        table = new_table(("the road's second half",), of_model.WAVE_HEADINGS)
+        for label, row in of_model.wave_rows(facts):
+            table.add_row(label, *row)
+    else:
+        table = new_table(("root mean square", "unit"), of_model.headings(facts))
+        for row in of_model.error_rows(facts):
+            table.add_row(row["number"], row["unit"], *of_model.cells(row))
+        lines = [of_model.verdict_of(facts), *lines, of_model.bound_of(facts)]
     console.print(table)
-    for line in (verdict_of(facts), trust_of(read_progress(run)), bound_of(facts)):
+    for line in lines:
         console.print(line)
     aside.print(f"report: {report}" if report else f"no report before the training has ended: --resume {run}")
 

@@ -31,6 +31,7 @@ BASES = {
     "none": ("nothing changes", "nothing known but that nothing changes"),
 }
 """what the base alone is called, and what it is"""
+WAVE_HEADINGS = ("mean speed [m/s]", "std across vehicles [m/s]", "slowest vehicle [m/s]")
 NOTHING = 1e-5
 """errors below this are those of single precision [m/s, m, reward]"""
 
@@ -65,6 +66,21 @@ def headings(facts: dict[str, Any]) -> list[str]:
         for after in (facts["decision_step"], facts["replay"]["seconds"][-1])
         for name in names
     ]
+
+
+def wave_rows(facts: dict[str, Any]) -> list[tuple[str, list[str]]]:
+    """Return what an actual road and those imagined from its start on are like: label and cells of each.
+
+    The cells are those of `WAVE_HEADINGS`: means over the second half, when what is wrong has had time to
+    grow.
+    """
+    found: list[tuple[str, list[str]]] = []
+    for label, road in facts["waves"].items():
+        speeds = np.array(road["speeds"], np.float64)
+        later = speeds[len(speeds) // 2 :]
+        numbers = (later.mean(), later.std(1).mean(), later.min(1).mean())
+        found.append((BASES[facts["base"]][0] if label == "base" else label, [f"{n:.2f}" for n in numbers]))
+    return found
 
 
 def cells(row: dict[str, Any]) -> list[str]:

@@ -56,10 +56,6 @@ def newest_model_facts(folder: Path, config: RunConfig) -> dict[str, Any]:
         raise InputError(
             f"run: {str(folder)!r} has no virtual environment: its virtual.virtual_ratio is 0; allowed: > 0"
         )
-    if config.virtual.model == "road":
-        raise InputError(
-            f"run: {str(folder)!r} imagines whole roads, whose waves its report shows; allowed: one of rows"
-        )
     kept, progress = read_model(folder), read_progress(folder)
     if kept is None or not progress or kept.get("iteration") != progress[-1]["iteration"]:
         write_model_facts(folder, config)
@@ -92,7 +88,7 @@ def measure_model(folder: Path, config: RunConfig) -> dict[str, Any]:
     if settings.model == "road":
         roads = RoadImagination(settings, task, config.policy, config.seed)
         roads.restore(state[roads.name], under(f"{roads.name}/", tensors))
-        return _rounded(_waves(roads))
+        return _rounded({"iteration": state["iteration"], **_waves(roads)})
     imagination = RowImagination(settings, task, config.policy, config.seed)
     imagination.restore(state[imagination.name], under(f"{imagination.name}/", tensors))
     scenario = imagination.scenario
