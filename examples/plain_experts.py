@@ -24,6 +24,8 @@ class State(NamedTuple):
     to_merge: float = math.nan
     lane_speeds: Sequence[float] = ()
     road_speeds: Sequence[float] = ()
+    beside_gaps: Sequence[float] = ()
+    beside_speeds: Sequence[float] = ()
 
 
 def clip(value: float, low: float, high: float) -> float:

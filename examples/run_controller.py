@@ -62,6 +62,10 @@ class Driver:
             "to_merge": (clip(s.to_merge / 1000.0, -1.0, 2.0),),
             "lane_speeds": tuple((speed - s.speed) / 10.0 for speed in s.lane_speeds),
             "road_speeds": tuple((speed - s.speed) / 10.0 for speed in s.road_speeds),
+            "beside": (
+                *((speed - s.speed) / 5.0 for speed in s.beside_speeds),
+                *(gap / 20.0 for gap in s.beside_gaps),
+            ),
             "route_position": (s.route_position / 100.0,),
             "place": (math.cos(lap := 2.0 * math.pi * s.route_position / s.loop_length), math.sin(lap)),
         }

@@ -3,8 +3,10 @@
 import numpy as np
 import pytest
 
+from tests.conftest import random_network
 from unjam.drivers.local_state import EVERYWHERE, SECTIONS_AHEAD, LocalState, like_ones
 from unjam.drivers.registry import named_driver
+from unjam.drivers.residual import ResidualDriver
 from unjam.drivers.road_experts import FREELY, Cruise, JamAhead
 from unjam.errors import InputError
 
@@ -52,5 +54,14 @@ def test_sections_and_lanes_are_the_users_to_choose() -> None:
 
 
 def test_it_says_what_it_must_be_told() -> None:
-    assert JamAhead().perceives == tuple(name for name in LocalState._fields if name != "to_crossing")
+    assert JamAhead().perceives == (*EVERYWHERE, *JamAhead.told)
     assert Cruise().perceives == EVERYWHERE
+
+
+def test_a_network_may_see_who_drives_beside() -> None:
+    driver = ResidualDriver(Cruise(), random_network(8), 2.5, ("beside",))
+    assert driver.perceives == (*EVERYWHERE, "beside_gaps", "beside_speeds")
+    gaps, speeds = np.array([[10.0, 100.0, -2.0, 40.0]]), np.array([[25.0, 20.0, 15.0, 20.0]])
+    near = state(20.0, 20.0)._replace(beside_gaps=gaps, beside_speeds=speeds)
+    seen = driver.observation(near, driver.initial_memory(1))
+    np.testing.assert_allclose(seen, [[1.0, 0.0, -1.0, 0.0, 0.5, 5.0, -0.1, 2.0]])

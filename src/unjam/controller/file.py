@@ -17,7 +17,7 @@ from safetensors.numpy import load, save
 from unjam import __version__
 from unjam.drivers.command import Limits
 from unjam.drivers.driver import Driver
-from unjam.drivers.local_state import BY_SECTION, EVERYWHERE, SECTIONS_AHEAD, STATE_UNITS, LocalState
+from unjam.drivers.local_state import COLUMNS, EVERYWHERE, STATE_UNITS, LocalState
 from unjam.drivers.registry import code_of, driver_from_recipe, recipe_of
 from unjam.errors import InputError
 from unjam.files import DAMAGED, to_json, write_whole
@@ -306,7 +306,7 @@ def read_sample(part: bytes) -> tuple[LocalState, Floats]:
         raise InputError(f"sample: {first!r} is {'missing' if first in needed else 'unknown'}")
     answers = arrays.pop(ANSWER)
     for name, values in {**arrays, ANSWER: answers}.items():
-        shape = (len(values), SECTIONS_AHEAD) if name in BY_SECTION else answers.shape
+        shape = (len(values), COLUMNS[name]) if name in COLUMNS else answers.shape
         if values.ndim != len(shape) or values.shape != shape or values.dtype != np.float64:
             raise InputError(f"sample: {name!r} has shape {values.shape} of {values.dtype}; allowed: numbers")
     if not np.isfinite(answers).all():

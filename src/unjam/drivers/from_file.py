@@ -18,7 +18,7 @@ import numpy as np
 
 from unjam.drivers.command import as_rows
 from unjam.drivers.driver import Driver, Memory, Recipe, labelled
-from unjam.drivers.local_state import SECTIONS_AHEAD, LocalState
+from unjam.drivers.local_state import BESIDE, SECTIONS_AHEAD, LocalState
 from unjam.errors import InputError
 from unjam.physics.arrays import Array
 from unjam.tree import leaves, mapped
@@ -291,7 +291,9 @@ def random_state(generator: np.random.Generator, rows: int, told: bool = False) 
         return LocalState(*near)
     speeds = generator.uniform(0.0, 30.0, (2, rows, SECTIONS_AHEAD))
     allowed, to_merge = generator.uniform(20.0, 30.0, rows), generator.uniform(-500.0, 2000.0, rows)
-    return LocalState(*near, None, allowed, to_merge, *speeds)
+    ahead = LocalState(*near, None, allowed, to_merge, *speeds)
+    beside = generator.uniform(-5.0, 60.0, (rows, len(BESIDE)))
+    return ahead._replace(beside_gaps=beside, beside_speeds=generator.uniform(0.0, 30.0, beside.shape))
 
 
 def _equal(memory: Memory, other: Memory) -> bool:

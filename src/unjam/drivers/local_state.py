@@ -43,6 +43,11 @@ class LocalState(NamedTuple):
     said: (n, SECTIONS_AHEAD) [m/s]; where nobody is, what is allowed"""
     road_speeds: Array = None
     """the same over all lanes of the main road"""
+    beside_gaps: Array = None
+    """gaps to those on the lanes beside it, as in `BESIDE`: (n, 4) [m]; negative alongside, `LARGEST_GAP`
+    where nobody or no lane is. Before a ramp joins, its vehicles are on the lane that it becomes"""
+    beside_speeds: Array = None
+    """their speeds [m/s]; its own where nobody is"""
 
     def each(self, function: Callable[..., Any], *others: "LocalState") -> "LocalState":
         """Return `function` of each quantity, and of the same quantity of the other states."""
@@ -73,20 +78,26 @@ SECTIONS_AHEAD = 11
 SPEED_SCALE = 10.0
 """what speeds are divided by before a network sees them [m/s]"""
 
-_UNITS = ("m/s", "m/s", "m", "m/s", "m", "m", "m", "m", "m/s", "m", "m/s", "m/s")
+_UNITS = ("m/s", "m/s", "m", "m/s", "m", "m", "m", "m", "m/s", "m", "m/s", "m/s", "m", "m/s")
 STATE_UNITS = dict(zip(LocalState._fields, _UNITS, strict=True))
 """units of a `LocalState`, in its order"""
 
 
 EVERYWHERE = tuple(name for name in LocalState._fields if name not in LocalState._field_defaults)
 """what every road offers"""
-BY_SECTION = ("lane_speeds", "road_speeds")
-"""what has a number for each section ahead"""
+BESIDE = ("ahead on the left", "behind on the left", "ahead on the right", "behind on the right")
+COLUMNS = {
+    "lane_speeds": SECTIONS_AHEAD,
+    "road_speeds": SECTIONS_AHEAD,
+    "beside_gaps": len(BESIDE),
+    "beside_speeds": len(BESIDE),
+}
+"""what has several numbers for each CAV, and how many"""
 
 
 def like_ones(names: Sequence[str], ones: Callable[..., Any], rows: int = 1) -> LocalState:
     """Return a state of which `names` are there, all ones: for drivers that are asked what they answer."""
-    shapes = {name: (rows, SECTIONS_AHEAD) if name in BY_SECTION else (rows,) for name in names}
+    shapes = {name: (rows, COLUMNS[name]) if name in COLUMNS else (rows,) for name in names}
     return LocalState(**{name: ones(shape) for name, shape in shapes.items()})
 
 

@@ -15,6 +15,7 @@ from pydantic import AfterValidator
 from unjam.drivers.driver import Driver, Memory, Recipe
 from unjam.drivers.from_file import FileReference, is_file_reference
 from unjam.drivers.local_state import (
+    BESIDE,
     SECTION,
     SECTIONS_AHEAD,
     SPEED_SCALE,
@@ -53,9 +54,9 @@ class Feature:
     """answers them, about unit size, shape (n, m); a tuple of m for plain numbers; None: there are none"""
     numbers: tuple[Observed, ...] | None
     """what they are, in order; None: what the expert remembers is its own to say"""
-    needs: Literal["", "loop", "coordinate", "message"] = ""
-    """what the road must have: `loop` no ends, `coordinate` a position along it, `message` a service that
-    tells of the road ahead"""
+    needs: Literal["", "loop", "coordinate", "motorway"] = ""
+    """what the road must have: `loop` no ends, `coordinate` a position along it, `motorway` lanes, and a
+    service that tells of the road ahead"""
     told: tuple[str, ...] = ()
     """fields of a `LocalState` that it looks at and that only some roads offer"""
     plain: bool = True
@@ -98,10 +99,16 @@ def _sections_ahead(field: str, where: str) -> Feature:
     return Feature(
         lambda seen: (getattr(seen.state, field) - seen.state.speed[..., None]) / SPEED_SCALE,
         tuple(Observed(each, SPEED_SCALE, "m/s") for each in words),
-        needs="message",
+        needs="motorway",
         told=(field,),
         plain=False,
     )
+
+
+def _beside(state: LocalState) -> Array:
+    """Return the relative speeds of those on the lanes beside, then the gaps, shape (n, 8), no unit."""
+    speeds = (state.beside_speeds - state.speed[..., None]) / RELATIVE_SPEED_SCALE
+    return namespace(speeds).concatenate((speeds, state.beside_gaps / GAP_SCALE), -1)
 
 
 FEATURES: dict[str, Feature] = {
@@ -138,21 +145,32 @@ FEATURES: dict[str, Feature] = {
     "allowed_speed": Feature(
         lambda seen: as_column((seen.state.allowed_speed - seen.state.speed) / SPEED_SCALE),
         (Observed("wanted speed - own", SPEED_SCALE, "m/s"),),
-        needs="message",
+        needs="motorway",
         told=("allowed_speed",),
     ),
     "to_merge": Feature(
         lambda seen: as_column(clip(seen.state.to_merge / TO_MERGE_SCALE, -1.0, 2.0)),
         (Observed("way to where a ramp joins", TO_MERGE_SCALE, "m"),),
-        needs="message",
+        needs="motorway",
         told=("to_merge",),
     ),
     "lane_speeds": _sections_ahead("lane_speeds", "in its lane"),
     "road_speeds": _sections_ahead("road_speeds", "on the road"),
+    "beside": Feature(
+        lambda seen: _beside(seen.state),
+        (
+            *(Observed(f"speed {where} - own", RELATIVE_SPEED_SCALE, "m/s") for where in BESIDE),
+            *(Observed(f"gap {where}", GAP_SCALE, "m") for where in BESIDE),
+        ),
+        needs="motorway",
+        told=("beside_gaps", "beside_speeds"),
+        plain=False,
+    ),
 }
 """all that a network can be shown: the paper's five numbers; the expert's acceleration; what the expert
 remembers; the length of the closed road; the place on it; the position along a road with ends; on motorways
-the wanted speed, the way to where a ramp joins, and the speeds ahead in its lane and on all"""
+the wanted speed, the way to where a ramp joins, the speeds ahead in its lane and on all, and who drives
+beside it"""
 
 
 def _known(name: str) -> str:

@@ -55,7 +55,7 @@ class OnRamp(Scenario):
     title: ClassVar[str] = "on-ramp"
     reward: ClassVar[str] = "travel-time"
     closed: ClassVar[bool] = False
-    has_message: ClassVar[bool] = True
+    is_motorway: ClassVar[bool] = True
 
     lanes: Literal[1, 2] = 2
     """of the motorway"""

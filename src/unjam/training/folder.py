@@ -56,8 +56,8 @@ def check_possible(config: RunConfig) -> None:
             needs = feature(name).needs
             if needs == "loop" and not scenario.closed:
                 raise InputError(f"policy.observe: {name!r} is not allowed on a road with ends")
-            if needs == "message" and not scenario.has_message:
-                raise InputError(f"policy.observe: {name!r} is not allowed where nobody tells of the road")
+            if needs == "motorway" and not scenario.is_motorway:
+                raise InputError(f"policy.observe: {name!r} is not allowed on a road that is no motorway")
             if needs == "coordinate" and not scenario.has_coordinate:
                 raise InputError(f"policy.observe: {name!r} is not allowed on a network of one's own")
         observation_size(road.policy.observe, road.make_expert())

@@ -1,11 +1,14 @@
 """Is what is said of a motorway what SUMO does there, and who may command what where?"""
 
+from dataclasses import replace
+
 import libsumo
 import numpy as np
 import pytest
 
 from unjam.drivers import Human
 from unjam.drivers.command import Command
+from unjam.drivers.local_state import LARGEST_GAP
 from unjam.drivers.road_experts import Cruise, JamAhead
 from unjam.measures.metrics import measure
 from unjam.scenarios import OnRamp
@@ -46,6 +49,56 @@ def test_leaders_and_gaps_are_sumos(simulation: Simulation) -> None:
                 compared += 1
             assert seen.speed[row] == libsumo.vehicle.getSpeed(name)
     assert compared > 500
+
+
+def test_who_is_beside_a_cav_is_whom_sumo_sees_there(simulation: Simulation) -> None:
+    traffic, compared = motorway(simulation), 0
+    for _ in range(150):
+        traffic.advance(Command(np.full(traffic.rows, 100.0)))
+        seen = traffic.perceive()
+        for row, name in enumerate(traffic.cavs):
+            here = libsumo.vehicle.getRoadID(name)
+            if here != "motorway":  # where lanes end SUMO looks on to those that follow
+                continue
+            for column, mode in enumerate((0b010, 0b000, 0b011, 0b001)):
+                lane = libsumo.vehicle.getLaneIndex(name) + (1 if column < 2 else -1)
+                found = [
+                    other
+                    for other, _ in libsumo.vehicle.getNeighbors(name, mode)
+                    if libsumo.vehicle.getRoadID(other) == here
+                ]
+                if not found or not 0 <= lane < 2:
+                    continue
+                (other,) = found
+                way = libsumo.vehicle.getLanePosition(other) - libsumo.vehicle.getLanePosition(name)
+                gap = abs(way) - 4.8
+                if gap < LARGEST_GAP:
+                    assert seen.beside_gaps[row, column] == pytest.approx(gap, abs=1e-6)
+                    assert seen.beside_speeds[row, column] == libsumo.vehicle.getSpeed(other)
+                    compared += 1
+    assert compared > 500
+
+
+def test_a_ramps_vehicles_are_beside_the_right_lane_before_it_joins(simulation: Simulation) -> None:
+    traffic, seen_there = motorway(simulation, replace(BUSY, cav_share=1.0)), 0
+    for _ in range(200):
+        traffic.advance(Command(np.full(traffic.rows, 100.0)))
+        seen = traffic.perceive()
+        on_ramp = {
+            libsumo.vehicle.getLanePosition(name) - 400.0: libsumo.vehicle.getSpeed(name)
+            for name in libsumo.edge.getLastStepVehicleIDs("ramp")
+        }
+        for row, name in enumerate(traffic.cavs):
+            if libsumo.vehicle.getLaneID(name) != "motorway_0":
+                continue
+            place = libsumo.vehicle.getLanePosition(name) - 2000.0
+            ahead = [other for other in on_ramp if place <= other]
+            if ahead and min(ahead) - place - 4.8 < LARGEST_GAP:
+                assert seen.beside_gaps[row, 2] == pytest.approx(min(ahead) - place - 4.8, abs=1e-6)
+                assert seen.beside_speeds[row, 2] == on_ramp[min(ahead)]
+                seen_there += 1
+            assert (seen.beside_gaps[row] > -4.8 - 1e-9).all()
+    assert seen_there > 20
 
 
 def test_a_cav_is_held_back_upstream_and_left_alone_where_the_lane_closes(simulation: Simulation) -> None:

@@ -51,7 +51,7 @@ class MotorwayTraffic(LaneTraffic[MotorwayRoad]):
         self._speed = np.array(simulation.speeds(names), np.float64)
         self._way = self._ways[lanes]
         self._place = self._starts[lanes] + np.array(simulation.along_lanes(names), np.float64)
-        order = np.lexsort((self._place, self._way))
+        self._order = order = np.lexsort((self._place, self._way))
         same = self._way[order[1:]] == self._way[order[:-1]]
         self._leader, self._follower = np.full((2, len(names)), -1)
         self._leader[order[:-1][same]] = order[1:][same]
@@ -88,6 +88,7 @@ class MotorwayTraffic(LaneTraffic[MotorwayRoad]):
         near, close = (leader >= 0) & (ahead < LARGEST_GAP), (follower >= 0) & (behind < LARGEST_GAP)
         factors = np.array([self._factors[name] for name in names])
         lane_speeds, road_speeds = self._messages.ahead(way, place)
+        beside_gaps, beside_speeds = self._beside(rows)
         return LocalState(
             speed=speed,
             leader_speed=np.where(near, self._speed[leader], speed),
@@ -100,7 +101,24 @@ class MotorwayTraffic(LaneTraffic[MotorwayRoad]):
             to_merge=self.road.merge - place,
             lane_speeds=lane_speeds,
             road_speeds=road_speeds,
+            beside_gaps=beside_gaps,
+            beside_speeds=beside_speeds,
         )
+
+    def _beside(self, rows: NDArray[np.intp]) -> tuple[Floats, Floats]:
+        """Return gaps and speeds of those on the lanes beside these vehicles, as `LocalState` has them."""
+        order, length, apart = self._order, self.road.vehicle_length, 2.0 * self.road.length
+        along = self._way[order] * apart + self._place[order]  # one way behind the other
+        gaps, speeds = list[Floats](), list[Floats]()
+        for way in (self._way[rows] + 1, self._way[rows] - 1):  # to the left, to the right
+            first_ahead = np.searchsorted(along, way * apart + self._place[rows])
+            for found, towards in ((first_ahead, 1.0), (first_ahead - 1, -1.0)):
+                other = order[found.clip(0, len(order) - 1)]
+                gap = towards * (self._place[other] - self._place[rows]) - length
+                near = (found >= 0) & (found < len(order)) & (self._way[other] == way) & (gap < LARGEST_GAP)
+                gaps.append(np.where(near, gap, LARGEST_GAP))
+                speeds.append(np.where(near, self._speed[other], self._speed[rows]))
+        return np.stack(gaps, -1), np.stack(speeds, -1)
 
     def _ahead(self, names: Sequence[str]) -> list[Ahead]:
         rows = [self._row[name] for name in names]
