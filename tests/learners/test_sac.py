@@ -157,3 +157,8 @@ def test_settings_reach_sac() -> None:
     assert learner.target_entropy == -3.0
     optimisers = (learner.actor.optimizer, learner.critic.optimizer, learner.ent_coef_optimizer)
     assert {optimiser.param_groups[0]["lr"] for optimiser in optimisers} == {0.02}
+
+
+def test_a_policy_may_begin_as_its_weights_are_drawn() -> None:
+    policy = fresh(PolicySettings(begin_at_expert=False))
+    assert residual_of(policy, random_rows(200, 5, 0)).std() > 0.001

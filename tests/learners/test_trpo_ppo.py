@@ -39,6 +39,11 @@ def test_the_residual_of_a_fresh_policy_is_exactly_zero(seed: int) -> None:
     assert (policy.network()(rows.astype(float)) == 0.0).all()
 
 
+def test_a_policy_may_begin_as_its_weights_are_drawn() -> None:
+    rows = random_rows(200, 5, 0)
+    assert mean_of(fresh(PolicySettings(begin_at_expert=False)), rows).std() > 0.01
+
+
 @pytest.mark.parametrize("hold", [1, 10])
 @pytest.mark.parametrize("cavs", [1, 3])
 def test_a_fresh_policy_drives_exactly_as_its_expert(hold: int, cavs: int, simulation: Simulation) -> None:

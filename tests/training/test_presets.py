@@ -41,6 +41,23 @@ def test_the_demo_of_a_first_visit_begins_with_a_wave_and_ends_within_a_minute()
     assert load_config(preset="demo").world == "sumo"
 
 
+def test_to_the_letter_is_the_papers_preset_without_what_we_added() -> None:
+    paper, exact = load_config(preset="paper"), load_config(preset="paper-exact")
+    assert (exact.steps, exact.trpo, exact.virtual.kappa) == (4_000_000, paper.trpo, paper.virtual.kappa)
+    virtual = exact.virtual
+    assert (virtual.members, virtual.fall_back, virtual.noise, virtual.error) == (
+        1,
+        False,
+        False,
+        "transitions",
+    )
+    assert (exact.policy.begin_at_expert, exact.evaluation.every, exact.evaluation.converged) == (
+        False,
+        0,
+        50,
+    )
+
+
 def test_the_papers_preset_has_the_papers_numbers() -> None:
     made = load_config(preset="paper")
     assert (made.trpo.gamma, made.trpo.gae_lambda, made.trpo.target_kl) == (0.995, 0.97, 0.01)

@@ -8,7 +8,7 @@ import pytest
 from tests.training.test_run import STEPS, controller_manifest, learn_with, outcome, small_config
 from unjam.errors import MissingPartError
 from unjam.reports.results import read_progress
-from unjam.training.folder import gave_up
+from unjam.training.folder import gave_up, has_converged
 from unjam.training.tensorboard import FOLDER, tensorboard_into
 from unjam.training.train import Trainer
 from unjam.worlds.workers import Workers
@@ -32,6 +32,31 @@ def test_patience_counts_validations_since_the_best(
 ) -> None:
     rows = [{"return_validation": value, "return_expert": 11.0} for value in validations]
     assert gave_up(small_config(evaluation__patience=patience), rows) is over
+
+
+@pytest.mark.parametrize(
+    ("returns", "span", "over"),
+    [
+        ([1.0, 2.0, 2.0], 2, False),  # not yet twice as many
+        ([1.0, 2.0, 2.0, 0.9], 2, True),
+        ([1.0, 2.0, 2.0, 1.1], 2, False),
+        ([1.0, 2.0, 2.0, 1.1, 0.0], 2, False),  # looked at every second iteration
+        ([1.0, 2.0, 2.0, 1.1, 0.0, 0.0], 2, True),
+        ([1.0, 1.0, 1.0, 1.0], 0, False),
+    ],
+)
+def test_converged_is_who_earns_no_more_than_before(returns: list[float], span: int, over: bool) -> None:
+    rows = [{"return_mean": value} for value in returns]
+    assert has_converged(small_config(evaluation__converged=span), rows) is over
+
+
+def test_the_policy_that_has_converged_is_the_controller(tmp_path: Path) -> None:
+    config = small_config(steps=20 * STEPS, evaluation__every=0, evaluation__converged=1)
+    with Workers(1) as workers:
+        learn_with(workers, tmp_path / "run", config)
+    returns = [row["return_mean"] for row in read_progress(tmp_path / "run")]
+    assert returns[-1] <= returns[-2]
+    assert controller_manifest(tmp_path / "run")["iteration"] == len(returns) < 20
 
 
 def test_training_ends_where_patience_is_over(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -160,10 +160,20 @@ def test_a_loss_that_is_not_finite_is_told(actual: Transitions) -> None:
 
 def test_every_estimator_is_there(known: tuple[EnvironmentModel, Fit]) -> None:
     errors = known[1].errors
-    assert set(errors) == {"unexplained", "total_variation", "released"}
+    assert set(errors) == {"unexplained", "transitions", "total_variation", "released"}
+    assert 0 < errors["transitions"] < 1
     assert 0 < errors["unexplained"] < 0.1
     assert 0 < errors["total_variation"] < 1
     assert 0 < errors["released"] < 0.1
+
+
+def test_networks_that_may_not_fall_back_are_always_added(actual: Transitions) -> None:
+    wild = replace(SETTINGS, members=1, fall_back=False, epochs=1, fit_rows=20)
+    _, found = fitted(actual, wild)
+    assert set(found.learned) == set(TARGETS)
+    assert found.one_step["speed"].model > found.one_step["speed"].base  # the base knew it
+    fresh = EnvironmentModel(wild, actual.drawn.shape[1], (1,))
+    assert all(weight.abs().max() > 0 for weight in fresh.weights)
 
 
 @pytest.mark.parametrize("base", ["none", "idm"])

@@ -3,8 +3,24 @@ import math
 import numpy as np
 import pytest
 
-from unjam.virtual.fitting import OneStep, OneStepErrors, total_variation, unexplained
-from unjam.virtual.model import TARGETS
+from unjam.drivers import PISaturation
+from unjam.scenarios import FigureEight, Ring, Scenario
+from unjam.virtual.data import ActualData, Transitions
+from unjam.virtual.fitting import (
+    OneStep,
+    OneStepErrors,
+    against_transitions,
+    drawn_noise,
+    fit,
+    total_variation,
+    unexplained,
+)
+from unjam.virtual.model import TARGETS, EnvironmentModel, base_step
+from unjam.virtual.settings import VirtualSettings
+from unjam.worlds.batch.run import run_batch
+from unjam.worlds.episode import run_episode
+from unjam.worlds.record import Episode
+from unjam.worlds.workers import EpisodeTask
 
 
 def test_errors_one_step_ahead_are_root_mean_squares() -> None:
@@ -49,3 +65,41 @@ def test_numbers_add_up_and_one_that_all_agree_on_counts_nothing() -> None:
 
 def test_of_a_single_member_nobody_can_tell() -> None:
     assert math.isnan(total_variation(np.zeros((1, 4, 2)), np.ones(2)))
+
+
+@pytest.mark.parametrize("distance", [0.1, 1.0, 3.0])
+def test_against_transitions_is_that_of_two_gaussians(distance: float) -> None:
+    wrong = np.full((3, 4, 2), distance * 0.5 / math.sqrt(2.0))
+    assert against_transitions(wrong, 0.5) == pytest.approx(overlap(distance), abs=1e-6)
+
+
+def transitions_of(scenario: Scenario, episodes: list[Episode]) -> Transitions:
+    data = ActualData(100_000)
+    data.add(episodes, scenario)
+    return data.transitions(0.2)
+
+
+def test_the_way_that_people_made_tells_their_noise() -> None:
+    ring = Ring(vehicles=6, length=(120, 120), horizon=400, noise=0.3)
+    episodes = run_batch([EpisodeTask(ring, PISaturation(), (seed,)) for seed in range(6)])
+    actual = transitions_of(ring, episodes)
+    noise = drawn_noise(actual, ring)
+    assert noise is not None
+    moves = np.minimum(actual.following.leader_speed, actual.following.follower_speed) > 0.5
+    sigma = ring.noise_per_step * ring.simulation_step
+    np.testing.assert_allclose(noise[moves].std(0), sigma, rtol=0.06)
+    # The follower's own leader is the CAV, so that the IDM knows what he meant to do.
+    meant = base_step("idm", ring, actual.states, actual.applied).follower_speed
+    np.testing.assert_allclose(
+        (meant + noise[:, 1])[moves], actual.following.follower_speed[moves], atol=1e-9
+    )
+
+
+def test_where_noise_moves_people_too_its_variance_is_taken_off_the_error() -> None:
+    eight = FigureEight(horizon=300)
+    actual = transitions_of(eight, [run_episode(eight, PISaturation(), (seed,)) for seed in range(4)])
+    assert drawn_noise(actual, eight) is None
+    settings = VirtualSettings(members=1, epochs=1)
+    model = EnvironmentModel(settings, actual.drawn.shape[1], (0,))
+    errors = fit(model, actual, settings, eight, "", (1,)).errors
+    assert 0.0 < errors["transitions"] <= 1.0

@@ -140,7 +140,7 @@ class Imagination(Generic[Model]):
 
     def bound(self, eps_pi: float, gamma: float) -> float:
         """Return the bound C for this iteration; `gamma` is that from choice to choice."""
-        return self.bound_at(self.k_star, eps_pi, self.facts["eps_m_by_estimator"]["total_variation"], gamma)
+        return self.bound_at(self.k_star, eps_pi, self.facts["eps_m_by_estimator"]["transitions"], gamma)
 
     def bound_at(self, k: int, eps_pi: float, eps_m: float, gamma: float) -> float:
         """Return the bound C with rollouts of `k` decisions; `gamma` is that from choice to choice."""

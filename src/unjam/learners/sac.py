@@ -76,14 +76,16 @@ class OffPolicyResidual(BasePolicy):
 class SquashedResidualPolicy(OffPolicyResidual, SACPolicy):
     """SB3's policy of soft actor-critic with a residual that is zero at the start, with a little noise.
 
-    The last layer of the actor starts at zero but for the size of the noise, `exploration_std`.
+    The last layer of the actor starts at zero but for the size of the noise, `exploration_std`; unless the
+    settings want the residual as torch draws it.
     """
 
     def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> Actor:
         """Return the actor, which sees the first `inputs` numbers."""
         actor = super().make_actor(ActorView(self.observation_space, self.inputs))
         first_std = self.settings.exploration_std / self.settings.authority
-        for layer, bias in ((actor.mu, 0.0), (actor.log_std, math.log(first_std))):
+        known = ((actor.mu, 0.0), (actor.log_std, math.log(first_std)))
+        for layer, bias in known[0 if self.settings.begin_at_expert else 1 :]:
             linear = cast(nn.Linear, layer)
             nn.init.zeros_(linear.weight)
             nn.init.constant_(linear.bias, bias)

@@ -28,6 +28,9 @@ class PolicySettings:
         "expert_memory",
     )
     """what the network sees; the paper's network sees `local` alone, and cannot know what PI will do"""
+    begin_at_expert: bool = True
+    """whether the untrained network adds nothing, so that the full policy begins as exactly the expert, or
+    what its random weights happen to answer, as the paper's"""
     remember: bool = False
     """whether what the network sees of the expert's memory has means of the own past besides: speed, its
     spread, and gap, over ten seconds to some minutes"""

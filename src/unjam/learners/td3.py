@@ -19,14 +19,15 @@ from unjam.learners.settings import TD3Settings
 
 
 class DeterministicResidualPolicy(OffPolicyResidual, TD3Policy):
-    """SB3's policy of TD3 with a residual that is zero at the start: the actor's last layer is."""
+    """SB3's policy of TD3 with a residual that is zero at the start, if wanted: the actor's last layer is."""
 
     def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> Actor:
         """Return the actor, which sees the first `inputs` numbers."""
         actor = super().make_actor(ActorView(self.observation_space, self.inputs))
         last = cast(nn.Linear, actor.mu[-2])  # before the tanh
-        nn.init.zeros_(last.weight)
-        nn.init.zeros_(last.bias)
+        if self.settings.begin_at_expert:
+            nn.init.zeros_(last.weight)
+            nn.init.zeros_(last.bias)
         return actor
 
     @property

@@ -76,7 +76,8 @@ class ActorAndCritic(nn.Module):
 class ResidualPolicy(ActorCriticPolicy):
     """SB3's actor-critic policy with a bounded mean that is zero at the start.
 
-    The last layer of the actor starts at zero, so that the full policy starts as exactly the expert.
+    The last layer of the actor starts at zero, so that the full policy starts as exactly the expert; unless
+    the settings want it as torch draws it.
     """
 
     def __init__(
@@ -94,8 +95,9 @@ class ResidualPolicy(ActorCriticPolicy):
     def _build(self, lr_schedule: Any) -> None:
         super()._build(lr_schedule)
         last = nn.Linear(self.mlp_extractor.latent_dim_pi, 1)
-        nn.init.zeros_(last.weight)
-        nn.init.zeros_(last.bias)
+        if self.settings.begin_at_expert:
+            nn.init.zeros_(last.weight)
+            nn.init.zeros_(last.bias)
         self.action_net = nn.Sequential(last, BoundedTanh(self.authority))
         self.value_net = ScaledValue(self.mlp_extractor.latent_dim_vf)  # pyright: ignore[reportAttributeAccessIssue]
         nn.init.orthogonal_(self.value_net.linear.weight)

@@ -37,7 +37,7 @@ NOTHING = 1e-5
 
 MODEL, BASE, CHANGE, ACTUAL = LINES[2], LINES[1], LINES[0], INK
 """colours"""
-ESTIMATORS = {"unexplained": LINES[2], "total_variation": LINES[3], "released": LINES[4]}
+ESTIMATORS = dict(zip(("unexplained", "transitions", "total_variation", "released"), LINES[2:], strict=False))
 REPLAYED = ("leader_speed", "leader_gap", "follower_gap")
 """numbers whose errors are drawn over the time ahead"""
 PLACED = (("leader_speed", "leader_gap"), ("leader_speed", "speed"), ("reward", "leader_gap"))
@@ -219,7 +219,7 @@ def trust(progress: Sequence[dict[str, Any]], facts: dict[str, Any]) -> Figure:
     lengths.set_ylim(bottom=0)
     _titled(lengths, "rollout length k* [decisions]", "actual steps [thousands]")
     for name, colour in ESTIMATORS.items():
-        found = [each["eps_m_by_estimator"][name] for each in virtual]
+        found = [each["eps_m_by_estimator"].get(name) for each in virtual]
         over_steps(estimates, found, colour, name.replace("_", " "))
     estimates.set_ylim(bottom=0)
     estimates.legend(fontsize=8)

@@ -9,6 +9,7 @@ from unjam.studies.imagined import imagined
 from unjam.studies.robustness import FIGURE_10, ROBUSTNESS
 from unjam.studies.study import PAPERS_ROADS, Study
 from unjam.studies.theory import FIGURE_8, THEORY
+from unjam.studies.to_the_letter import to_the_letter
 
 TABLE_1: dict[str, Study] = {
     f"table-1-{road}": comparison_of(
@@ -18,6 +19,7 @@ TABLE_1: dict[str, Study] = {
     )
     for road in PAPERS_ROADS
 }
+LETTER = {f"to-the-letter-{road}": to_the_letter(road) for road in PAPERS_ROADS}
 STUDIES: dict[str, Study] = {
     **TABLE_1,
     "figure-5": FIGURE_5,
@@ -48,6 +50,11 @@ STUDIES: dict[str, Study] = {
         "ring-jammed",
     ),
     "imagined": imagined("ring"),
+    "eq16": comparison_of(
+        "Eq. 16 as it is printed and as it is meant, on the ring",
+        ("trpo-eq16", "trpo-as-printed", "proposed-eq16", "proposed-as-printed"),
+    ),
+    **LETTER,
     "robustness": ROBUSTNESS,
     "drivable": DRIVABLE_STUDY,
     "drivable-eight": DRIVABLE_EIGHT,
@@ -60,6 +67,7 @@ TOGETHER: dict[str, tuple[str, ...]] = {
     "table-1": tuple(TABLE_1),
     "figure-4": tuple(TABLE_1),
     "figure-7": ("table-2",),
+    "to-the-letter": tuple(LETTER),
     "all": tuple(STUDIES),
 }
 """names of the paper for one study or several: figures are drawn with their table, of the same trainings"""

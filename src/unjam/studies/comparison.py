@@ -103,8 +103,8 @@ def comparison_of(title: str, variants: Sequence[str], road: str = "ring") -> St
 
 
 def metric_of(road: str, variant: str) -> str:
-    """Return which return trainings are judged by: that of their reward, which all drivers have."""
-    return "return_eq16" if PlannedRun(road, variant, 0).config.reward == "eq16" else "return"
+    """Return which return trainings are judged by: one that all drivers have, of the reward as meant."""
+    return "return_eq16" if PlannedRun(road, variant, 0).config.reward.startswith("eq16") else "return"
 
 
 def best_expert(references: dict[str, Table], metric: str = "return") -> str:
@@ -132,7 +132,7 @@ def table_rows(studies: StudyFolder, road: str, variants: Sequence[str], seeds: 
 def _of_variant(
     road: str, variant: str, runs: list[TrainedRun], references: dict[str, Table]
 ) -> dict[str, Any]:
-    reported, metric = PAPER.get((road, variant)), metric_of(road, variant)
+    reported, metric = PAPER.get((road, VARIANTS[variant].papers or variant)), metric_of(road, variant)
     best = best_expert(references, metric)
     row: dict[str, Any] = {
         "road": road,
@@ -233,18 +233,20 @@ def _flat(row: dict[str, Any]) -> dict[str, Any]:
 def curves_of(studies: StudyFolder, road: str, variants: Sequence[str], seeds: int) -> dict[str, Any]:
     """Return the curves of a road: by variant the steps, and what is drawn over them, a list per seed.
 
-    Returns of another reward than that of the first variant are left out.
+    Returns of another reward than that of the first variant are left out, and what was never looked at.
     """
     found: dict[str, Any] = {}
-    metric = metric_of(road, variants[0])
+    reward = PlannedRun(road, variants[0], 0).config.reward
     for variant in variants:
         runs = studies.trained(road, variant, seeds)
         first = max(run.progress[0]["actual_steps"] for run in runs)
         last = min(run.progress[-1]["actual_steps"] for run in runs)
         grid = np.linspace(first, last, POINTS)
         found[variant] = {"steps": grid.round().tolist()}
-        for name in (*RETURNS, *SPEEDS) if metric_of(road, variant) == metric else SPEEDS:
-            found[variant][name] = [_on(grid, run.progress, name) for run in runs]
+        same = PlannedRun(road, variant, 0).config.reward == reward
+        for name in (*RETURNS, *SPEEDS) if same else SPEEDS:
+            if any(row[name] is not None for row in runs[0].progress):
+                found[variant][name] = [_on(grid, run.progress, name) for run in runs]
     return found
 
 

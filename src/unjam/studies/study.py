@@ -31,6 +31,8 @@ BUDGET = 300_000
 """actual steps of every learner"""
 LONG_BUDGET = 4_000_000
 """the paper's own"""
+MILLION = 1_000_000
+"""where an hour makes no more"""
 
 ROADS: dict[str, dict[str, Any]] = {
     "ring": {"scenario": "ring"},
@@ -127,6 +129,8 @@ class Variant:
     changes: dict[str, Any]
     steps: int | None = BUDGET
     """None: those of the preset"""
+    papers: str = ""
+    """the variant whose numbers the paper gives for it, if it is another"""
 
 
 SMALL = {"trpo.batch_steps": 12_000}
@@ -139,6 +143,7 @@ IMAGINED = {
 }
 """iterations as large as those of `best` on the ring, of which an eighth is actual"""
 ALONE = {"expert": "none", "virtual.virtual_ratio": 0.0}
+TO_THE_END = {"evaluation.converged": 0}
 VARIANTS: dict[str, Variant] = {
     "trpo": Variant("TRPO", "paper", ALONE),
     "ppo": Variant("PPO", "paper", {"agent": "ppo", **ALONE}),
@@ -151,6 +156,14 @@ VARIANTS: dict[str, Variant] = {
     "proposed-sac": Variant("proposed with SAC", "paper", {"agent": "sac"}),
     "trpo-long": Variant("TRPO, 4 M steps", "paper", ALONE, LONG_BUDGET),
     "proposed-long": Variant("proposed, 4 M steps", "paper", {}, LONG_BUDGET),
+    "trpo-eq16": Variant("TRPO, Eq. 16 as meant", "paper", {**ALONE, "reward": "eq16"}),
+    "trpo-as-printed": Variant("TRPO, Eq. 16 as printed", "paper", {**ALONE, "reward": "eq16-as-printed"}),
+    "proposed-eq16": Variant("proposed, Eq. 16 as meant", "paper", {"reward": "eq16"}),
+    "proposed-as-printed": Variant("proposed, Eq. 16 as printed", "paper", {"reward": "eq16-as-printed"}),
+    "trpo-exact": Variant("TRPO", "paper-exact", {**ALONE, **TO_THE_END}, LONG_BUDGET, "trpo"),
+    "proposed-exact": Variant("proposed", "paper-exact", TO_THE_END, LONG_BUDGET, "proposed"),
+    "trpo-exact-million": Variant("TRPO", "paper-exact", {**ALONE, **TO_THE_END}, MILLION, "trpo"),
+    "proposed-exact-million": Variant("proposed", "paper-exact", TO_THE_END, MILLION, "proposed"),
     "ours": Variant("ours", "quick", {}),
     "ours-without-model": Variant("ours without model", "quick", {"virtual.virtual_ratio": 0.0}),
     "ours-with-model": Variant("ours with model", "quick", {"virtual.virtual_ratio": 5.0}),

@@ -47,6 +47,10 @@ class EvaluationSettings:
     """iterations between two validations; 0: none, and the last policy becomes the controller"""
     patience: CountOrNone = 0
     """validations in a row without a new best after which training ends; 0: it goes on to `steps`"""
+    converged: CountOrNone = 0
+    """training ends where the mean return of so many iterations, exploration included, is no better than that
+    of as many before them, looked at whenever as many have been made: the paper's rule; 0: it goes on to
+    `steps`"""
     validation_episodes: Count = 4
     """episodes of a validation, the same seeds each time: they choose the controller"""
     episodes: Count = 20

@@ -180,6 +180,15 @@ def save_checkpoint(folder: Path, state: dict[str, Any], tensors: "Tensors") -> 
     _sweep(folder)
 
 
+def has_converged(config: RunConfig, progress: Sequence[dict[str, Any]]) -> bool:
+    """Return whether the newest `evaluation.converged` iterations were no better than those before them."""
+    span = config.evaluation.converged
+    if not span or len(progress) % span or len(progress) < 2 * span:
+        return False
+    returns = [row["return_mean"] for row in progress[-2 * span :]]
+    return sum(returns[span:]) <= sum(returns[:span])
+
+
 def gave_up(config: RunConfig, progress: Sequence[dict[str, Any]]) -> bool:
     """Return whether so many validations in a row found nothing better that `evaluation.patience` is over."""
     found = [value for row in progress if (value := row.get("return_validation")) is not None]

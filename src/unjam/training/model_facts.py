@@ -209,7 +209,7 @@ def _replayed(
 
 def _bounds(imagination: RowImagination, newest: dict[str, Any], gamma: float) -> dict[str, Any] | None:
     """Return the bound C by the length of rollouts for the newest row of progress; None without an eps_m."""
-    eps_m = newest["virtual"]["eps_m_by_estimator"]["total_variation"]
+    eps_m = newest["virtual"]["eps_m_by_estimator"].get("transitions")  # of runs of before there is none
     if eps_m is None:
         return None
     eps_pi = newest["learner"]["eps_pi_max"]

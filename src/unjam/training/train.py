@@ -33,6 +33,7 @@ from unjam.training.folder import (
     check_possible,
     continue_folder,
     gave_up,
+    has_converged,
     last_state,
     make_new_folder,
     note_lineage,
@@ -241,7 +242,8 @@ class Trainer:
     def write(self, iteration: Iteration, validated: Validated) -> bool:
         """Write a row of progress, of the whole run and of each road, and a checkpoint.
 
-        Return whether it is time to stop: the user says so, or `evaluation.patience` is over.
+        Return whether it is time to stop: the user says so, `evaluation.patience` is over, or it has
+        converged.
         """
         rows = [self._row(iteration, validated, index) for index in range(len(self.tasks))]
         whole = rows[0]
@@ -268,11 +270,11 @@ class Trainer:
             "expert_returns": self._expert_returns,
         }
         save_checkpoint(self.folder / "checkpoint", state, {**tensors, **self._controllers.tensors()})
-        if self._on_iteration(whole) is False:
-            if validated is None:
-                self.validate(iteration, ended=True)
-            return True
-        return gave_up(self.config, read_progress(self.folder))
+        stopped, progress = self._on_iteration(whole) is False, read_progress(self.folder)
+        stopped = stopped or gave_up(self.config, progress) or has_converged(self.config, progress)
+        if stopped and validated is None:
+            self.validate(iteration, ended=True)
+        return stopped
 
     def returns_of(self, drivers: Sequence[Driver]) -> list[float]:
         """Return the mean return on the validation seeds, by road, each driven by its own of `drivers`."""

@@ -60,8 +60,8 @@ def _through(layers: Layers, inputs: Tensor) -> Tensor:
 class Ensemble(nn.Module):
     """Networks that answer what some base leaves to be answered, each on its own.
 
-    Their last layers start at zero, so that at first nothing is added to the base. What it remembers of its
-    fits is in its buffers: `state_dict` is all of it.
+    Unless the settings say otherwise their last layers start at zero, so that at first nothing is added to
+    the base. What it remembers of its fits is in its buffers: `state_dict` is all of it.
     """
 
     input_mean: Tensor
@@ -88,8 +88,9 @@ class Ensemble(nn.Module):
             draws /= sqrt(before)
             self.weights.append(nn.Parameter(draws[:, :-1].contiguous()))
             self.biases.append(nn.Parameter(draws[:, -1:].contiguous()))
-        nn.init.zeros_(self.weights[-1])
-        nn.init.zeros_(self.biases[-1])
+        if settings.fall_back:
+            nn.init.zeros_(self.weights[-1])
+            nn.init.zeros_(self.biases[-1])
         self.register_buffer("input_mean", torch.zeros(inputs))
         self.register_buffer("input_scale", torch.ones(inputs))
         self.register_buffer("target_mean", torch.zeros(outputs))
@@ -184,7 +185,8 @@ def teach(
     """Teach an ensemble, which goes on from what it is.
 
     Every network learns from rows of its own, drawn with replacement once, and ends with the weights that
-    were best on the holdout. What is not answered better than by nothing there is left to the base.
+    were best on the holdout. What is not answered better than by nothing there is left to the base, unless
+    the settings do not let the networks fall back on it.
 
     Args:
         ensemble: is changed.
@@ -206,6 +208,7 @@ def teach(
     loss, epochs = _descend(ensemble, learned_from, judged_by, settings, generator)
     asked, predicted = targets[holdout].cpu().numpy(), ensemble.answers(inputs[holdout])
     learned = np.square(asked - predicted).mean((0, 1)) < np.square(asked).mean(0)
+    learned |= not settings.fall_back
     ensemble.learned.copy_(torch.as_tensor(learned))
     return Learned(asked, predicted * learned, holdout, loss, epochs, len(training))
 

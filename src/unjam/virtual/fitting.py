@@ -11,7 +11,7 @@ import torch
 
 from unjam.scenarios.scenario import Scenario
 from unjam.virtual.data import Transitions
-from unjam.virtual.ensemble import SMALLEST_CHANGE, teach
+from unjam.virtual.ensemble import SMALLEST_CHANGE, Learned, teach
 from unjam.virtual.model import (
     NOISE_ROWS,
     NUMBERS,
@@ -69,11 +69,12 @@ class Fit:
     """the model error eps_m by estimator
 
     `unexplained`: mean square of the holdout error over the variance of the change, mean of the five numbers
-    of the state. `total_variation`: between the distributions of the next state of a random member and of
-    the ensemble's mean, erf(d / (2 sqrt 2)), averaged over the holdout, where d is how far a member is from
-    the mean over the standard deviation of the noise; NaN with a single member. `released`: mean square
-    of the training error in the last pass, in units of the targets' standard deviation, as in the authors'
-    code.
+    of the state. `transitions`: between the next speeds of leader and follower as a random member has them
+    and as they were drawn, see `against_transitions`. `total_variation`: between the distributions of the
+    next state of a random member and of the ensemble's mean, erf(d / (2 sqrt 2)), averaged over the holdout,
+    where d is how far a member is from the mean over the standard deviation of the noise; NaN with a single
+    member. `released`: mean square of the training error in the last pass, in units of the targets' standard
+    deviation, as in the authors' code.
     """
     one_step: dict[str, OneStep]
     """by name of TARGETS"""
@@ -117,6 +118,7 @@ def fit(
     steps = OneStepErrors(found.wanted, found.predicted, change).by_number()
     errors = {
         "unexplained": unexplained([steps[name] for name in NUMBERS]),
+        "transitions": _against_rows(found, actual.chosen(found.holdout), scenario),
         "total_variation": total_variation(found.predicted[:, :, :-1], error[:, :-1].std(0)),
         "released": found.loss,
     }
@@ -148,6 +150,47 @@ def unexplained(numbers: Sequence[OneStep]) -> float:
     """
     shares = [(step.model / step.change) ** 2 if step.change > SMALLEST_CHANGE else 0.0 for step in numbers]
     return sum(shares) / len(shares)
+
+
+def against_transitions(wrong: Floats, noise: float) -> float:
+    """Return the mean total variation between predicted and actual transitions, Gaussians as noisy.
+
+    Source: eps_m of the paper's theorem A3; TV(N(m1, s), N(m2, s)) = erf(|m1 - m2| / (2 sqrt 2 s)).
+
+    Args:
+        wrong: by how much the means of what is noisy were predicted wrongly, shape (..., numbers).
+        noise: standard deviation of the noise that people have.
+    """
+    distance = torch.as_tensor(np.sqrt(np.square(wrong).sum(-1))) / max(noise, SMALLEST_CHANGE)
+    return float(torch.erf(distance / (2.0 * sqrt(2.0))).mean())
+
+
+def drawn_noise(actual: Transitions, scenario: Scenario) -> Floats | None:
+    """Return what noise added to the speeds of leader and follower in each decision, shape (rows, 2).
+
+    Where SUMO drives people it comes after they have moved, so that the way that they made says how fast they
+    meant to drive. Where they are commanded it moves them too: nobody can tell, None.
+    """
+    if scenario.human_control != "native" or scenario.steps_per_decision > 1:
+        return None
+    state, then, step = actual.states, actual.following, scenario.simulation_step
+    leader_moved = then.speed + (then.leader_gap - state.leader_gap) / step
+    follower_moved = then.speed - (then.follower_gap - state.follower_gap) / step
+    return np.column_stack([then.leader_speed - leader_moved, then.follower_speed - follower_moved])
+
+
+def _against_rows(found: Learned, actual: Transitions, scenario: Scenario) -> float:
+    """Return `against_transitions` of leader and follower on the holdout.
+
+    Where the noise is not known it is the mean square of the errors beyond the noise's variance that counts.
+    """
+    columns = [TARGETS.index("leader_speed"), TARGETS.index("follower_speed")]
+    wrong, noise = (found.wanted - found.predicted)[..., columns], drawn_noise(actual, scenario)
+    sigma = scenario.noise_per_step * scenario.simulation_step
+    if noise is None:
+        beyond = np.square(wrong).mean((0, 1)) - sigma**2
+        return against_transitions(np.sqrt(beyond.clip(0.0)), sigma)
+    return against_transitions(wrong - noise, sigma)
 
 
 def total_variation(predicted: Floats, noise: Floats) -> float:

@@ -8,7 +8,7 @@ the way that a vehicle made tells how fast it meant to drive. What is left of an
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from math import nan, sqrt
+from math import nan
 
 import numpy as np
 import torch
@@ -22,7 +22,13 @@ from unjam.scenarios.ring import Ring
 from unjam.scenarios.scenario import VEHICLE_LENGTH, Scenario
 from unjam.virtual.data import is_held_out
 from unjam.virtual.ensemble import SMALLEST_CHANGE, Ensemble, predict, random_members, teach
-from unjam.virtual.fitting import Fit, OneStep, root_mean_square
+from unjam.virtual.fitting import (
+    Fit,
+    OneStep,
+    against_transitions,
+    root_mean_square,
+    total_variation,
+)
 from unjam.virtual.model import BASES
 from unjam.virtual.settings import VirtualSettings
 from unjam.worlds.batch.people import People, people_speed
@@ -144,8 +150,8 @@ def fit_roads(
     """Teach `model` what the base leaves of how people moved, and measure their noise.
 
     The errors, of the speed alone: `unexplained` is the squared error on the holdout over the variance of
-    what there was to predict, `total_variation` that between the next speed as a member has it and as it
-    truly was drawn, with the noise known from the record: erf(|predicted - true mean| / (2 sqrt 2 sigma)).
+    what there was to predict; `transitions` is between the next speed as a member has it and as it truly
+    was drawn, with the noise known from the record; `total_variation` between members.
 
     Raises:
         UnjamError: a loss is not finite.
@@ -168,15 +174,17 @@ def fit_roads(
     model.noise.fill_(sigma)
     targets = torch.from_numpy((moved - base)[:, None])
     found = teach(model, _inputs(speed, leader_speed, gaps, base), targets, held_out, settings, generator)
-    if root_mean_square(found.wanted) < SMALLEST_CHANGE:  # the base knows all: what is left is rounding
+    if (
+        settings.fall_back and root_mean_square(found.wanted) < SMALLEST_CHANGE
+    ):  # the base knows all: what is left is rounding
         model.learned.zero_()
     wrong = found.wanted - found.predicted * model.learned.numpy()
     change = (moved - speed)[found.holdout]
     step = OneStep(root_mean_square(found.wanted), root_mean_square(wrong), float(change.std()))
-    distance = torch.as_tensor(np.abs(wrong)) / (2.0 * sqrt(2.0) * max(sigma, SMALLEST_CHANGE))
     errors = {
         "unexplained": (step.model / max(step.change, SMALLEST_CHANGE)) ** 2,
-        "total_variation": float(torch.erf(distance).mean()),
+        "transitions": against_transitions(wrong, sigma),
+        "total_variation": total_variation(found.predicted * model.learned.numpy(), np.array([sigma])),
         "released": found.loss,
     }
     learned = ("speed",) if model.learned.any() else ()

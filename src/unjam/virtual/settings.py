@@ -8,7 +8,7 @@ from pydantic.dataclasses import dataclass
 from unjam.parameters import STRICT, Count, CountOrNone, NotNegative, Positive
 
 BaseName = Literal["idm", "population", "acc", "ovm", "none"]
-ErrorName = Literal["unexplained", "total_variation", "released"]
+ErrorName = Literal["unexplained", "transitions", "total_variation", "released"]
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -28,6 +28,9 @@ class VirtualSettings:
     """networks in the ensemble"""
     hidden: Annotated[tuple[Count, ...], Field(min_length=1)] = (64, 64)
     """units of the hidden layers of each network"""
+    fall_back: bool = True
+    """whether the networks begin by adding nothing to the base, which stands alone where they are worse on
+    the holdout; the paper's begin as they are drawn, and are always added"""
     rows: Count = 100_000
     """actual decisions that are kept, the newest, rounded up to whole episodes"""
     fit_rows: Count = 10_000
