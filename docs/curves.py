@@ -1,4 +1,4 @@
-"""Learning with the virtual environment and without it, from what `unjam reproduce table-2` made."""
+"""Learning with the virtual environment and without it, from what `unjam reproduce` made."""
 
 import json
 from io import BytesIO
@@ -13,25 +13,39 @@ from studies import rows_of
 from unjam.studies.comparison import interval
 
 LABELS = {"ours": "with the virtual environment", "ours-without-model": "without"}
-COLOURS = {"ours": "#2b6cb0", "ours-without-model": "#e07a1f"}
+IMAGINED = {
+    "best-imagined": "whole roads imagined besides",
+    "best": "without, in large iterations",
+    "best-few": "without, in small ones",
+}
+COLOURS = ("#2b6cb0", "#e07a1f", "#7b8794")
 
 
-def validations(variant: str) -> tuple[np.ndarray, np.ndarray]:
-    """Return actual steps, shape (points,), and the returns on the validation seeds, shape (runs, points)."""
-    curves = json.loads((RESULTS / "table-2" / "curves.json").read_text())["ring"][variant]
-    return np.array(curves["steps"]), np.array(curves["return_validation"])
+def validations(variant: str, study: str = "table-2") -> tuple[np.ndarray, np.ndarray]:
+    """Return actual steps, shape (points,), and the returns on the validation seeds, shape (runs, points).
+
+    Before a training was validated for the first time there is nothing.
+    """
+    curves = json.loads((RESULTS / study / "curves.json").read_text())["ring"][variant]
+    steps, values = np.array(curves["steps"]), np.array(curves["return_validation"])
+    first = int(np.argmax((values != values[:, :1]).any(0)))  # until then the first is all that is known
+    return steps[max(0, first - 1) :], values[:, max(0, first - 1) :]
 
 
-def draw() -> Image:
-    """Draw validation against actual steps: mean and range of the runs."""
+def draw(labels: dict[str, str] = LABELS, study: str = "table-2", lowest: float | None = None) -> Image:
+    """Draw validation against actual steps: mean and range of the runs; from `lowest` on, steps by powers."""
     figure = Figure(figsize=(9, 3.6), layout="constrained")
     axes = figure.subplots()
-    for variant, label in LABELS.items():
-        steps, curves = validations(variant)
-        axes.fill_between(
-            steps / 1000, curves.min(0), curves.max(0), color=COLOURS[variant], alpha=0.15, lw=0
-        )
-        axes.plot(steps / 1000, curves.mean(0), color=COLOURS[variant], label=label)
+    most = 0.0
+    for (variant, label), colour in zip(labels.items(), COLOURS, strict=False):
+        steps, curves = validations(variant, study)
+        most = max(most, curves.max())
+        axes.fill_between(steps / 1000, curves.min(0), curves.max(0), color=colour, alpha=0.15, lw=0)
+        axes.plot(steps / 1000, curves.mean(0), color=colour, label=label)
+    if lowest is not None:
+        axes.set_xscale("log")
+        axes.xaxis.set_major_formatter("{x:,.0f}")
+        axes.set_ylim(lowest, most + 5.0)
     axes.set_xlabel("actual simulator steps [thousands]")
     axes.set_ylabel("return of an episode, validation")
     axes.legend(frameon=False)
