@@ -6,6 +6,7 @@ import math
 import os
 import shutil
 import sys
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -114,6 +115,16 @@ def append_line(path: Path, line: str) -> None:
             os.fsync(file.fileno())
     except OSError as error:
         raise _disk(error, path) from None
+
+
+def read_lines(path: Path) -> list[dict[str, Any]]:
+    """Return the tables in a file of JSON lines; what is damaged, or cut short by a crash, is left out."""
+    rows = []
+    for line in path.read_text(errors="replace").splitlines() if path.is_file() else ():
+        with suppress(ValueError, RecursionError):
+            if isinstance(row := json.loads(line), dict):
+                rows.append(row)
+    return rows
 
 
 def check_folder(path: Path) -> None:

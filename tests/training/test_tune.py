@@ -16,6 +16,7 @@ from unjam.measures.metrics import measure
 from unjam.scenarios import FigureEight, Ring
 from unjam.training.search import Choice, Range
 from unjam.training.seeds import TUNE, tuning_seeds
+from unjam.training.tried import TRIED
 from unjam.training.tune import EPISODES, FINALISTS, OF_EACH, TUNED, space_around, tune
 from unjam.worlds.episode import run_episode
 from unjam.worlds.sumo.simulation import Simulation
@@ -51,6 +52,33 @@ def test_the_same_seed_tries_the_same_settings_whoever_drives(tmp_path: Path) ->
             (folder := tmp_path / str(count)).mkdir()
             tried.append(tune({"ring": SMALL}, "pi", SPACE, STEPS, folder, workers).settings)
     assert tried[0] == tried[1]
+
+
+def test_a_tuning_that_was_stopped_goes_on_where_it_was(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with Workers(1) as workers:
+        whole = tune({"ring": SMALL}, "pi", SPACE, STEPS, tmp_path / "whole", workers)
+        folder, lines, driven = tmp_path / "stopped", list[str](), list[int]()
+
+        def stop(line: str) -> None:
+            lines.append(line)
+            if len(lines) == 2:
+                raise KeyboardInterrupt
+
+        with pytest.raises(KeyboardInterrupt):
+            tune({"ring": SMALL}, "pi", SPACE, STEPS, folder, workers, on_line=stop)
+        run = Workers.run
+        monkeypatch.setattr(Workers, "run", lambda pool, tasks: driven.append(len(tasks)) or run(pool, tasks))
+        with (folder / TRIED).open("a") as file:
+            file.write('{"first": 0, "driver": "cut sho')
+        found = tune({"ring": SMALL}, "pi", SPACE, STEPS, folder, workers)
+        assert (found.settings, found.best, found.default) == (whole.settings, whole.best, whole.default)
+        assert driven == [EPISODES, EPISODES, (FINALISTS - 1 + 1) * 2 * EPISODES]  # the last two, finalists
+        assert len(json.loads((folder / TUNED).read_text())["manifest"]["starts"]) == 2
+        with pytest.raises(InputError, match="is of another tuning"):
+            tune({"ring": SMALL}, "pi", SPACE, STEPS, folder, workers, seed=1)
+    assert tune({"ring": SMALL}, "pi", SPACE, STEPS, folder, workers).best == whole.best  # nobody drives
 
 
 def test_screened_settings_are_judged_as_sumo_judges_them(tmp_path: Path, simulation: Simulation) -> None:

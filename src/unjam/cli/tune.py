@@ -55,7 +55,8 @@ def tune(
     """Tune an expert's parameters: what needs no learning, with the steps that learning has.
 
     Settings are judged on seeds of their own, under the road's limits and filter; those that no car could
-    drive do not count. The tuned expert is a controller that every verb takes.
+    drive do not count. The tuned expert is a controller that every verb takes. After a stop the same command
+    with the same --out goes on.
 
     Examples:
 
@@ -69,6 +70,7 @@ def tune(
     from unjam.training.family import FAMILY, is_family, roads_of
     from unjam.training.folder import new_and_owned
     from unjam.training.search import space_of
+    from unjam.training.tried import ASKED
     from unjam.training.tune import space_around
     from unjam.training.tune import tune as run
     from unjam.worlds.batch.world import why_not
@@ -89,7 +91,7 @@ def tune(
     around = space_around(expert, made.decision_step)
     space = space_of(vary) if vary else around
     folder = new_folder(out, f"tune-{Path(scenario).stem}")
-    with new_and_owned(folder), Workers(workers) as pool:
+    with new_and_owned(folder, or_with=ASKED), Workers(workers) as pool:
         found = run(
             *(roads, expert, space, steps, folder, pool, reward, seed),
             (lambda line: None) if json else aside.print,

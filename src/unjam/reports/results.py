@@ -3,7 +3,6 @@
 import json
 import shlex
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,7 @@ from numpy.typing import NDArray
 from safetensors.numpy import load_file
 
 from unjam.errors import InputError
-from unjam.files import DAMAGED
+from unjam.files import DAMAGED, read_lines
 from unjam.measures.metrics import METRICS
 from unjam.worlds.record import Episode
 
@@ -173,12 +172,7 @@ def read_rows(folder: Path) -> dict[str, list[dict[str, Any]]]:
 
 def read_progress(folder: Path) -> list[dict[str, Any]]:
     """Return the rows of a run's progress; one that is damaged, or cut short by a crash, is left out."""
-    rows = []
-    for line in _text(folder / "progress.jsonl").splitlines():
-        with suppress(ValueError, RecursionError):
-            if isinstance(row := json.loads(line), dict) and "iteration" in row:
-                rows.append(row)
-    return rows
+    return [row for row in read_lines(folder / "progress.jsonl") if "iteration" in row]
 
 
 def validations_of(progress: Sequence[dict[str, Any]]) -> tuple[float, float] | None:

@@ -88,16 +88,23 @@ def make_new_folder(folder: Path, otherwise: str = "") -> None:
 
 
 @contextmanager
-def new_and_owned(folder: Path) -> Iterator[None]:
+def new_and_owned(folder: Path, or_with: str = "") -> Iterator[None]:
     """Make a folder, and hold it for this process alone; one that stays empty is removed again.
+
+    It may be an old one where it has a file `or_with`.
 
     Raises:
         InputError: it holds something already, or another process holds it.
     """
-    make_new_folder(folder)
+
+    def check() -> None:
+        if not (or_with and (folder / or_with).is_file()):
+            make_new_folder(folder)
+
+    check()
     try:
         with owned(folder):
-            make_new_folder(folder)  # another may have written it until just now
+            check()  # another may have written it until just now
             yield
     finally:
         with suppress(OSError):  # it holds something: all went well

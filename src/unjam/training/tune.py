@@ -6,7 +6,7 @@ limits and filter. Settings that no car could drive do not count.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
-from functools import partial
+from functools import cache, partial
 from math import inf
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin, get_type_hints
@@ -26,9 +26,10 @@ from unjam.measures.metrics import measure
 from unjam.scenarios import scenario_recipe
 from unjam.scenarios.scenario import Scenario
 from unjam.training.evaluate import raise_failure
-from unjam.training.folder import make_new_folder, origin
+from unjam.training.folder import origin
 from unjam.training.search import Choice, Range, Space, quiet_optuna
 from unjam.training.seeds import tuning_seeds
+from unjam.training.tried import Tried, Verdict
 from unjam.worlds.batch.run import run_batch
 from unjam.worlds.batch.world import why_not
 from unjam.worlds.record import Episode
@@ -132,6 +133,8 @@ def tune(
 ) -> Tuned:
     """Search an expert's parameters, and write `tuned.json` and the expert as `EXPERT.unjam` into a folder.
 
+    What was tried is kept there: a tuning that was stopped goes on where it was, and finds the same.
+
     On one road the return is maximised. On several it is the mean over the roads of the share that is gained
     of what people alone leave to be gained; who could not be driven on a road gains nothing there.
 
@@ -140,7 +143,7 @@ def tune(
         expert: its name.
         space: what is varied, of `space_around` or `search.space_of`.
         steps: that may be driven in all.
-        folder: new, or empty.
+        folder: new, empty, or that of this tuning.
         workers: drive; the result does not depend on how many.
         reward: what is maximised on one road; empty: the scenario's own.
         seed: of the proposals.
@@ -149,7 +152,8 @@ def tune(
             the finalists, and the expert as it is, in SUMO.
 
     Raises:
-        InputError: the steps are too few, a parameter is wrong, or a road cannot be stepped in a batch.
+        InputError: the steps are too few, a parameter is wrong, a road cannot be stepped in a batch, or the
+            folder holds something else.
         UnjamError: no car could drive any of the settings.
         MissingPartError: Optuna is not installed.
     """
@@ -163,23 +167,22 @@ def tune(
     for scenario in roads.values() if screen else ():
         if why := why_not(scenario):
             raise InputError(f"screen: {why}")
-    make_new_folder(folder)
-    run = partial(_in_sumo, workers)
-    alone = {
-        first: _driven(roads, ["human"], first, count, reward, run)[0] if len(roads) > 1 else {}
-        for first, count in ((0, episodes), (episodes, 2 * episodes))
-    }
+    recipes = {road: scenario_recipe(scenario) for road, scenario in roads.items()}
+    wanted = {"roads": recipes, "expert": expert, "space": repr(space), "steps": steps, "reward": reward}
+    tried, run = Tried(folder, wanted | {"seed": seed, "screen": screen}), partial(_in_sumo, workers)
+
+    @cache
+    def alone(first: int, count: int) -> dict[str, Rows]:
+        return _driven(roads, ["human"], first, count, reward, run)[0] if len(roads) > 1 else {}
 
     def judged(all_values: list[dict[str, Any]], first: int, count: int, run: Run) -> list[Setting]:
         texts = [labelled(expert, values) for values in all_values]
-        wrong = {text: why for text in texts if (why := _not_made(text))}
-        found = iter(_driven(roads, [each for each in texts if each not in wrong], first, count, reward, run))
-        return [
-            Setting(
-                text, values, *((None, wrong[text]) if text in wrong else _score(next(found), alone[first]))
-            )
-            for text, values in zip(texts, all_values, strict=True)
-        ]
+        scores: dict[str, Verdict] = {text: (None, why) for text in texts if (why := _not_made(text))}
+        new = [text for text in texts if text not in scores and (first, text) not in tried.known]
+        for text, rows in zip(new, _driven(roads, new, first, count, reward, run), strict=True):
+            tried.keep(first, text, _score(rows, alone(first, count)))
+        scores |= {text: tried.known[first, text] for text in texts if text not in scores}
+        return [Setting(text, values, *scores[text]) for text, values in zip(texts, all_values, strict=True)]
 
     optuna, settings = quiet_optuna("tune"), list[Setting]()
     sampler = optuna.samplers.TPESampler(seed=seed, multivariate=True)
@@ -208,7 +211,7 @@ def tune(
     file = folder / f"{expert}{SUFFIX}"
     actual, imagined = (final, trials * each) if screen else (trials * each + final, 0)
     tuned = Tuned(best, default, settings, actual, imagined, file)
-    _write(roads, expert, tuned, folder, reward, seed)
+    _write(roads, expert, tuned, folder, reward, seed, tried.starts)
     return tuned
 
 
@@ -278,7 +281,13 @@ def _rounded(value: Any) -> Any:
 
 
 def _write(
-    roads: Mapping[str, Scenario], expert: str, found: Tuned, folder: Path, reward: str, seed: int
+    roads: Mapping[str, Scenario],
+    expert: str,
+    found: Tuned,
+    folder: Path,
+    reward: str,
+    seed: int,
+    starts: list[dict[str, Any]],
 ) -> None:
     recipes = {road: scenario_recipe(scenario) for road, scenario in roads.items()}
     scenario = next(iter(roads.values()))
@@ -299,4 +308,7 @@ def _write(
     content = controller_bytes(driver, {**origin(scenario, driver), "tuned": tuned})
     write_whole(found.file, content)
     rows = [asdict(one) for one in found.settings]
-    write_whole(folder / TUNED, to_json({**about, "manifest": manifest(), "settings": rows}, indent=1))
+    write_whole(
+        folder / TUNED,
+        to_json({**about, "manifest": {**manifest(), "starts": starts}, "settings": rows}, indent=1),
+    )
