@@ -118,7 +118,7 @@ def test_a_seed_that_would_train_on_the_judging_episodes_is_refused(seed: int) -
 
 
 def test_an_unknown_preset_lists_the_known() -> None:
-    with pytest.raises(InputError, match="preset: 'papre' is not allowed; allowed: paper, demo"):
+    with pytest.raises(InputError, match="preset: 'papre' is not allowed; allowed: paper, paper-exact, demo"):
         load_config(preset="papre")
 
 
