@@ -8,7 +8,7 @@ from pydantic import BeforeValidator, ConfigDict, Field, TypeAdapter, Validation
 
 from unjam.errors import InputError, did_you_mean, wrong
 
-STRICT = ConfigDict(extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
+STRICT = ConfigDict(extra="forbid", allow_inf_nan=False)
 """Configuration of every parameter dataclass: an unknown name or a NaN is an error, not a surprise.
 
 The texts under its fields are what `unjam drivers` and the documentation show.

@@ -316,7 +316,7 @@ def test_bench_prints_ratios(unjam: Run) -> None:
 
 @pytest.mark.parametrize("verb", VERBS)
 def test_every_verb_explains_itself_with_an_example(verb: str, unjam: Run) -> None:
-    ran = unjam(verb, "--help", environment={"COLUMNS": "120"})
+    ran = unjam(verb, "--help")
     assert ran.returncode == 0
     assert f"unjam {verb}" in ran.stdout
     assert "Example" in ran.stdout

@@ -1,7 +1,11 @@
 """What episodes are made of: `unjam scenarios`, `unjam drivers`, and people made by `unjam fit-drivers`."""
 
+import ast
+import inspect
+import textwrap
 from dataclasses import asdict, is_dataclass
 from io import BytesIO
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -160,13 +164,27 @@ def parameter_rows(instance: Any) -> list[dict[str, Any]]:
     if not is_dataclass(instance) or isinstance(instance, type):
         return []
     about: dict[str, str] = {}
-    for base in reversed(type(instance).__mro__):  # pydantic forgets the texts of inherited fields
-        own = getattr(base, "__pydantic_fields__", {})
-        about |= {name: field.description for name, field in own.items() if field.description}
+    for base in reversed(type(instance).__mro__):
+        if is_dataclass(base):
+            about |= _texts_under_fields(base)
     return [
         {"name": name, "default": value, "about": about.get(name, "")}
         for name, value in asdict(instance).items()
     ]
+
+
+def _texts_under_fields(kind: type) -> dict[str, str]:
+    """Return the text under each field of a class; read from its source only where somebody asks."""
+    try:
+        (definition,) = ast.parse(textwrap.dedent(inspect.getsource(kind))).body
+    except (OSError, TypeError):
+        return {}  # a class without a file
+    texts = {}
+    for line, below in pairwise(getattr(definition, "body", [])):
+        match line, below:
+            case ast.AnnAssign(target=ast.Name(id=name)), ast.Expr(value=ast.Constant(value=str(text))):
+                texts[name] = inspect.cleandoc(text)
+    return texts
 
 
 def _parameter_table(rows: list[dict[str, Any]], title: str) -> Any:
