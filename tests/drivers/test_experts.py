@@ -36,6 +36,8 @@ EXPERTS = [
     "cruise",
     "jam-ahead",
     "jam-ahead:all_lanes=true,last=9",
+    "adaptive-acc",
+    "adaptive-acc:time_headway=1.2,front=0.5",
     "constant:acceleration=0.2",
 ]
 

@@ -9,6 +9,7 @@ import numpy as np
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
+from unjam.drivers.adaptive_acc import AdaptiveACC
 from unjam.drivers.by_road import KINDS_OF_ROAD, ByRoad
 from unjam.drivers.car_following import ACC, BCM, IDM, LACC, OVM, Constant, Human
 from unjam.drivers.driver import Driver, Recipe
@@ -27,7 +28,7 @@ from unjam.tree import Arrays
 
 _KINDS = (
     *(Human, IDM, PISaturation, PIFromGap, FollowerStopper, ACC, LACC, BCM, OVM),
-    *(Pacer, JamAbsorber, Cruise, JamAhead),
+    *(Pacer, JamAbsorber, Cruise, JamAhead, AdaptiveACC),
     Constant,
 )
 DRIVERS: dict[str, type[Driver]] = {kind.name: kind for kind in _KINDS}
