@@ -7,7 +7,7 @@ trainings of each variant: mean and range over the seeds.
 from collections.abc import Sequence
 from dataclasses import asdict, fields, replace
 from functools import partial
-from math import inf, nan
+from math import ceil, inf, nan
 from pathlib import Path
 from typing import Any
 
@@ -70,6 +70,8 @@ CONVENTION = {
     "std": ("speed_std_cav", "speed_std_cav"),
 }
 """the paper's columns: each as a metric of episodes, and as a number of the training batches"""
+LETTERS_OF_A_ROW, BESIDE_A_LABEL = 155, 8
+"""what a row of a legend holds, and what a label's line and margins take of it"""
 HONEST = (
     *("return", "return_eq16", "mean_speed", "mean_speed_steady", "speed_limit_ratio_steady"),
     *("speed_std_fleet", "time_to_dissolve", "throughput_veh_per_h", "backlog_veh"),
@@ -296,7 +298,10 @@ def draw_curves(
         axes.set_title(f"{road}: {label}")
         axes.margins(x=0.01)
         axes.set_xlabel("actual simulator steps [thousands]")
-    figure.legend(*figure.axes[-1].get_legend_handles_labels(), loc="outside upper left", ncols=6)
+    lines, labels = figure.axes[-1].get_legend_handles_labels()
+    lettered = sum(len(label) + BESIDE_A_LABEL for label in labels)
+    rows = ceil(lettered / LETTERS_OF_A_ROW)
+    figure.legend(lines, labels, loc="outside upper left", ncols=ceil(len(labels) / rows))
     return figure
 
 
