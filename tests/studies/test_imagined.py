@@ -14,11 +14,22 @@ def test_returns_stand_beside_those_of_as_few_steps_and_of_three_times_as_many(t
         "steps": [96_000.0, 6_000_000.0],
         "return_validation": [[1000.0, value] for value in (2e3, 2e3, 2e3)],
     }
-    curves = dict(zip(COMPARED, (modelled, few, many), strict=True))
+    middle = {"steps": [24_000.0, 1_512_000.0], "return_validation": [[*end, 2100.0] for end in ends]}
+    curves = dict(zip(COMPARED, (modelled, few, middle, many), strict=True))
     (tmp_path / "curves.json").write_text(json.dumps({"ring": curves}))
     table = imagined("ring").tables["efficiency"](tmp_path).set_index("")
     assert table.loc["ours, few steps and whole roads imagined", "750,000"] == "2125"
     assert table.loc["ours, few steps", "1,500,000"] == "–"
     assert table.loc["ours, all its steps", "380,000"] == "–"  # nobody had looked
-    assert table.loc["with the model beyond as few steps without it", "380,000"] == "+31"
-    assert table.loc["with the model beyond 3 times the steps without it", "750,000"].startswith("+7")
+    assert table.loc["with the model beyond “ours, few steps” after 1 times as many", "380,000"] == "+31"
+    assert table.loc["with the model beyond “ours, twice as many” after 2 times as many", "750,000"] == "+26"
+    assert table.loc[
+        "with the model beyond “ours, all its steps” after 3 times as many", "750,000"
+    ].startswith("+7")
+
+
+def test_what_a_training_takes_stands_beside_its_steps(tmp_path: Path) -> None:
+    rows = [{"variant": name, "trainings": 3, "seconds": 60.0 * place} for place, name in enumerate(COMPARED)]
+    (tmp_path / "table.json").write_text(json.dumps([{"variant": None, "trainings": 0}, *rows]))
+    table = imagined("ring").tables["durations"](tmp_path).set_index("")
+    assert table.loc["ours, twice as many"].tolist() == ["1,512,000", "2.0"]

@@ -1,6 +1,7 @@
 """What a virtual environment of whole roads saves: the same return from how many actual steps.
 
-The best method of a road, with the model and without it: on as few actual steps, and on all that it takes.
+The best method of a road, with the model and without it: on as few actual steps, on twice as many, and on all
+that it takes.
 """
 
 from dataclasses import replace
@@ -16,10 +17,10 @@ from unjam.studies.comparison import comparison_of
 from unjam.studies.study import VARIANTS, PlannedRun, Study, read_part
 from unjam.worlds.record import Floats
 
-MODELLED, FEW, MANY = COMPARED = ("best-imagined", "best-few", "best")
+MODELLED, FEW, MIDDLE, MANY = COMPARED = ("best-imagined", "best-few", "best-middle", "best")
 LOOKS = (190_000, 380_000, 750_000, 1_500_000, 3_000_000, 6_000_000)
 """actual steps after which trainings are looked at"""
-FEWER = 3
+TIMES = {FEW: 1, MIDDLE: 2, MANY: 3}
 """how many times the actual steps the method may take without the model"""
 
 
@@ -28,11 +29,25 @@ def efficiency(road: str, folder: Path) -> pd.DataFrame:
     curves = read_part(folder, "curves")[road]
     seen = {name: partial(_returns, curves[name], _first_look(road, name)) for name in COMPARED}
     rows = [_row(VARIANTS[name].label, [seen[name](at) for at in LOOKS]) for name in COMPARED]
-    few = [seen[MODELLED](at) - seen[FEW](at) for at in LOOKS]
-    many = [seen[MODELLED](at) - seen[MANY](FEWER * at) for at in LOOKS]
-    rows.append(_row("with the model beyond as few steps without it", few, "+"))
-    rows.append(_row(f"with the model beyond {FEWER} times the steps without it", many, "+"))
+    for name, times in TIMES.items():
+        beyond = [seen[MODELLED](at) - seen[name](times * at) for at in LOOKS]
+        rows.append(
+            _row(f"with the model beyond “{VARIANTS[name].label}” after {times} times as many", beyond, "+")
+        )
     return pd.DataFrame(rows)
+
+
+def durations(road: str, folder: Path) -> pd.DataFrame:
+    """Return how many minutes a training took, by variant; the machine is in the manifest."""
+    rows = {row["variant"]: row for row in read_part(folder, "table") if row["trainings"]}
+    return pd.DataFrame(
+        {
+            "": VARIANTS[name].label,
+            "actual steps": f"{PlannedRun(road, name, 0).config.steps:,}",
+            "minutes": f"{rows[name]['seconds'] / 60.0:.1f}",
+        }
+        for name in COMPARED
+    )
 
 
 def _first_look(road: str, variant: str) -> int:
@@ -57,4 +72,11 @@ def _row(label: str, columns: list[Floats], sign: str = "") -> dict[str, str]:
 def imagined(road: str) -> Study:
     """Return the study of a road."""
     compared = comparison_of(f"what a model of the whole road saves, on the {road}", COMPARED, road)
-    return replace(compared, tables={**compared.tables, "efficiency": partial(efficiency, road)})
+    return replace(
+        compared,
+        tables={
+            **compared.tables,
+            "efficiency": partial(efficiency, road),
+            "durations": partial(durations, road),
+        },
+    )

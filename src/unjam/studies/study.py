@@ -170,6 +170,7 @@ VARIANTS: dict[str, Variant] = {
     "ours-on-pi": Variant("ours on PI", "quick", {"expert": "pi"}),
     "best": Variant("ours, all its steps", "best", {}, None),
     "best-few": Variant("ours, few steps", "best", SMALL, 756_000),
+    "best-middle": Variant("ours, twice as many", "best", {"trpo.batch_steps": 24_000}, 1_512_000),
     "best-imagined": Variant("ours, few steps and whole roads imagined", "best", IMAGINED, 756_000),
 }
 """the paper's methods with the paper's settings, and what we make of them"""
