@@ -26,10 +26,3 @@ def test_returns_stand_beside_those_of_as_few_steps_and_of_three_times_as_many(t
     assert table.loc[
         "with the model beyond “ours, all its steps” after 3 times as many", "750,000"
     ].startswith("+7")
-
-
-def test_what_a_training_takes_stands_beside_its_steps(tmp_path: Path) -> None:
-    rows = [{"variant": name, "trainings": 3, "seconds": 60.0 * place} for place, name in enumerate(COMPARED)]
-    (tmp_path / "table.json").write_text(json.dumps([{"variant": None, "trainings": 0}, *rows]))
-    table = imagined("ring").tables["durations"](tmp_path).set_index("")
-    assert table.loc["ours, twice as many"].tolist() == ["1,512,000", "2.0"]

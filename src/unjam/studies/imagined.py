@@ -37,19 +37,6 @@ def efficiency(road: str, folder: Path) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def durations(road: str, folder: Path) -> pd.DataFrame:
-    """Return how many minutes a training took, by variant; the machine is in the manifest."""
-    rows = {row["variant"]: row for row in read_part(folder, "table") if row["trainings"]}
-    return pd.DataFrame(
-        {
-            "": VARIANTS[name].label,
-            "actual steps": f"{PlannedRun(road, name, 0).config.steps:,}",
-            "minutes": f"{rows[name]['seconds'] / 60.0:.1f}",
-        }
-        for name in COMPARED
-    )
-
-
 def _first_look(road: str, variant: str) -> int:
     """Return after how many steps a training is validated for the first time."""
     config = PlannedRun(road, variant, 0).config
@@ -72,11 +59,4 @@ def _row(label: str, columns: list[Floats], sign: str = "") -> dict[str, str]:
 def imagined(road: str) -> Study:
     """Return the study of a road."""
     compared = comparison_of(f"what a model of the whole road saves, on the {road}", COMPARED, road)
-    return replace(
-        compared,
-        tables={
-            **compared.tables,
-            "efficiency": partial(efficiency, road),
-            "durations": partial(durations, road),
-        },
-    )
+    return replace(compared, tables={**compared.tables, "efficiency": partial(efficiency, road)})
