@@ -161,7 +161,8 @@ def _table(road: str, folder: Path) -> pd.DataFrame:
     for row in read_part(folder, "robustness"):
         if row["road"] == road:
             cells = table.setdefault(row["condition"], {"": row["condition"]})
-            cells[f"{row['driver']} [m/s]"] = number(row["mean_speed"]["mean"], 2)
+            label = {PEOPLE: "people alone"}.get(row["driver"], row["driver"])
+            cells[f"{label} [m/s]"] = number(row["mean_speed"]["mean"], 2)
             if row["driver"] == TRAINED:
                 cells["beyond it [m/s]"] = interval(row["faster_than_expert"], 2, "+")
                 cells["smallest headway [s]"] = number(row["min_headway"]["smallest"], 2)
