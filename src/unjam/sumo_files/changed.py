@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from xml.sax.saxutils import quoteattr
 
+from unjam.errors import wrong
 from unjam.files import to_json, write_whole
 from unjam.processes import PrivateFolder
 from unjam.sumo_files import SumoFiles, copy_harmless
@@ -26,10 +27,14 @@ def write_changed(files: SumoFiles, types: Types, scale: float, path: Path) -> P
         path: of the new configuration.
 
     Raises:
-        InputError: a file is broken, or too large.
+        InputError: a file is broken, or too large, or the configuration's own scale is no number.
         DiskError: the disk is full or cannot be written.
     """
-    folder = path.parent
+    folder, before = path.parent, files.options.get("scale", "1")
+    try:
+        scaled = float(before) * scale
+    except ValueError:
+        raise wrong(f"{files.path.name}: scale", before, "a number") from None
     names: dict[str, list[str]] = {"additional-files": [], "route-files": []}
     undefined = {name: types[name] for name in types if "id" not in files.types[name]}
     if undefined:  # SUMO's default type may be defined before any vehicle has it
@@ -54,7 +59,7 @@ def write_changed(files: SumoFiles, types: Types, scale: float, path: Path) -> P
         **{option: ",".join(found) for option, found in names.items() if found},
         **files.options,
         "step-length": f"{files.step:g}",
-        "scale": f"{float(files.options.get('scale', 1)) * scale:.6g}",
+        "scale": f"{scaled:.6g}",
     }
     lines = [f"    <{name} {_attributes({'value': value})}/>" for name, value in values.items()]
     write_whole(path, "\n".join(["<configuration>", *lines, "</configuration>", ""]))
