@@ -1,7 +1,7 @@
 """How near roads come to what was measured on the day they were calibrated to, and on another.
 
-Its arguments are the file for the answer, a file of factors that are known, those of the measurements, and the
-roads: name=file.sumocfg.
+Its arguments are the file for the answer, a file of factors that are known, those of the measurements, and
+the roads: name=file.sumocfg.
 """
 
 import json
@@ -27,12 +27,8 @@ with Counting(2) as counting:
         passed = counting.run(one.scenario(Path(road)), held_out_seeds(JUDGED), one.loops)
         found[name] = {}
         for day, here in days.items():
-            rows = [
-                agreement(here.measured, *detected(here.measured, here.loops_of, each)) for each in passed
-            ]
-            found[name][day] = {
-                measure: asdict(estimate([getattr(row, measure) for row in rows]))
-                for measure in asdict(rows[0])
-            }
+            each_day = (detected(here.measured, here.loops_of, each) for each in passed)
+            rows = [asdict(agreement(here.measured, *both)) for both in each_day]
+            found[name][day] = {key: asdict(estimate([row[key] for row in rows])) for key in rows[0]}
 answer = {"factors": json.loads(factors.read_text()), "agreement": found, "manifest": manifest()}
 told.write_text(to_json(answer, indent=1))

@@ -1,7 +1,7 @@
 """What detectors would measure on SUMO's motorway ramp if its people kept more distance and were fewer.
 
-Its arguments are the .sumocfg file, a new folder for the road with the known factors, and the files for what is
-measured there on several days, each a seed that is used nowhere else.
+Its arguments are the .sumocfg file, a new folder for the road with the known factors, and the files for what
+is measured there on several days, each a seed that is used nowhere else.
 """
 
 import sys
