@@ -50,6 +50,7 @@ VERBS = [
     "drivers",
     "drive",
     "assess",
+    "calibrate",
     "train",
     "evaluate",
     "model",

@@ -126,6 +126,26 @@ WRONG: dict[str, tuple[str, list[str]]] = {
         "full' is not empty",
         ["assess good.sumocfg --out full"],
     ),
+    "calibrating a road of the package": (
+        "scenario: 'ring' is not allowed; allowed: your own .sumocfg file",
+        ["calibrate ring --detectors counts.csv"],
+    ),
+    "calibrating without measurements": (
+        "'none.csv' is not a file",
+        ["calibrate good.sumocfg --detectors none.csv"],
+    ),
+    "measurements that are words": (
+        "counts.csv: line 2: flow_veh_per_h: 'many' is not allowed; allowed: a number >= 0",
+        ["calibrate good.sumocfg --detectors counts.csv"],
+    ),
+    "detector that is nowhere": (
+        "edge: 'nowhere' is not allowed; allowed: one of good.net.xml",
+        ["calibrate good.sumocfg --detectors astray.csv"],
+    ),
+    "calibrating what there is not": (
+        "did you mean 'tau'",
+        ["calibrate good.sumocfg --detectors counts.csv --vary tua=1..2"],
+    ),
     "exporting to a file of another kind": ("ends in .unjam", ["export pi --to pi.zip"]),
     "exporting Python code": ("is Python code", ["export mine.py:gentle --to mine.unjam"]),
     "verifying what is not there": ("does not exist", ["verify none.unjam"]),
@@ -166,6 +186,9 @@ def files(tmp_path: Path, my_drivers: Path) -> None:
             f'<configuration><net-file value="{name}.net.xml"/><route-files value="{name}.rou.xml"/>'
             "</configuration>"
         )
+    head = "edge,position,begin,end,flow_veh_per_h,speed"
+    for name, row in {"counts": "a,1,0,60,many,20", "astray": "nowhere,1,0,60,900,20"}.items():
+        (tmp_path / f"{name}.csv").write_text(f"{head}\n{row}\n")
     (tmp_path / "nested.toml").write_text("a = " + "[" * 100_000)
     (tmp_path / "number.toml").write_text("steps = " + "9" * 5000)
     (tmp_path / "deep.toml").write_text(f"a{'.a' * 50_000} = 1")

@@ -10,6 +10,7 @@ from typing import Annotated
 import typer
 
 from unjam import __version__
+from unjam.cli.calibrate import calibrate
 from unjam.cli.drive import assess, drive, watch
 from unjam.cli.machine import bench, doctor
 from unjam.cli.options import with_trust
@@ -52,7 +53,7 @@ def _root(
 MAY_RUN_CODE = (drive, assess, train, evaluate, model, search, export, certify, verify, watch)
 """verbs that take folders which can name Python code"""
 for verb in (
-    *(scenarios, drivers, drive, assess, train, evaluate, model, fit_drivers),
+    *(scenarios, drivers, drive, assess, calibrate, train, evaluate, model, fit_drivers),
     *(report, tune, search, reproduce, export, certify, keys, sign, verify, watch, bench, doctor),
 ):
     app.command()(with_trust(verb) if verb in MAY_RUN_CODE else verb)

@@ -117,13 +117,15 @@ def read_lanes(path: Path) -> list[Lane]:
     return [(edge, length, [(x, y) for x, y in line]) for edge, length, line in lanes]
 
 
-def copy_harmless(path: Path, copy: Path) -> None:
+def copy_harmless(path: Path, copy: Path, types: Path | None = None) -> None:
     """Write one of SUMO's files again without what makes SUMO write a file, listen, or read another file.
+
+    Vehicle types get the attributes that a JSON file `types` has for them, by id.
 
     Raises:
         InputError: it is broken, or too large.
     """
-    _ask("copy", path, copy)
+    _ask("copy", path, copy, *([types] if types else []))
 
 
 def stamp_of(file: Path) -> tuple[int, int]:

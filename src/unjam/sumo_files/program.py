@@ -164,12 +164,13 @@ def _check_network(path: Path, found: "_Filter") -> None:
 class _Filter:
     """Follows an XML file, and writes what is harmless of it to `out`, if there is one.
 
-    Names are those in the file, with their prefixes, as SUMO takes them.
+    Names are those in the file, with their prefixes, as SUMO takes them. Vehicle types get the attributes
+    that `types` has for their ids.
     """
 
-    def __init__(self, path: Path, out: IO[str] | None) -> None:
+    def __init__(self, path: Path, out: IO[str] | None, types: dict[str, dict[str, str]]) -> None:
         self._write = out.write if out else lambda text: None
-        self._within = 0
+        self._within, self._types = 0, types
         """open elements within one that was dropped, itself included"""
         self.root, self.version = "", ""
         self.dropped: set[str] = set()
@@ -191,6 +192,7 @@ class _Filter:
         if kept is None:
             self._within += 1
         else:
+            kept |= self._types.get(kept.get("id", ""), {}) if tag == "vType" else {}
             inside = "".join(f" {name}={quoteattr(value)}" for name, value in kept.items())
             self._write(f"<{tag}{inside}>")
 
@@ -226,11 +228,11 @@ class _Filter:
         self.to_copy = True
 
 
-def _filtered(path: Path, out: IO[str] | None = None) -> _Filter:
+def _filtered(path: Path, out: IO[str] | None = None, types: dict[str, Any] | None = None) -> _Filter:
     """Follow an XML file to its end; raise `Broken` where it has a document type, or is no XML."""
     try:
         _refuse_definitions(path)
-        found = _Filter(path, out)
+        found = _Filter(path, out, types or {})
         with _open(path) as file:
             while chunk := file.read(CHUNK):
                 found.parser.Parse(chunk, False)
@@ -240,10 +242,11 @@ def _filtered(path: Path, out: IO[str] | None = None) -> _Filter:
     return found
 
 
-def _copy(path: Path, copy: Path) -> None:
-    """Write an XML file again without what is not harmless."""
+def _copy(path: Path, copy: Path, types: Path | None = None) -> None:
+    """Write an XML file again without what is not harmless, vehicle types changed as a JSON file says."""
+    changes = json.loads(types.read_bytes()) if types else {}
     with open(copy, "w", encoding="utf-8") as out:
-        _filtered(path, out)
+        _filtered(path, out, changes)
 
 
 class _Demand(NamedTuple):

@@ -12,7 +12,7 @@ pacers had been chosen with those in sight.)"""
 VALIDATE = 1_000_033
 """first number of the seeds that choose a controller among those of a training"""
 TUNE = 1_000_037
-"""first number of the seeds that choose an expert's parameters"""
+"""first number of the seeds that choose an expert's parameters, or those of the people on a user's road"""
 
 CHOOSE = 1_000_081
 """first number of the seeds that choose who drives on a road of the user's own"""
@@ -29,5 +29,5 @@ def choosing_seeds(count: int, first: int = 0) -> list[tuple[int, ...]]:
 
 
 def tuning_seeds(count: int, first: int = 0) -> list[tuple[int, ...]]:
-    """Return seeds that choose an expert's parameters, from number `first` on."""
+    """Return seeds that choose parameters of an expert or of people, from number `first` on."""
     return [(TUNE, index) for index in range(first, first + count)]

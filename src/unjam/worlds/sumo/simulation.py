@@ -96,6 +96,8 @@ class Simulation:
         """who left the road at the end of its route in the last step"""
         self.colliding: Callable[[], Sequence[str]] = call("simulation", "getCollidingVehiclesIDList")
         """who touched another in the last step"""
+        self.on_loop: Callable[[str], Sequence[Any]] = call("inductionloop", "getVehicleData")
+        """who was on a loop in the last step: (name, length, when it came, when it left or -1, type)"""
         self.waiting: Callable[[], Sequence[str]] = call("simulation", "getPendingVehicles")
         """who wants to enter and cannot"""
 

@@ -1,0 +1,187 @@
+"""A road of the user's own with detectors, and what of its people and their number can be varied."""
+
+import re
+from dataclasses import dataclass
+from math import inf
+from pathlib import Path
+from typing import Any
+
+from unjam.controller.file import hash_of
+from unjam.errors import InputError, did_you_mean, wrong, wrong_name
+from unjam.measures.detectors import Measurement, read_detectors
+from unjam.scenarios.own_network import OwnNetwork, own_network
+from unjam.sumo_files import SumoFiles, read_sumo_files
+from unjam.training.assess import NOBODY
+from unjam.training.search import Range, Space, space_of
+from unjam.worlds.sumo.detectors import Loop
+from unjam.worlds.sumo.networks import edge_lengths, lane_counts
+
+FLOWS = "flows"
+"""factor on the number of vehicles, of all types"""
+VARIED: Space = {
+    "tau": Range(0.5, 2.0, log=True),
+    "accel": Range(0.5, 2.0, log=True),
+    "decel": Range(0.5, 2.0, log=True),
+    "minGap": Range(0.5, 2.0, log=True),
+    "speedFactor": Range(0.8, 1.25, log=True),
+    FLOWS: Range(0.67, 1.5, log=True),
+}
+"""factors on the attributes of passenger vehicle types, and on flows"""
+SUMO_DEFAULTS = {"tau": 1.0, "accel": 2.6, "decel": 4.5, "minGap": 2.5, "speedFactor": 1.0}
+"""of passenger types that do not say otherwise"""
+PASSENGER = "passenger"
+DISTRIBUTED = re.compile(r"(normc?)\(([^()]*)\)")
+"""a speed factor that each vehicle draws"""
+
+Factors = dict[str, float]
+"""by the names of `VARIED`"""
+
+
+@dataclass(frozen=True)
+class Corridor:
+    """A network and what its detectors measured; everything in it has been checked."""
+
+    files: SumoFiles
+    detectors: Path
+    begin: float
+    """[s]"""
+    end: float
+    """[s]"""
+    measured: tuple[Measurement, ...]
+    """intervals that lie between these two"""
+    left_out: int
+    """intervals that do not"""
+    loops: tuple[Loop, ...]
+    loops_of: tuple[tuple[int, ...], ...]
+    """numbers of the loops of each interval"""
+
+    def scenario(self, file: Path) -> OwnNetwork:
+        """Return a network's traffic, people alone, until nothing more is measured."""
+        changes = {"cav_share": NOBODY, "cav_types": (), "begin": self.begin, "end": self.end}
+        return own_network(str(file), changes)
+
+    def about(self) -> dict[str, Any]:
+        """Return what a calibration is about: names and hashes of the files, and what is measured when."""
+        files = self.files
+        named = [self.detectors, files.path, files.network, *files.additional_files, *files.route_files]
+        return {
+            "scenario": files.path.name,
+            "detectors": self.detectors.name,
+            "files": [{"name": path.name, "sha256": hash_of(path.read_bytes())} for path in named],
+            "begin": self.begin,
+            "end": self.end,
+            "intervals": {"used": len(self.measured), "left_out": self.left_out},
+        }
+
+
+def corridor(file: str, detectors: Path, begin: float | None = None, end: float | None = None) -> Corridor:
+    """Return a network and what its detectors measured, once both have been checked.
+
+    Args:
+        file: a .sumocfg file.
+        detectors: a CSV file, as `measures.detectors.read_detectors` reads it.
+        begin: when to begin [s]; None: as the configuration says.
+        end: when to end [s]; None: as the configuration says, or with the last interval.
+
+    Raises:
+        InputError: one of them is wrong, a detector has no place on the road, or nothing can be varied.
+    """
+    if not file.endswith(".sumocfg"):
+        raise wrong("scenario", file, "your own .sumocfg file")
+    kind, rows = read_detectors(detectors)
+    # People alone: the share is so small that nobody has it.
+    checked = own_network(file, {"cav_share": NOBODY, **({} if begin is None else {"begin": begin})})
+    files = read_sumo_files(Path(checked.file))
+    first = files.begin if begin is None else begin
+    last = next((limit for limit in (end, files.end) if limit is not None), inf)
+    kept = [row for row in rows if row.begin >= first and row.end <= last]
+    if not kept:
+        raise InputError(f"{detectors.name}: no interval lies between {first:g} s and {last:g} s")
+    if not passenger_types(files):
+        known = ", ".join(sorted(files.used_types))
+        raise InputError(f"{files.path.name}: no vehicle type is a passenger car; its types are {known}")
+    lanes = [_lanes(files.network, kind, row) for row in kept]
+    loops = {
+        loop: number for number, loop in enumerate(dict.fromkeys(loop for each in lanes for loop in each))
+    }
+    return Corridor(
+        files,
+        detectors,
+        first,
+        max(row.end for row in kept),
+        tuple(kept),
+        len(rows) - len(kept),
+        tuple(loops),
+        tuple(tuple(loops[loop] for loop in each) for each in lanes),
+    )
+
+
+def _lanes(network: Path, kind: str, row: Measurement) -> list[Loop]:
+    """Return the loops of a detector; raise `InputError` where the network has no such place."""
+    counts, lengths = lane_counts(network), edge_lengths(network)
+    edge = row.place if kind == "edge" else row.place.rpartition("_")[0]
+    all_lanes = [f"{edge}_{number}" for number in range(counts.get(edge, 0))]
+    lanes = all_lanes if kind == "edge" else [lane for lane in all_lanes if lane == row.place]
+    if not lanes:
+        raise wrong(kind, row.place, f"one of {network.name}{did_you_mean(row.place, all_lanes or counts)}")
+    if row.position > lengths[edge]:
+        raise wrong(f"{kind} {row.place}: position", row.position, f"<= {lengths[edge]:g} m, its length")
+    return [Loop(lane, row.position) for lane in lanes]
+
+
+def passenger_types(files: SumoFiles) -> list[str]:
+    """Return the types of passenger cars that vehicles have; SUMO's default class is that one."""
+    return [
+        name
+        for name in sorted(files.used_types)
+        if files.types.get(name, {}).get("vClass", PASSENGER) == PASSENGER
+    ]
+
+
+def changed_types(files: SumoFiles, factors: Factors) -> dict[str, dict[str, str]]:
+    """Return the attributes of all passenger types once they are multiplied by `factors`, by id.
+
+    What would stay as it is is left out. A reaction time never falls below the simulation step: people would
+    collide.
+
+    Raises:
+        InputError: an attribute is no number.
+    """
+    found: dict[str, dict[str, str]] = {}
+    for name in passenger_types(files):
+        own = {**{key: str(value) for key, value in SUMO_DEFAULTS.items()}, **files.types.get(name, {})}
+        changed = {
+            key: _multiplied(f"vType {name}: {key}", own[key], factor, files.step if key == "tau" else 0.0)
+            for key, factor in factors.items()
+            if key != FLOWS and factor != 1
+        }
+        if changed:
+            found[name] = changed
+    return found
+
+
+def _multiplied(field: str, text: str, factor: float, least: float) -> str:
+    drawn = DISTRIBUTED.fullmatch(text.replace(" ", ""))
+    try:
+        if drawn:  # mean, deviation and bounds alike: every vehicle's own is multiplied
+            return f"{drawn[1]}({','.join(f'{float(part) * factor:.6g}' for part in drawn[2].split(','))})"
+        value = float(text)
+    except ValueError:
+        raise wrong(field, text, "a number, or norm(...) or normc(...) of numbers") from None
+    return f"{max(value * factor, min(value, least)):.6g}"
+
+
+def varied(texts: list[str]) -> Space:
+    """Return what is varied, from texts `tau=0.5..2` or `tau=0.5..2:log`; without any, all.
+
+    Raises:
+        InputError: a name is unknown, or these are no factors.
+    """
+    found: Space = {}
+    for name, values in (space_of(texts) if texts else VARIED).items():
+        if name not in VARIED:
+            raise wrong_name("vary", name, VARIED)
+        if not isinstance(values, Range) or not values.low > 0:
+            raise wrong(f"vary {name}", values.ends, "a range of factors > 0, as 0.5..2")
+        found[name] = Range(float(values.low), float(values.high), values.log)
+    return found

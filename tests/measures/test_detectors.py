@@ -1,0 +1,131 @@
+"""Detectors: what a file may hold, what passages make of it, and how near two traffics are."""
+
+from contextlib import suppress
+from math import isnan, nan
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from unjam.errors import InputError
+from unjam.measures.detectors import COLUMNS, Measurement, agreement, detected, geh, read_detectors
+from unjam.worlds.sumo.detectors import Passage
+
+HEAD = "edge,position,begin,end,flow_veh_per_h,speed"
+
+
+def file_of(folder: Path, *lines: str) -> Path:
+    """A file with these lines."""
+    path = folder / "detectors.csv"
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+number = st.floats(0, 1e6)
+measurements = st.builds(
+    lambda place, position, begin, length, flow, speed: Measurement(
+        place, position, begin, begin + length, flow, speed
+    ),
+    st.from_regex(r"[A-Za-z0-9_:#.-]{1,9}", fullmatch=True),
+    *(number, number, st.floats(1, 3600), number, number | st.just(nan)),
+)
+
+
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(rows=st.lists(measurements, min_size=1, max_size=5), kind=st.sampled_from(["edge", "lane"]))
+def test_what_is_written_is_read_again(rows: list[Measurement], kind: str, tmp_path: Path) -> None:
+    texts = [["" if isnan(value) else repr(value) for value in list(vars(row).values())[1:]] for row in rows]
+    lines = [",".join([row.place, *values]) for row, values in zip(rows, texts, strict=True)]
+    found_kind, found = read_detectors(file_of(tmp_path, ",".join((kind, *COLUMNS)), *lines))
+    assert found_kind == kind
+    assert str(found) == str(rows)  # NaN is not equal to itself
+
+
+def test_other_columns_orders_and_a_byte_order_mark_are_fine(tmp_path: Path) -> None:
+    path = tmp_path / "detectors.csv"
+    path.write_text(
+        "speed,name,lane,position,begin,end,flow_veh_per_h\n20,a,e_0,5,0,60,900\n", encoding="utf-8-sig"
+    )
+    assert read_detectors(path) == ("lane", [Measurement("e_0", 5.0, 0.0, 60.0, 900.0, 20.0)])
+
+
+@pytest.mark.parametrize(
+    ("lines", "words"),
+    [
+        ([HEAD], "has no rows"),
+        (["edge,begin"], "columns: 'edge, begin' is not allowed; allowed: edge or lane, position"),
+        ([f"lane,{HEAD}"], "columns"),
+        ([""], "columns"),
+        ([HEAD, "a,1,0,60,-5,20"], "line 2: flow_veh_per_h: '-5' is not allowed; allowed: a number >= 0"),
+        ([HEAD, "a,1,0,60,5,20", "a,1,0,60,many,20"], "line 3: flow_veh_per_h: 'many'"),
+        ([HEAD, "a,1,0,60,,20"], "flow_veh_per_h: ''"),
+        ([HEAD, "a,1,0,60"], "flow_veh_per_h: ''"),
+        ([HEAD, "a,1,0,60,5,nan"], "speed: 'nan'"),
+        ([HEAD, "a,inf,0,60,5,20"], "position: 'inf'"),
+        ([HEAD, "a,1,60,60,5,20"], "end: 60.0 is not allowed; allowed: after begin, 60 s"),
+        ([HEAD, ",1,0,60,5,20"], "edge: ''"),
+    ],
+)
+def test_what_is_wrong_is_told_with_its_line(lines: list[str], words: str, tmp_path: Path) -> None:
+    with pytest.raises(InputError) as error:
+        read_detectors(file_of(tmp_path, *lines))
+    assert words in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(content=st.binary(max_size=200))
+def test_whatever_a_file_holds_it_is_read_or_refused(content: bytes, tmp_path: Path) -> None:
+    path = tmp_path / "detectors.csv"
+    path.write_bytes(HEAD.encode() + b"\n" + content)
+    with suppress(InputError):
+        assert read_detectors(path)[1]
+
+
+def test_a_device_is_no_file_of_measurements() -> None:
+    with pytest.raises(InputError, match="is not a file"):
+        read_detectors(Path("/dev/zero"))
+
+
+def test_geh_is_that_of_the_manual() -> None:
+    # Worked by hand: sqrt(2 * 100^2 / 2100) and sqrt(2 * 50^2 / 150).
+    found = geh(np.array([1100.0, 100.0, 0.0]), np.array([1000.0, 50.0, 0.0]))
+    assert found == pytest.approx([3.0861, 5.7735, 0.0], abs=1e-4)
+
+
+def test_agreement_is_worked_by_hand() -> None:
+    rows = [Measurement("a", 0, 0, 60, 1000, 20), Measurement("a", 0, 60, 120, 50, nan)]
+    found = agreement(rows, np.array([1100.0, 100.0]), np.array([17.0, 30.0]))
+    assert found.geh == pytest.approx((3.0861 + 5.7735) / 2, abs=1e-4)
+    assert found.geh_below_5 == 0.5
+    assert found.flow_rmse == pytest.approx(np.sqrt((100**2 + 50**2) / 2))
+    assert found.speed_rmse == pytest.approx(3.0)
+    assert found.score == pytest.approx(found.geh / 5 + 3 / 20)
+
+
+def test_traffic_that_never_arrives_has_no_speed() -> None:
+    found = agreement([Measurement("a", 0, 0, 60, 600, 20)], np.array([0.0]), np.array([nan]))
+    assert found.speed_rmse == 20.0
+
+
+def test_passages_make_flows_and_speeds_of_each_interval() -> None:
+    rows = [
+        Measurement("a", 0, 0, 60, 0, 0),
+        Measurement("a", 0, 60, 180, 0, 0),
+        Measurement("b", 0, 0, 60, 0, 0),
+    ]
+    passed = [Passage(0, "x", 0.0, 10.0), Passage(1, "y", 59.9, 20.0), Passage(0, "z", 60.0, 30.0)]
+    flows, speeds = detected(rows, [(0, 1), (0, 1), (2,)], passed)
+    assert list(flows) == [120.0, 30.0, 0.0]
+    assert speeds[:2] == pytest.approx([15.0, 30.0])
+    assert isnan(speeds[2])
+
+
+def test_who_changes_lanes_over_the_loops_of_an_edge_is_counted_once() -> None:
+    rows = [Measurement("a", 0, 0, 600, 0, 0)]
+    passed = [Passage(0, "x", 1.0, 10.0), Passage(1, "x", 1.4, 12.0), Passage(0, "x", 300.0, 14.0)]
+    flows, speeds = detected(rows, [(0, 1)], passed)
+    assert flows[0] == 2 * 6  # a lap later it passes once more
+    assert speeds[0] == 12.0

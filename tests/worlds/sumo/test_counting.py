@@ -1,0 +1,49 @@
+"""Detectors on a road in SUMO: the same whoever counts, and other simulations go on after one that failed."""
+
+from pathlib import Path
+
+import pytest
+
+from tests.worlds.sumo.own_roads import straight
+from unjam.errors import EpisodeError
+from unjam.scenarios.own_network import OwnNetwork, own_network
+from unjam.worlds.sumo.counting import Counting
+from unjam.worlds.sumo.detectors import Loop
+
+STEADY = (
+    '<vType id="steady" speedFactor="0.5" speedDev="0" sigma="0"/>'
+    '<flow id="f" type="steady" route="along" begin="0" end="60" period="6" departSpeed="max"/>'
+)
+
+
+def road(folder: Path, vehicles: str = STEADY) -> OwnNetwork:
+    """A road with one lane, people alone."""
+    folder.mkdir(exist_ok=True)
+    return own_network(str(straight(folder, vehicles)), {"cav_share": 1e-12})
+
+
+def test_loops_tell_when_and_how_fast_everybody_passed(tmp_path: Path) -> None:
+    with Counting(1) as counting:
+        (passed,) = counting.run(road(tmp_path), [(1,)], [Loop("road_0", 105.0)])
+    assert [one.vehicle for one in passed] == [f"f.{number}" for number in range(9)]
+    # They begin at 5.1 m (a car's length, SUMO's base position) with 10 m/s, six seconds apart.
+    assert [one.time for one in passed] == pytest.approx([10.0 + 6 * number for number in range(9)], abs=0.25)
+    assert [one.speed for one in passed] == pytest.approx([10.0] * 9)
+
+
+def test_the_count_does_not_depend_on_how_many_count(tmp_path: Path) -> None:
+    random = STEADY.replace('period="6"', 'probability="0.3"')
+    seeds = [(1,), (2,), (1,)]
+    found = []
+    for count in (1, 2):
+        with Counting(count) as counting:
+            found.append(counting.run(road(tmp_path, random), seeds, [Loop("road_0", 50.0)]))
+    assert found[0] == found[1]
+    assert found[0][0] == found[0][2] != found[0][1]
+
+
+def test_after_one_that_failed_others_go_on(tmp_path: Path) -> None:
+    with Counting(1) as counting:
+        with pytest.raises(EpisodeError, match="SUMO cannot start"):
+            counting.run(road(tmp_path), [(1,), (2,)], [Loop("nowhere_0", 5.0)])
+        assert counting.run(road(tmp_path), [(1,)], [Loop("road_0", 5.0)]) != [[]]
