@@ -299,8 +299,7 @@ def draw_curves(
         axes.margins(x=0.01)
         axes.set_xlabel("actual simulator steps [thousands]")
     lines, labels = figure.axes[-1].get_legend_handles_labels()
-    lettered = sum(len(label) + BESIDE_A_LABEL for label in labels)
-    rows = ceil(lettered / LETTERS_OF_A_ROW)
+    rows = ceil(sum(len(label) + BESIDE_A_LABEL for label in labels) / LETTERS_OF_A_ROW)
     figure.legend(lines, labels, loc="outside upper left", ncols=ceil(len(labels) / rows))
     return figure
 
