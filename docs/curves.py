@@ -16,9 +16,10 @@ LABELS = {"ours": "with the virtual environment", "ours-without-model": "without
 IMAGINED = {
     "best-imagined": "whole roads imagined besides",
     "best": "without, in large iterations",
+    "best-middle": "without, in iterations of 24,000",
     "best-few": "without, in small ones",
 }
-COLOURS = ("#2b6cb0", "#e07a1f", "#7b8794")
+COLOURS = ("#2b6cb0", "#e07a1f", "#3a8f5c", "#7b8794")
 
 
 def validations(variant: str, study: str = "table-2") -> tuple[np.ndarray, np.ndarray]:
