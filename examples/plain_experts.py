@@ -156,10 +156,39 @@ def jam_ahead(p: Any, s: State, m: Any) -> float:
     return max((cap - s.speed) / p.time_constant, -p.slowing)
 
 
+def adaptive_acc(p: Any, s: State, m: Any) -> float:
+    before = getattr(m, "mean", s.speed)
+    m.mean = before + (1.0 - math.exp(-p.time_step / p.averaging)) * (s.speed - before)
+    change, (_, leaves) = s.speed - m.mean, getattr(m, "features", (0.0, 0.0))
+    if change > p.front:
+        leaves = 1.0
+    elif change < -p.front or m.mean > p.free_speed or m.mean < p.jam_speed:
+        leaves = 0.0
+    m.features = m.mean / 10.0, leaves
+    headway, acceleration, braking = (1.0, 1.0, 0.7) if change < -p.front else (1.0, 1.0, 1.0)
+    if -p.behind < s.to_merge < p.before:
+        headway, acceleration, braking = 0.7, 1.5, 1.0
+    if leaves:
+        headway, acceleration, braking = 0.5, 2.0, 1.0
+    fitting = SimpleNamespace(**vars(p))
+    fitting.time_headway, fitting.max_acceleration = (
+        p.time_headway * headway,
+        p.max_acceleration * acceleration,
+    )
+    fitting.comfortable_deceleration = p.comfortable_deceleration * braking
+    fitting.desired_speed = p.desired_speed if math.isnan(s.allowed_speed) else s.allowed_speed
+    return idm(fitting, s._replace(leader_gap=s.leader_gap if s.leader_gap < 100.0 else 1e6), m)
+
+
 def constant(p: Any, s: State, m: Any) -> float:
     return p.acceleration
 
 
 EXPERTS = {"idm": idm, "pi": pi, "follower-stopper": follower_stopper, "acc": acc, "lacc": acc, "bcm": bcm}
 EXPERTS |= {"ovm": ovm, "pacer": pacer, "jam-absorber": jam_absorber, "constant": constant}
-EXPERTS |= {"cruise": cruise, "jam-ahead": jam_ahead, "pi-from-gap": pi_from_gap}
+EXPERTS |= {
+    "cruise": cruise,
+    "jam-ahead": jam_ahead,
+    "pi-from-gap": pi_from_gap,
+    "adaptive-acc": adaptive_acc,
+}

@@ -22,6 +22,7 @@ LESS = {
     "drive": ["-n", "1", "--set", "horizon=200"],
     "train": TINY_TRAINING,
     "assess": shlex.split("--shares 0.5 -d acc -n 34 --set horizon=100"),
+    "calibrate": shlex.split("--trials 2 --seeds 1"),
     "reproduce": ["--dry-run"],
     "search": shlex.split("--trials 1 --steps 300 --set road.horizon=60 --set trpo.batch_steps=150"),
     "tune": shlex.split("--steps 8000 --set horizon=20"),
@@ -51,6 +52,8 @@ def files(tmp_path: Path) -> None:
     vehicles = '<flow id="f" type="car" route="along" begin="0" end="60" period="3"/>'
     straight(tmp_path, vehicles).rename(tmp_path / "my.sumocfg")
     write_table(tmp_path / "trajectories.csv")
+    measured = ["edge,position,begin,end,flow_veh_per_h,speed", "road,100,0,60,900,15"]
+    (tmp_path / "detectors.csv").write_text("\n".join(measured))
 
 
 def test_every_unjam_command_of_the_readme_runs_in_its_order(
