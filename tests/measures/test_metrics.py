@@ -14,7 +14,8 @@ from unjam.measures.metrics import METRICS, measure
 from unjam.scenarios.scenario import VEHICLE_LENGTH
 from unjam.worlds.audit import Audit, Following, following
 from unjam.worlds.closed import loop_neighbours, loop_state
-from unjam.worlds.record import Episode, Floats, Trajectory, failed_episode, outcome_of
+from unjam.worlds.earned import earned
+from unjam.worlds.record import Episode, Floats, Trajectory, failed_episode
 
 LENGTH = 200.0
 LIMIT = 8.0
@@ -312,9 +313,13 @@ def test_a_collision_is_measured_up_to_its_end() -> None:
     assert row["status"] == "collision"
     assert row["collisions"] == 2.0
     assert row["mean_speed"] == pytest.approx(4.0)
-    crashed, calm = (outcome_of(episode.speeds, episode.trajectories, end) for end in (True, False))
-    assert np.flatnonzero(crashed.crashed).tolist() == [20 - 1]
-    assert not calm.crashed.any()
+    seen = (episode.speeds, episode.trajectories)
+    crashed, calm = (
+        earned(lambda outcome: {"end": 1.0 * outcome.crashed}, *seen, end, episode.waiting)["end"]
+        for end in (True, False)
+    )
+    assert np.flatnonzero(crashed).tolist() == [20 - 1]
+    assert not calm.any()
 
 
 def test_a_collision_in_the_first_step_is_measured_without_complaint() -> None:

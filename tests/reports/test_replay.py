@@ -2,7 +2,7 @@ import base64
 import json
 import zlib
 from dataclasses import replace
-from itertools import pairwise
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +13,9 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from tests.reports.open_roads import merge_episode, own_episode, shown_from
-from unjam.reports.html import NO_VALUE, REPLAY_SECONDS, _share, _squeezed, replay_data
+from unjam.reports.html import NO_VALUE, REPLAY_SECONDS, _squeezed, replay_data
 from unjam.reports.results import Shown
+from unjam.worlds.record import shared_columns
 
 
 def unpacked(driver: dict[str, Any], name: str) -> np.ndarray:
@@ -34,20 +35,25 @@ def shown(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
     return shown_from(own_episode(tmp_path_factory.mktemp("own")), "pi")
 
 
-@given(hnp.arrays(np.bool_, (8, 12)), st.sets(st.integers(0, 11)))
-def test_vehicles_that_share_a_column_are_never_there_together(there: np.ndarray, chosen: set[int]) -> None:
+@given(hnp.arrays(np.bool_, (8, 12)), st.sets(st.integers(0, 11)), st.integers(1, 3))
+def test_vehicles_that_share_a_column_are_never_there_together(
+    there: np.ndarray, chosen: set[int], apart: int
+) -> None:
     for vehicle in range(there.shape[1]):  # each comes once and stays in between
         moments = np.flatnonzero(there[:, vehicle])
         if len(moments):
             there[moments[0] : moments[-1] + 1, vehicle] = True
-    mask = np.isin(np.arange(12), list(chosen))
-    groups = _share(there, mask)
-    found = [vehicle for group in groups for vehicle in group]
-    assert sorted(found) == [vehicle for vehicle in sorted(chosen) if there[:, vehicle].any()]
-    for group in groups:
-        for one, other in pairwise(group):
-            # An empty frame lies between: or the page would draw one vehicle that flies.
-            assert np.flatnonzero(there[:, one])[-1] + 1 < np.flatnonzero(there[:, other])[0]
+    stays = [vehicle for vehicle in range(12) if there[:, vehicle].any()]
+    moments = [np.flatnonzero(there[:, vehicle]) for vehicle in stays]
+    first, last = (np.array([each[end] for each in moments], int) for end in (0, -1))
+    groups = [vehicle in chosen for vehicle in stays]
+    columns = shared_columns(first, last, groups, apart)
+    assert sorted(set(columns.tolist())) == list(range(len(set(columns.tolist()))))
+    for one, other in combinations(range(len(stays)), 2):
+        if columns[one] == columns[other]:
+            # Empty frames lie between: or the page would draw one vehicle that flies.
+            assert groups[one] == groups[other]
+            assert max(first[one], first[other]) - min(last[one], last[other]) > apart
 
 
 def test_all_that_were_there_are_in_the_replay_where_they_were_and_as_fast(shown: Shown) -> None:

@@ -2,8 +2,11 @@
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from unjam.worlds.audit import Audit, brakings, following
+from unjam.worlds import audit
+from unjam.worlds.audit import Audit, BrakingLog, brakings, following
 
 
 def test_brakings_are_counted_beyond_each_limit_and_rounding_is_none() -> None:
@@ -46,3 +49,17 @@ def test_an_override_near_a_crossing_is_put_down_to_the_right_of_way() -> None:
     still = np.ones((4, 1))
     found = following(still, still, still, 0.1, overridden, near)
     assert (found.overridden, found.yielded) == (0.25, 0.25)
+
+
+@given(st.lists(st.lists(st.tuples(st.floats(-9, 3), st.integers(0, 2)), max_size=6), max_size=30))
+def test_brakings_counted_step_by_step_are_those_of_all_steps_together(
+    steps: list[list[tuple[float, int]]],
+) -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(audit, "NOTED_AT_ONCE", 4)
+        log = BrakingLog(0.5)
+        for step in steps:
+            log.note(np.array([change for change, _ in step]), np.array([kind for _, kind in step], np.uint8))
+    for kind in range(3):
+        changes = [change for step in steps for change, whose in step if whose == kind]
+        assert log.of(kind) == brakings(np.array(changes) / 0.5)

@@ -45,6 +45,20 @@ def share_short_headway(episode: Episode) -> float:
     return episode.audit.following.share_short
 
 
+def min_ttc(episode: Episode) -> float:
+    """Smallest time to collision [s], gap over closing speed, of the CAV and of the vehicle behind it.
+
+    Infinite where nobody ever closed in. Hayward 1972.
+    """
+    smallest = np.inf
+    for trajectory in episode.trajectories:
+        own, leader, gap, follower, gap_behind, *_ = trajectory.states
+        for distance, closing in ((gap, own - leader), (gap_behind, follower - own)):
+            near = closing > 0
+            smallest = min(smallest, float((distance[near] / closing[near]).min(initial=np.inf)))
+    return smallest
+
+
 def cav_min_ttc(episode: Episode) -> float:
     """Smallest time to collision of the CAV with the vehicle ahead [s]; NaN where it never closed in."""
     return _finite(episode.audit.following.time_to_collision)

@@ -17,13 +17,15 @@ from unjam.measures.drivable import (
     max_drac,
     max_jerk,
     min_headway,
+    min_ttc,
     overridden,
     people_max_braking,
     share_short_headway,
     yielded,
 )
 from unjam.worlds.audit import BEYOND, SHIELD_ROUNDING
-from unjam.worlds.record import Episode, Floats, outcome_of
+from unjam.worlds.earned import CELLS_AT_ONCE, earned
+from unjam.worlds.record import Episode, Floats
 from unjam.worlds.reward import eq16
 
 STEADY_STEPS = 1000
@@ -57,10 +59,14 @@ def _mean_there(speeds: Floats) -> float:
     return float(there.mean()) if there.size else float("nan")
 
 
-def _std_across(speeds: Floats) -> float:
-    """Return the std across vehicles at one moment, averaged over the moments with at least one."""
-    there = ~np.isnan(speeds).all(axis=1)
-    return float(np.nanstd(speeds[there], axis=1).mean()) if there.any() else float("nan")
+def _of_moments(function: Callable[..., Floats], speeds: Floats) -> Floats:
+    """Return `np.nanmean` or the like of each moment, NaN where nobody is; hours of them part by part."""
+    found, rows = np.full(len(speeds), np.nan), max(1, CELLS_AT_ONCE // max(1, speeds.shape[1]))
+    for start in range(0, len(speeds), rows):
+        part = speeds[start : start + rows]
+        there = ~np.isnan(part).all(axis=1)
+        found[start : start + rows][there] = function(part[there], axis=1)
+    return found
 
 
 def mean_speed(episode: Episode) -> float:
@@ -73,8 +79,7 @@ def mean_speed_of_moments(episode: Episode) -> float:
 
     Where vehicles come and go it counts a moment with few vehicles as much as one in a jam.
     """
-    moments = episode.speeds[1:]
-    return _mean_there(np.nanmean(moments[~np.isnan(moments).all(axis=1)], axis=1))
+    return _mean_there(_of_moments(np.nanmean, episode.speeds[1:]))
 
 
 def mean_speed_steady(episode: Episode) -> float:
@@ -92,12 +97,12 @@ def speed_std_fleet(episode: Episode) -> float:
 
     The size of the waves: zero when all drive alike. Stern et al. 2018, section 4.
     """
-    return _std_across(episode.speeds[1:])
+    return _mean_there(_of_moments(np.nanstd, episode.speeds[1:]))
 
 
 def speed_std_fleet_steady(episode: Episode) -> float:
     """Standard deviation of speed across vehicles, averaged over the steady state [m/s]."""
-    return _std_across(_steady(episode.speeds[1:]))
+    return _mean_there(_of_moments(np.nanstd, _steady(episode.speeds[1:])))
 
 
 def speed_std_cav(episode: Episode) -> float:
@@ -127,8 +132,9 @@ def episode_return(episode: Episode) -> float:
 
 def return_eq16(episode: Episode) -> float:
     """Sum of the paper's reward, Eq. 16 with its sign mended, not discounted."""
-    seen = outcome_of(episode.speeds, episode.trajectories, episode.status == "collision")
-    return float(sum(term.sum() for term in eq16(seen).values()))
+    crashed = episode.status == "collision"
+    terms = earned(eq16, episode.speeds, episode.trajectories, crashed, episode.waiting)
+    return float(sum(term.sum() for term in terms.values()))
 
 
 def mean_abs_accel(episode: Episode) -> float:
@@ -146,7 +152,7 @@ def mean_abs_jerk(episode: Episode) -> float:
 def share_standing(episode: Episode) -> float:
     """Share of vehicle-seconds spent below 0.1 m/s."""
     speeds = episode.speeds[1:]
-    return _mean_there(np.where(np.isnan(speeds), np.nan, speeds < STANDING_SPEED))
+    return _mean_there((speeds[~np.isnan(speeds)] < STANDING_SPEED).astype(np.float64))
 
 
 def time_to_dissolve(episode: Episode) -> float:
@@ -155,28 +161,13 @@ def time_to_dissolve(episode: Episode) -> float:
     From the first decision to the first moment from which on the std of speed across vehicles stays below
     0.3 m/s for 60 s on end.
     """
-    anybody = ~np.isnan(episode.speeds).all(axis=1)
-    calm = np.ones(len(episode.speeds), bool)
-    calm[anybody] = np.nanstd(episode.speeds[anybody], axis=1) < CALM_STD
+    spread = _of_moments(np.nanstd, episode.speeds)
+    calm = np.isnan(spread) | (spread < CALM_STD)
     needed = round(CALM_SECONDS / episode.step)
     if calm[0] or len(calm) < needed:
         return float("nan")
     found = np.flatnonzero(np.convolve(calm, np.ones(needed), "valid") > needed - 0.5)
     return float(found[0] * episode.step) if len(found) else float("nan")
-
-
-def min_ttc(episode: Episode) -> float:
-    """Smallest time to collision [s], gap over closing speed, of the CAV and of the vehicle behind it.
-
-    Infinite where nobody ever closed in. Hayward 1972.
-    """
-    smallest = np.inf
-    for trajectory in episode.trajectories:
-        own, leader, gap, follower, gap_behind, *_ = trajectory.states
-        for distance, closing in ((gap, own - leader), (gap_behind, follower - own)):
-            near = closing > 0
-            smallest = min(smallest, float((distance[near] / closing[near]).min(initial=np.inf)))
-    return smallest
 
 
 def collisions(episode: Episode) -> float:
@@ -214,8 +205,9 @@ def throughput_veh_per_h(episode: Episode) -> float:
     if episode.peak[1] > 0:
         end = min(round(episode.peak[1] / episode.step), episode.steps)
         begin = max(0, end - round(LAST_OF_PEAK / episode.step))
-        last = (~np.isnan(episode.speeds)).cumsum(axis=0).argmax(axis=0)
-        return float(((last >= begin) & (last < end)).sum() * 3600.0 / max(end - begin, 1) / episode.step)
+        there = ~np.isnan(episode.speeds[begin : end + 1])
+        left = (there[:-1] & ~there[1:]).sum()
+        return float(left * 3600.0 / max(end - begin, 1) / episode.step)
     hours = episode.steps * episode.step / 3600.0
     if np.isnan(episode.loop_length):
         return episode.arrived / hours

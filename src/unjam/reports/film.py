@@ -10,6 +10,7 @@ from PIL import Image, ImageDraw, ImageFont
 from unjam.errors import MissingPartError, wrong
 from unjam.files import check_folder
 from unjam.reports.figures import CAV_COLOUR, INK, colour_table
+from unjam.reports.results import shown_of
 from unjam.scenarios.scenario import VEHICLE_LENGTH
 from unjam.worlds.closed import places_along
 from unjam.worlds.record import Episode
@@ -105,7 +106,7 @@ def scenes(episode: Episode, moments: Sequence[int]) -> Iterator[Scene]:
     if len(episode.outline):
         lines = episode.outline[:, 1:]
         places = places_along(episode.outline, episode.positions, episode.loop_length)
-    cavs = np.isin(episode.vehicle_ids, episode.cav_ids)
+    cavs = np.isin(np.arange(episode.speeds.shape[1]), episode.cavs)
     for moment in moments:
         yield Scene(lines, places[moment], episode.speeds[moment], cavs)
 
@@ -120,6 +121,7 @@ def write_video(episode: Episode, path: Path, title: str, pace: float = 10.0) ->
     """
     check_format(path)
     check_folder(path)
+    episode = shown_of("", episode)
     every = max(1, round(pace / FRAMES_PER_SECOND / episode.step))
     frames = _frames(episode, title, every)
     seconds = every * episode.step / pace

@@ -4,7 +4,6 @@ import base64
 import json
 from collections.abc import Sequence
 from dataclasses import replace
-from heapq import heappop, heappush
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -44,6 +43,7 @@ from unjam.reports.story import (
     title_of,
 )
 from unjam.scenarios.scenario import VEHICLE_LENGTH
+from unjam.worlds.record import shared_columns
 
 MOST_PANELS = 6
 MOST_FRAMES = 600
@@ -203,48 +203,23 @@ def _replayed(episode: Shown, step: float, frames: int) -> dict[str, Any]:
             "positions": [_squeezed(episode.positions[moments])],
             "lines": [np.round(episode.outline, 2).tolist()],
         }
-    is_cav = np.isin(np.arange(speeds.shape[1]), episode.cavs)
-    cavs, people = (_share(~np.isnan(speeds), chosen) for chosen in (is_cav, ~is_cav))
-    columns = [*cavs, *people]
+    vehicles = np.flatnonzero(~np.isnan(speeds).all(axis=0))
+    there, is_cav = ~np.isnan(speeds[:, vehicles]), np.isin(vehicles, episode.cavs)
+    first, last = there.argmax(axis=0), frames - 1 - there[::-1].argmax(axis=0)
+    columns = shared_columns(first, last, is_cav.tolist())
     values = np.concatenate([episode.places[moments], speeds[..., None]], axis=-1)
-    packed = np.full((frames, len(columns), 4), np.nan, np.float32)
-    for number, vehicles in enumerate(columns):
-        for vehicle in vehicles:
-            there = ~np.isnan(speeds[:, vehicle])
-            packed[there, number] = values[there, vehicle]
+    packed = np.full((frames, int(columns.max(initial=-1)) + 1, 4), np.nan, np.float32)
+    for vehicle, column, present in zip(vehicles, columns, there.T, strict=True):
+        packed[present, column] = values[present, vehicle]
     lines = split_lines(episode.lines)
     return {
-        "vehicles": len(columns),
-        "cavs": list(range(len(cavs))),
+        "vehicles": packed.shape[1],
+        "cavs": np.unique(columns[is_cav]).tolist(),
         "loop_length": None,
         "speeds": [_squeezed(packed[..., 3])],
         "places": [_squeezed(packed[..., axis]) for axis in range(3)],
         "lines": [np.column_stack([np.zeros(len(line)), line]).round(1).tolist() for line in lines],
     }
-
-
-def _share(there: np.ndarray, chosen: np.ndarray) -> list[list[int]]:
-    """Return groups of the `chosen` vehicles that are never on the road together: a column for each will do.
-
-    `there`, shape (frames, vehicles), says when each is on the road; an empty frame lies between two.
-    """
-    stays = {
-        int(vehicle): np.flatnonzero(there[:, vehicle])[[0, -1]]
-        for vehicle in np.flatnonzero(chosen)
-        if there[:, vehicle].any()
-    }
-    groups: list[list[int]] = []
-    busy: list[tuple[int, int]] = []  # a heap: until which frame, which group
-    for vehicle in sorted(stays, key=lambda vehicle: stays[vehicle][0]):
-        first, last = map(int, stays[vehicle])
-        if busy and busy[0][0] + 1 < first:
-            _, number = heappop(busy)
-            groups[number].append(vehicle)
-        else:
-            number = len(groups)
-            groups.append([vehicle])
-        heappush(busy, (last, number))
-    return groups
 
 
 def _squeezed(array: np.ndarray) -> dict[str, Any]:

@@ -23,6 +23,8 @@ from unjam.reports.results import Floats, Shown
 
 TIMES, PLACES = 240, 100
 """cells of a map, at most, along time and along the road"""
+FILLING = 4
+"""vehicles at moments in a cell, in the mean, that leave hardly one empty"""
 MOST_LANES = 4
 """lanes that have a map: of more, those with the most traffic"""
 
@@ -95,14 +97,14 @@ def _extent(shown: Sequence[Shown], lane: int) -> tuple[float, float]:
 def mean_speeds(episode: Shown, lane: int, extent: tuple[float, float, float]) -> Floats:
     """Return the mean speeds in a lane's cells of place and time [m/s], NaN where nobody drives.
 
-    `extent` is the last moment [s] and the first and last place [m]. A cell is never smaller than what is
-    driven between two moments, or fast vehicles would leave holes.
+    `extent` is the last moment [s] and the first and last place [m]. A cell is not smaller than what is
+    driven between two moments, or fast vehicles would leave holes, unless so many drive that they fill them.
     """
     longest, start, end = extent
-    fastest = float(np.nanmax(episode.speeds, initial=1.0))
-    places = max(1, min(PLACES, int((end - start) / (fastest * episode.step))))
-    times = max(1, min(TIMES, int(longest / episode.step)))
     moments, vehicles = np.nonzero((episode.lanes == lane) & ~np.isnan(episode.positions))
+    times = max(1, min(TIMES, int(longest / episode.step)))
+    driven = float(np.nanmax(episode.speeds, initial=1.0)) * episode.step
+    places = max(1, min(PLACES, int(max((end - start) / driven, len(moments) / times / FILLING))))
     column = (episode.times[moments] / (longest + episode.step) * times).astype(int)
     along = (episode.positions[moments, vehicles] - start) / (end - start)
     row = (along * places).astype(int).clip(0, places - 1)

@@ -26,12 +26,14 @@ PICTURED = ("speeds", "positions", "gaps", "outline", "waiting", "lines", "place
 """arrays of an episode that pictures are made of"""
 BY_VEHICLE = ("speeds", "positions", "gaps", "places", "lanes")
 """those with a row per moment and a column per vehicle"""
+AT_ALL_MOMENTS = ("speeds", "waiting")
+"""those of which an episode has more moments than are pictured"""
 IN_NO_LANE = -1
 """lanes are stored as small integers, which have no NaN"""
 STORED = (*PICTURED, "there")
 ABOUT_SHOWN = (
     *("step", "seed", "drawn", "loop_length", "crossings", "branches", "limit_speed"),
-    *("vehicle_ids", "cav_ids", "lane_names"),
+    *("vehicle_ids", "cav_ids", "columns", "lane_names"),
 )
 """what is written of an episode that pictures show, beside its arrays"""
 
@@ -54,15 +56,12 @@ class Shown(Episode):
         """[s], shape (T + 1,)."""
         return np.arange(len(self.speeds), dtype=np.float64) * self.step
 
-    @property
-    def cavs(self) -> list[int]:
-        """Columns of the CAVs."""
-        return [self.vehicle_ids.index(name) for name in self.cav_ids]
-
 
 def shown_of(driver: str, episode: Episode) -> Shown:
     """Return what pictures show of an episode that was just driven."""
-    return Shown(**{name: getattr(episode, name) for name in (*ABOUT_SHOWN, *PICTURED)}, driver=driver)
+    shown = {name: getattr(episode, name) for name in (*ABOUT_SHOWN, *PICTURED)}
+    thinned = {name: shown[name][:: episode.every] for name in AT_ALL_MOMENTS}
+    return Shown(**{**shown, **thinned, "step": episode.step * episode.every}, driver=driver)
 
 
 def packed(shown: Shown) -> dict[str, Floats]:

@@ -19,6 +19,8 @@ MOVING_SPEED = 1.0
 """speed above which a time headway is a matter of safety [m/s]"""
 SHORT_HEADWAY = 1.0
 """[s]"""
+NOTED_AT_ONCE = 1000
+"""steps that are counted together: one by one takes longer than they take to drive"""
 
 
 @dataclass(frozen=True)
@@ -30,6 +32,11 @@ class Brakings:
     beyond: tuple[int, ...] = (0,) * len(BEYOND)
     """moments with more than each of BEYOND"""
     moments: int = 0
+
+    def __add__(self, other: "Brakings") -> "Brakings":
+        """Return how hard the vehicles of both braked."""
+        beyond = tuple(sum(both) for both in zip(self.beyond, other.beyond, strict=True))
+        return Brakings(max(self.hardest, other.hardest), beyond, self.moments + other.moments)
 
 
 @dataclass(frozen=True)
@@ -75,6 +82,37 @@ def brakings(accelerations: Any) -> Brakings:
     hard = all_of_them[all_of_them < -BEYOND[0]]
     beyond = tuple(int((hard < -limit - ROUNDING).sum()) for limit in BEYOND)
     return Brakings(float(max(0.0, -all_of_them.min())), beyond, all_of_them.size)
+
+
+class BrakingLog:
+    """Counts how hard several kinds of vehicles brake, step by step; hours of them need no more memory."""
+
+    def __init__(self, step: float) -> None:
+        """Begin with nothing; what is noted are changes of speed in `step` seconds."""
+        self._step, self._found = step, dict[int, Brakings]()
+        self._changes: list[Floats] = []
+        self._whose: list[NDArray[np.uint8]] = []
+
+    def note(self, changes: Floats, whose: NDArray[np.uint8]) -> None:
+        """Note how the speeds of n vehicles changed [m/s], and of which kind each is: shape (n,)."""
+        self._changes.append(changes)
+        self._whose.append(whose)
+        if len(self._changes) == NOTED_AT_ONCE:
+            self._count()
+
+    def of(self, kind: int) -> Brakings:
+        """Return how hard those of a kind braked so far."""
+        self._count()
+        return self._found.get(kind, Brakings())
+
+    def _count(self) -> None:
+        if not self._changes:
+            return
+        accelerations, whose = np.concatenate(self._changes) / self._step, np.concatenate(self._whose)
+        for kind in np.unique(whose).tolist():
+            self._found[kind] = self._found.get(kind, Brakings()) + brakings(accelerations[whose == kind])
+        self._changes.clear()
+        self._whose.clear()
 
 
 def following(

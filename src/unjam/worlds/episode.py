@@ -3,14 +3,13 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import numpy as np
-
 from unjam.drivers.driver import Driver
 from unjam.drivers.from_file import DriverLike, as_driver
 from unjam.errors import InputError
 from unjam.scenarios.scenario import Scenario
 from unjam.worlds.drive import drive
-from unjam.worlds.record import Episode, Floats, outcome_of
+from unjam.worlds.earned import earned
+from unjam.worlds.record import Episode
 from unjam.worlds.reward import Reward, make_reward
 from unjam.worlds.sumo import make_traffic
 from unjam.worlds.sumo.apart import simulation_for
@@ -67,7 +66,7 @@ def run_episode(
     driver, seed = as_driver(driver), (seed,) if isinstance(seed, int) else seed
     if not can_drive(driver, scenario):
         raise InputError(f"driver: it is not allowed on {scenario.title}: it needs a closed road")
-    earned = make_reward(reward or scenario.reward)
+    paid = make_reward(reward or scenario.reward)
     if simulation is None:
         with simulation_for(scenario) as simulation:
             return run_episode(scenario, driver, seed, reward, explore, full, simulation, progress)
@@ -75,7 +74,7 @@ def run_episode(
     episode = drive(traffic, driver, explore, on_progress=progress)
     if traffic.entered == 0 and not driver.native:
         raise InputError(f"no CAV was on the road in {episode.steps} decisions: let more vehicles be CAVs")
-    return rewarded(episode, earned)
+    return rewarded(episode, paid)
 
 
 def can_drive(driver: Driver, scenario: Scenario) -> bool:
@@ -85,24 +84,10 @@ def can_drive(driver: Driver, scenario: Scenario) -> bool:
 
 def rewarded(episode: Episode, reward: Reward) -> Episode:
     """Return an episode with what was earned in it; raise `InputError` where a term is not finite."""
-    # Columns one behind the other: sums over vehicles are rounded in the order of memory.
-    speeds = np.asfortranarray(episode.speeds)
     crashed = episode.status == "collision"
-    outcome = outcome_of(speeds, episode.trajectories, crashed, episode.waiting)
-    terms = _checked(reward(outcome), episode.steps)
+    terms = earned(reward, episode.speeds, episode.trajectories, crashed, episode.waiting)
     trajectories = tuple(
         replace(each, terms={name: values[each.during] for name, values in terms.items()})
         for each in episode.trajectories
     )
     return replace(episode, terms=terms, trajectories=trajectories)
-
-
-def _checked(terms: dict[str, Floats], rows: int) -> dict[str, Floats]:
-    """Return the reward's terms; raise `InputError` unless each is finite and has a value per decision."""
-    for name, values in terms.items():
-        if np.shape(values) != (rows,):
-            raise InputError(f"reward: term {name!r} has shape {np.shape(values)}; allowed: ({rows},)")
-        if not np.isfinite(values).all():
-            step = int(np.argmax(~np.isfinite(values)))
-            raise InputError(f"reward: step {step}: term {name!r} is {values[step]}; allowed: finite")
-    return {name: np.asarray(values, np.float64) for name, values in terms.items()}

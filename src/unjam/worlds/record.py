@@ -1,8 +1,9 @@
 """What happened in an episode, and how it travels between processes."""
 
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from heapq import heappop, heappush
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,6 @@ from numpy.typing import NDArray
 from unjam.drivers.local_state import LocalState
 from unjam.physics.arrays import Floats
 from unjam.worlds.audit import Audit
-from unjam.worlds.reward import Outcome, time_headway
 from unjam.worlds.world import Driven
 
 
@@ -139,20 +139,26 @@ class Episode:
     """the scenario's own limit of speed [m/s]"""
     vehicle_ids: tuple[str, ...] = ()
     cav_ids: tuple[str, ...] = ()
+    columns: tuple[int, ...] = ()
+    """which of N columns each vehicle has, where those that are never there together share one: with an empty
+    moment between two, and CAVs with CAVs alone; empty: each vehicle its own, in order"""
+    every: int = 1
+    """where vehicles are is kept of every so many-th moment: not of all where many drive for long"""
     collisions: int = 0
     """vehicles in contact with another when the episode ended"""
     speeds: Floats = field(default_factory=lambda: np.zeros((1, 0)))
     """[m/s], shape (T + 1, N); NaN where a vehicle is not on the road"""
     positions: Floats = field(default_factory=lambda: np.zeros((1, 0)))
-    """front bumpers along the route, not wrapped [m], shape (T + 1, N)"""
+    """front bumpers along the route, not wrapped [m], shape (T // every + 1, N)"""
     gaps: Floats = field(default_factory=lambda: np.zeros((1, 0)))
-    """bumper to bumper to the vehicle ahead [m], shape (T + 1, N)"""
+    """bumper to bumper to the vehicle ahead [m], shape (T // every + 1, N)"""
     fuel: Floats = field(default_factory=lambda: np.zeros((0, 0)))
-    """fuel rate in each step [mg/s], shape (T, N); (0, 0) where it was not recorded"""
+    """fuel rate in each step [mg/s], shape (T, N), of a road with ends of all together, (T,); (0, 0) where it
+    was not recorded"""
     outline: Floats = field(default_factory=lambda: np.zeros((0, 3)))
     """a closed road's centre line: rows (coordinate along the route, x, y) [m]"""
     branches: tuple[str, ...] = ()
-    """where each vehicle of a merging road came from"""
+    """where the vehicles of each column came from, on a road with several ways in"""
     arrived: int = 0
     """vehicles that left at the end of their route"""
     peak: tuple[float, float] = (0.0, 0.0)
@@ -164,11 +170,11 @@ class Episode:
     lines: Floats = field(default_factory=lambda: np.zeros((0, 2)))
     """lanes of a road with ends: rows (x, y) [m], a row of NaN between two; (0, 2) where not recorded"""
     places: Floats = field(default_factory=lambda: np.zeros((0, 0, 3)))
-    """(x, y, heading) of front bumpers on a road with ends [m, rad], shape (T + 1, N, 3); no rows where not
-    recorded"""
+    """(x, y, heading) of front bumpers on a road with ends [m, rad], shape (T // every + 1, N, 3); no rows
+    where not recorded"""
     lanes: Floats = field(default_factory=lambda: np.zeros((0, 0)))
-    """which of `lane_names` each vehicle is in, shape (T + 1, N), NaN where in none of them; (0, 0) where not
-    recorded"""
+    """which of `lane_names` each vehicle is in, shape (T // every + 1, N), NaN where in none of them; (0, 0)
+    where not recorded"""
     lane_names: tuple[str, ...] = ()
     """of a road with lanes, from left to right as one drives"""
     terms: dict[str, Floats] = field(default_factory=dict)
@@ -187,30 +193,39 @@ class Episode:
         return len(self.speeds) - 1
 
     @property
+    def cavs(self) -> list[int]:
+        """Columns of the CAVs, in order of entry."""
+        columns = self.columns or range(len(self.vehicle_ids))
+        column = dict(zip(self.vehicle_ids, columns, strict=True))
+        return list(dict.fromkeys(column[name] for name in self.cav_ids))
+
+    @property
     def ok(self) -> bool:
         """Whether the episode ran to its end, be it a collision."""
         return self.status != "failed"
 
 
+def shared_columns(
+    first: NDArray[np.intp], last: NDArray[np.intp], groups: Sequence[Hashable], apart: int = 1
+) -> NDArray[np.intp]:
+    """Return a column for each of n stays, with at least `apart` empty moments between two in the same one.
+
+    `first` and `last` are the moments of each, both included; only stays of the same group share one.
+    """
+    columns, used = np.zeros(len(groups), np.intp), 0
+    busy: dict[Hashable, list[tuple[int, int]]] = {}
+    """of each group a heap: until which moment, which column"""
+    for stay in np.argsort(first, kind="stable").tolist():
+        waiting = busy.setdefault(groups[stay], [])
+        if waiting and waiting[0][0] + apart < first[stay]:
+            _, column = heappop(waiting)
+        else:
+            column, used = used, used + 1
+        columns[stay] = column
+        heappush(waiting, (int(last[stay]), column))
+    return columns
+
+
 def failed_episode(seed: tuple[int, ...], reason: str, error: str) -> Episode:
     """Return the row of an episode that did not run: every requested episode has one."""
     return Episode(seed=seed, status="failed", reason=reason, error=error)
-
-
-def outcome_of(
-    speeds: Floats, trajectories: Sequence[Trajectory], crashed: bool, waiting: Floats | None = None
-) -> Outcome:
-    """Return what a reward function sees of a whole episode; `crashed` where its last decision ended so.
-
-    Speeds are of all vehicles, shape (T + 1, N), trajectories of CAVs; `waiting` is how many wanted to enter
-    and could not, shape (T + 1,), None where nobody did.
-    """
-    steps = len(speeds) - 1
-    accelerations, headways = (np.full((steps, len(trajectories)), np.nan) for _ in range(2))
-    for column, each in enumerate(trajectories):
-        accelerations[each.during, column] = each.applied
-        headways[each.during, column] = time_headway(each.states.leader_gap[1:], each.states.speed[1:])
-    collided = np.zeros(steps, bool)
-    collided[-1:] = crashed
-    kept_out = np.zeros(steps) if waiting is None or not len(waiting) else waiting[1:]
-    return Outcome(speeds[1:], accelerations, headways, collided, kept_out)

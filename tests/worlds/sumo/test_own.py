@@ -90,8 +90,8 @@ def test_a_share_is_about_that_share_and_types_are_all_of_theirs(tmp_path: Path)
                 kinds.setdefault(name, libsumo.vehicle.getTypeID(name))
             traffic.advance(Command(np.zeros(len(traffic.cavs))))
         assert {name for name, kind in kinds.items() if "truck" in kind} >= set(traffic.cavs)
-        driven = {name for moment in traffic._log_cavs for name in moment}
-        there = set(traffic._log_moments[-2][0]) | driven
+        driven = {name for moment in traffic._stays.cavs for name in moment}
+        there = set(traffic._log.names) | driven
         assert driven == {name for name in there if "truck" in kinds.get(name, "")} != set()
 
 

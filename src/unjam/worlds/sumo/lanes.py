@@ -4,15 +4,17 @@ Who cuts in leaves less of a gap than anybody would choose. What a CAV does in t
 nothing of how it follows; the audit counts it apart.
 """
 
+from array import array
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from unjam.worlds.audit import SHORT_HEADWAY, Audit, brakings, following
+from unjam.worlds.audit import SHORT_HEADWAY, Audit, following
 from unjam.worlds.record import Floats, Trajectory
-from unjam.worlds.sumo.open import OpenTraffic
+from unjam.worlds.sumo.open import CAV, PEOPLE, OpenTraffic
 from unjam.worlds.sumo.simulation import LEAVE_TO_SUMO
 from unjam.worlds.sumo.traffic import OpenKind
 from unjam.worlds.world import OnProgress
@@ -21,8 +23,8 @@ CUT_IN = 3.0
 """time after a change of leader in which braking is counted apart [s]"""
 SETTLED = 5.0
 """time behind the same leader after which headways are a car's own choice [s]"""
-PEOPLE, CAV, CAV_CUT_IN = 0, 1, 2
-"""whose braking it is"""
+CAV_CUT_IN = 2
+"""whose braking it is, beside PEOPLE and CAV"""
 
 
 class Followed(NamedTuple):
@@ -45,7 +47,7 @@ class LaneTraffic(OpenTraffic[OpenKind]):
         """Run the warm-up, then hand the CAVs over; drivers remember nothing of it."""
         self._leaders: dict[str, tuple[str, int]] = {}
         """of each CAV: its leader, and the simulation step since when"""
-        self._seen: list[tuple[float, float, float]] = []
+        self._seen = array("d")
         """speed, leader's speed and gap of CAVs that follow the same for long, in each simulation step"""
         self._steps = 0
         super().start(controlled, on_progress)
@@ -58,24 +60,26 @@ class LaneTraffic(OpenTraffic[OpenKind]):
         """Whether nobody may hold a CAV back where it is."""
         return False
 
-    def _watch(self) -> None:
-        super()._watch()
+    def _whose(self) -> NDArray[np.uint8]:
+        """Look whom CAVs follow, and return whose changes of speed those of the last step are."""
+        whose = super()._whose()
         self._steps += 1
         if not self._controlled:
-            return
+            return whose
+        whose = whose.copy()
         step = self.scenario.simulation_step
         rows = {name: row for row, name in enumerate(self._watched)}
         names = [name for name in self.cavs if name in rows]
-        first = len(self._changed) - len(rows)
         for name, (leader, *seen) in zip(names, self._followed(names), strict=True):
             known = self._leaders.get(name)
             if known is None or known[0] != leader:
                 known = self._leaders[name] = leader, self._steps
             since = (self._steps - known[1]) * step
             if since < CUT_IN:
-                self._changed[first + rows[name]] = CAV_CUT_IN
+                whose[rows[name]] = CAV_CUT_IN
             if leader and since > SETTLED:
-                self._seen.append((seen[0], seen[1], seen[2]))
+                self._seen.extend(seen)
+        return whose
 
     def _legal(self, speeds: dict[str, float]) -> dict[str, float]:
         """Return wanted speeds; with an ACC of its own, who is not held back is told nothing.
@@ -93,9 +97,7 @@ class LaneTraffic(OpenTraffic[OpenKind]):
 
     def _audit(self, trajectories: Sequence[Trajectory]) -> Audit:
         """Return the physics of every simulation step; how CAVs follow whom they have followed for long."""
-        accelerations = np.array(self._changes) / self.scenario.simulation_step
-        whose = np.frombuffer(bytes(self._changed), np.uint8)
-        people, cavs, cut_in = (brakings(accelerations[whose == who]) for who in (PEOPLE, CAV, CAV_CUT_IN))
+        people, cavs, cut_in = map(self._brakings.of, (PEOPLE, CAV, CAV_CUT_IN))
         speed, ahead, gap = self._settled()
         found = following(speed, ahead, gap, self.scenario.simulation_step)
         decided = self._decided(trajectories)

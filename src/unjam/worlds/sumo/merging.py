@@ -22,7 +22,7 @@ from unjam.scenarios.road import MergingRoad, Origin
 from unjam.scenarios.scenario import VEHICLE_LENGTH
 from unjam.worlds.record import Episode, Floats
 from unjam.worlds.sumo.networks import network_file, network_lines
-from unjam.worlds.sumo.open import Moment, OpenTraffic
+from unjam.worlds.sumo.open import OpenTraffic
 from unjam.worlds.sumo.simulation import LEAVE_TO_SUMO
 from unjam.worlds.world import Driven, OnProgress
 
@@ -164,14 +164,14 @@ class MergingTraffic(OpenTraffic[MergingRoad]):
         wanted[streams.on_junction(self.road.junctions)] = LEAVE_TO_SUMO
         self._simulation.command_speeds(streams.names, wanted.tolist())
 
-    def _everybody(self) -> tuple[Sequence[str], list[float]]:
-        return self._streams.names, self._streams.speeds.tolist()
+    def _everybody(self) -> tuple[Sequence[str], Floats]:
+        return self._streams.names, self._streams.speeds
 
-    def _moment(self) -> Moment:
-        streams = self._streams
-        self._states_of_all = states = streams.states()
-        gaps = states.leader_gap.tolist()
-        return Moment(list(streams.names), streams.speeds.tolist(), streams.positions.tolist(), gaps)
+    def _note_moment(self) -> None:
+        self._states_of_all = self._streams.states()
+
+    def _pictured_now(self, names: Sequence[str]) -> dict[str, Any]:
+        return {"positions": self._streams.positions, "gaps": self._states_of_all.leader_gap}
 
     def _states(self, names: Sequence[str]) -> LocalState:
         places = [self._streams.names.index(name) for name in names]
@@ -194,5 +194,5 @@ class MergingTraffic(OpenTraffic[MergingRoad]):
     def _lines(self) -> Floats:
         return network_lines(network_file(self.road.network))
 
-    def _pictured(self, vehicles: Sequence[str]) -> dict[str, Any]:
-        return {"branches": tuple(BRANCHES[self.road.origins[name].branch] for name in vehicles)}
+    def _branches(self, vehicles: Sequence[str]) -> Sequence[str]:
+        return [BRANCHES[self.road.origins[name].branch] for name in vehicles]

@@ -15,7 +15,6 @@ from unjam.worlds.record import Floats
 from unjam.worlds.sumo.files import CAV_TYPES
 from unjam.worlds.sumo.lanes import Followed, LaneTraffic
 from unjam.worlds.sumo.networks import network_file, network_lines
-from unjam.worlds.sumo.open import Moment
 from unjam.worlds.world import OnProgress
 
 
@@ -29,7 +28,6 @@ class MotorwayTraffic(LaneTraffic[MotorwayRoad]):
             np.array(each) for each in zip(*(lane[1:4] for lane in road.lanes), strict=True)
         )
         self._closing = {number for number, lane in enumerate(road.lanes) if lane.closing}
-        self._log_ways = list[NDArray[np.intp]]()
         self._factors = {entry.name: road.kinds[entry.kind].speed_factor for entry in road.entries}
         ways, step = int(self._ways.max()) + 1, scenario.decision_step
         self._messages = Messages(road.roadside, ways, road.length, step, self._noise_generator)
@@ -57,8 +55,8 @@ class MotorwayTraffic(LaneTraffic[MotorwayRoad]):
         self._leader[order[:-1][same]] = order[1:][same]
         self._follower[order[1:][same]] = order[:-1][same]
 
-    def _everybody(self) -> tuple[Sequence[str], list[float]]:
-        return self._names, self._speed.tolist()
+    def _everybody(self) -> tuple[Sequence[str], Floats]:
+        return self._names, self._speed
 
     def _followed(self, names: Sequence[str]) -> list[Followed]:
         rows = [self._row[name] for name in names]
@@ -71,14 +69,14 @@ class MotorwayTraffic(LaneTraffic[MotorwayRoad]):
         """Return the gaps of vehicles to their leaders [m]."""
         return self._place[leaders] - self.road.vehicle_length - self._place[rows]
 
-    def _moment(self) -> Moment:
+    def _note_moment(self) -> None:
         self._messages.measure(self._way, self._place, self._speed, self.road.limit_speed)
-        if self.full:
-            self._log_ways.append(self._way)
+
+    def _pictured_now(self, names: Sequence[str]) -> dict[str, Any]:
         ahead = self._leader
         gaps = np.where(ahead >= 0, self._gap(np.arange(len(ahead)), ahead), np.nan)
         places = self._place - self.road.merge  # as on the merge: zero where the ways meet
-        return Moment(self._names, self._speed.tolist(), places.tolist(), gaps.tolist())
+        return {"positions": places, "gaps": gaps, "lanes": len(self.road.ways) - 1 - self._way}
 
     def _states(self, names: Sequence[str]) -> LocalState:
         rows = np.array([self._row[name] for name in names], np.intp)
@@ -134,14 +132,12 @@ class MotorwayTraffic(LaneTraffic[MotorwayRoad]):
     def _lines(self) -> Floats:
         return network_lines(network_file(self.road.network))
 
-    def _pictured(self, vehicles: Sequence[str]) -> dict[str, Any]:
+    def _branches(self, vehicles: Sequence[str]) -> Sequence[str]:
         routes = {entry.name: entry.route for entry in self.road.entries}
-        road, branches = self.road, tuple(routes[name] for name in vehicles)
-        facts = {"branches": branches, "peak": road.peak, "free_time": road.free_time}
+        return [routes[name] for name in vehicles]
+
+    def _pictured(self, columns: NDArray[np.intp]) -> dict[str, Any]:
+        facts = {**super()._pictured(columns), "peak": self.road.peak, "free_time": self.road.free_time}
         if not self.full:
             return facts
-        column = {name: number for number, name in enumerate(vehicles)}
-        lanes = np.full((len(self._log_ways), len(vehicles)), np.nan)
-        for time, (moment, ways) in enumerate(zip(self._log_moments, self._log_ways, strict=True)):
-            lanes[time, [column[name] for name in moment.names]] = len(road.ways) - 1 - ways
-        return {**facts, "lanes": lanes, "lane_names": road.ways[::-1]}
+        return {**facts, "lanes": self._log.pictures("lanes", columns), "lane_names": self.road.ways[::-1]}

@@ -1,34 +1,25 @@
 """Traffic on roads with ends: vehicles come and go, and each stay of a CAV is a trajectory of its own."""
 
-from array import array
-from collections import defaultdict
 from collections.abc import Sequence
 from math import inf
-from operator import sub
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from unjam.drivers.command import Command
 from unjam.drivers.local_state import LARGEST_GAP, LocalState
 from unjam.drivers.safety import Ahead
 from unjam.physics.kinematics import next_speed
-from unjam.worlds.audit import SHIELD_ROUNDING, Audit, Following, brakings, following
-from unjam.worlds.record import Episode, Floats, Trajectory, trajectory
+from unjam.worlds.audit import SHIELD_ROUNDING, Audit, BrakingLog, Following, following
+from unjam.worlds.record import Episode, Floats, Trajectory
+from unjam.worlds.sumo.log import TrafficLog
+from unjam.worlds.sumo.stays import StayLog
 from unjam.worlds.sumo.traffic import OpenKind, Scene, Traffic
 from unjam.worlds.world import Driven, OnProgress
 
-
-class Moment(NamedTuple):
-    """All vehicles that are on the road at one moment, in the same order."""
-
-    names: Sequence[str]
-    speeds: Sequence[float]
-    """[m/s]"""
-    positions: Sequence[float]
-    """[m]"""
-    gaps: Sequence[float]
-    """to the vehicle ahead [m]"""
+PEOPLE, CAV = 0, 1
+"""whose braking it is"""
 
 
 class OpenTraffic(Traffic[OpenKind]):
@@ -38,6 +29,9 @@ class OpenTraffic(Traffic[OpenKind]):
     stay ends with the last decision after which it is still on the road. What comes before `start` each kind
     of road does in its own way.
     """
+
+    _fuel_every = 1
+    """decisions for which what all vehicles burn is held"""
 
     def _is_cav(self, name: str) -> bool:
         """Whether a vehicle that has just entered is a CAV."""
@@ -54,13 +48,18 @@ class OpenTraffic(Traffic[OpenKind]):
     def _command_people(self) -> None:
         """Ask for the speeds that people want, where SUMO does not drive them."""
 
-    def _everybody(self) -> tuple[Sequence[str], list[float]]:
+    def _everybody(self) -> tuple[Sequence[str], Floats]:
         """Return who is on the road after the last step, and their speeds [m/s], in one order."""
-        names = list(self._on_road)
-        return names, self._simulation.speeds(names)
+        if self._now is None:
+            names = list(self._on_road)
+            self._now = names, np.array(self._simulation.speeds(names), np.float64)
+        return self._now
 
-    def _moment(self) -> Moment:
-        """Return all vehicles on the road now."""
+    def _note_moment(self) -> None:
+        """Get ready for what is asked of the moment after a decision."""
+
+    def _pictured_now(self, names: Sequence[str]) -> dict[str, Any]:
+        """Return what pictures show of these vehicles now, `positions` [m] and `gaps` to those ahead [m]."""
         raise NotImplementedError
 
     def _states(self, names: Sequence[str]) -> LocalState:
@@ -77,10 +76,6 @@ class OpenTraffic(Traffic[OpenKind]):
 
     def _lines(self) -> Floats:
         """Return the road's lines as `Scene` has them."""
-        raise NotImplementedError
-
-    def _pictured(self, vehicles: Sequence[str]) -> dict[str, Any]:
-        """Return what else the record says of the road."""
         raise NotImplementedError
 
     @property
@@ -101,29 +96,27 @@ class OpenTraffic(Traffic[OpenKind]):
         self._on_road: dict[str, bool] = {}
         """who is there, in order of entry; true: to be driven by the driver"""
         self.cavs, self._arrived = [], 0
+        self._alive = on_progress or (lambda steps: None)
+        self._now: tuple[Sequence[str], Floats] | None = None
         self._forget()
         self._follow()
         self._warm_up(lambda: self._simulate({}), on_progress)
         self._controlled = controlled
-        self._log_moments: list[Moment] = []
-        self._log_cavs: list[Sequence[str]] = []
-        self._log_states: list[LocalState] = []
-        self._log_applied: list[list[float]] = []
-        self._log_filtered: list[list[float]] = []
-        self._log_shield: list[list[float]] = []
-        self._log_places: list[Floats] = []
+        self._log = TrafficLog()
+        self._stays = StayLog()
         self._log_waiting: list[int] = []
+        self._log_fuel: list[float] = []
         self._arrived = 0
         self._forget()
         self._look()
 
     def _forget(self) -> None:
         """Begin the log of everybody's accelerations anew."""
-        self._watched, self._of_cav = list[str](), b""
+        self._watched: Sequence[str] = ()
+        self._of_cav: NDArray[np.uint8] = np.zeros(0, np.uint8)
         self._drives: Sequence[str] = ()
-        self._last_speeds: list[float] = []
-        self._changes, self._changed = array("d"), bytearray()
-        """everybody's changes of speed in each simulation step [m/s], and whether a CAV's"""
+        self._last_speeds = np.zeros(0)
+        self._brakings = BrakingLog(self.scenario.simulation_step)
 
     @property
     def waiting(self) -> int:
@@ -132,14 +125,14 @@ class OpenTraffic(Traffic[OpenKind]):
 
     def _state(self) -> LocalState:
         """Return what exact sensors of the CAVs would read now."""
-        return self._log_states[-1].read_only()
+        return self._stays.states[-1].read_only()
 
     def advance(self, command: Command | None) -> None:
         """Simulate one decision, held over its simulation steps; None: the CAVs stay human."""
         scenario, names = self.scenario, self.cavs
         step, obeys = scenario.simulation_step, scenario.actuation != "cruise"
         wanted = self._told(command) if self._controlled else []
-        before = self._log_states[-1].speed
+        before = self._stays.states[-1].speed
         shield = dict.fromkeys(names, 0.0)
         taken: dict[str, list[float]] = {name: [] for name in names}
         for _ in range(scenario.steps_per_decision):
@@ -154,15 +147,15 @@ class OpenTraffic(Traffic[OpenKind]):
         self.decisions += 1
         self._look()
         if not (self._controlled and obeys):
-            after = dict(zip(self._log_moments[-1].names, self.speeds, strict=True))
+            after = dict(zip(self._log.names, self.speeds, strict=True))
             changes = (after.get(name, speed) - speed for name, speed in zip(names, before, strict=True))
             wanted = [change / scenario.decision_step for change in changes]
         less = [sum(values) / scenario.steps_per_decision for values in taken.values()]
-        self._log_applied.append([asked - part for asked, part in zip(wanted, less, strict=True)])
-        self._log_filtered.append([max(values, default=0.0) for values in taken.values()])
-        self._log_shield.append(list(shield.values()))
-        if self.full:
-            self.log_fuel.append(self._simulation.fuel(self._log_moments[-1].names))
+        self._stays.applied.append([asked - part for asked, part in zip(wanted, less, strict=True)])
+        self._stays.filtered.append([max(values, default=0.0) for values in taken.values()])
+        self._stays.shield.append(list(shield.values()))
+        if self.full and (self.decisions - 1) % self._fuel_every == 0:
+            self._log_fuel.append(sum(self._simulation.fuel(self._log.names)))
 
     def _carried_out(self, wanted: dict[str, float], taken: dict[str, list[float]]) -> dict[str, float]:
         """Return the speeds that CAVs' accelerations lead to in this step, once they are filtered [m/s].
@@ -190,6 +183,7 @@ class OpenTraffic(Traffic[OpenKind]):
 
     def _follow(self) -> None:
         """Keep up with who is on the road."""
+        self._now = None
         entered, left = self._simulation.departed(), self._simulation.left()
         self._arrived += len(self._simulation.arrived())
         for name in left:
@@ -203,14 +197,18 @@ class OpenTraffic(Traffic[OpenKind]):
         names, speeds = self._everybody()
         last, driven = self._last_speeds, self.cavs if self._controlled else ()
         if names != self._watched:  # in few steps: the rest is quick
-            before = dict(zip(self._watched, last, strict=True))
-            last = [before.get(name, speed) for name, speed in zip(names, speeds, strict=True)]
+            before = dict(zip(self._watched, last.tolist(), strict=True))
+            last = np.array(list(map(before.get, names, speeds.tolist())), np.float64)
         if names != self._watched or driven is not self._drives:
-            self._of_cav = bytes(map(set(driven).__contains__, names))
+            chosen = set(driven)
+            self._of_cav = np.fromiter((name in chosen for name in names), np.uint8, len(names))
             self._watched, self._drives = list(names), driven
-        self._changes.fromlist(list(map(sub, speeds, last)))
-        self._changed.extend(self._of_cav)
+        self._brakings.note(speeds - last, self._whose())
         self._last_speeds = speeds
+
+    def _whose(self) -> NDArray[np.uint8]:
+        """Return whose changes of speed those of the last step are, in the order of `_watched`."""
+        return self._of_cav
 
     def _look(self) -> None:
         """Note who is where after a decision, and take control of the CAVs that have entered."""
@@ -223,53 +221,56 @@ class OpenTraffic(Traffic[OpenKind]):
         self.entered += len(new)
         if self._controlled:
             simulation.take_control(new, scenario.actuation, scenario.right_of_way, self._cav_type)
-        moment = self._moment()
-        self.speeds = moment.speeds
-        self._log_moments.append(moment)
-        self._log_cavs.append(self.cavs)
-        self._log_states.append(self._states(self.cavs))
+        names, self.speeds = self._everybody()
+        self._note_moment()
+        self._log.note(names, self.speeds)
+        if self._log.is_pictured:
+            pictured = self._pictured_now(names)
+            places = {"places": simulation.places(names)} if self.full else {}
+            self._log.picture({**pictured, **places})
+        self._stays.cavs.append(self.cavs)
+        self._stays.states.append(self._states(self.cavs))
         self._log_waiting.append(len(simulation.waiting()))
-        if self.full:
-            self._log_places.append(simulation.places(moment.names))
 
     def record(self, driven: Driven) -> Episode:
         """Return what happened since the start."""
-        names = list(dict.fromkeys(name for moment in self._log_moments for name in moment.names))
-        column = {name: index for index, name in enumerate(names)}
-        shape = (self.decisions + 1, len(names))
-        speeds, positions, gaps = (np.full(shape, np.nan) for _ in range(3))
-        places = np.full((*shape, 3), np.nan) if self.full else np.zeros((0, 0, 3))
-        fuel = np.full((len(self.log_fuel), len(names)), np.nan) if self.full else np.zeros((0, 0))
-        for time, (there, *values) in enumerate(self._log_moments):
-            columns = [column[name] for name in there]
-            for log, row in zip((speeds, positions, gaps), values, strict=True):
-                log[time, columns] = row
-            if self.full:
-                places[time, columns] = self._log_places[time]
-                if time:
-                    fuel[time - 1, columns] = self.log_fuel[time - 1]
-        trajectories = self._trajectories(driven)
-        return Episode(
-            **{**self._facts(), **self._pictured(names)},
-            vehicle_ids=tuple(names),
-            cav_ids=tuple(dict.fromkeys(each.vehicle for each in trajectories)),
-            speeds=speeds,
-            positions=positions,
-            gaps=gaps,
-            fuel=fuel,
-            arrived=self._arrived,
-            waiting=np.array(self._log_waiting, np.float64),
-            lines=self._lines() if self.full else np.zeros((0, 2)),
-            places=places,
-            trajectories=trajectories,
-            audit=self._audit(trajectories),
+        log, vehicles = self._log, self._log.vehicles
+        trajectories = self._stays.trajectories(driven, self.crashed, lambda: self._alive(self.decisions))
+        cavs = dict.fromkeys(each.vehicle for each in trajectories)
+        branches = self._branches(vehicles)
+        columns = log.columns(
+            [(name in cavs, branch) for name, branch in zip(vehicles, branches, strict=True)]
         )
+        of_column = dict(zip(columns.tolist(), branches, strict=True))
+        held = np.repeat(self._log_fuel, self._fuel_every)[: self.decisions]
+        facts: dict[str, Any] = {
+            "vehicle_ids": vehicles,
+            "cav_ids": tuple(cavs),
+            "columns": tuple(columns.tolist()) if len(of_column) < len(vehicles) else (),
+            "branches": tuple(of_column[column] for column in sorted(of_column)) if any(branches) else (),
+            "speeds": log.speeds(columns),
+            "every": log.every,
+            "fuel": held if self.full else np.zeros((0, 0)),
+            "arrived": self._arrived,
+            "waiting": np.array(self._log_waiting, np.float64),
+            "lines": self._lines() if self.full else np.zeros((0, 2)),
+            "trajectories": trajectories,
+            "audit": self._audit(trajectories),
+        }
+        return Episode(**{**self._facts(), **facts, **self._pictured(columns)})
+
+    def _branches(self, vehicles: Sequence[str]) -> Sequence[str]:
+        """Return where each vehicle came from; an empty text where that is not known."""
+        return [""] * len(vehicles)
+
+    def _pictured(self, columns: NDArray[np.intp]) -> dict[str, Any]:
+        """Return what pictures show, as the record has it, and what else it says of the road."""
+        names = ("positions", "gaps", "places") if self.full else ("positions", "gaps")
+        return {name: self._log.pictures(name, columns) for name in names}
 
     def _audit(self, trajectories: Sequence[Trajectory]) -> Audit:
         """Return the physics of every simulation step; how CAVs followed, of every decision."""
-        accelerations = np.array(self._changes) / self.scenario.simulation_step
-        of_cav = np.array(self._changed, bool)
-        people, cavs = brakings(accelerations[~of_cav]), brakings(accelerations[of_cav])
+        people, cavs = self._brakings.of(PEOPLE), self._brakings.of(CAV)
         return Audit(people, cavs, self._decided(trajectories), self.scenario.safety.time_headway)
 
     def _decided(self, trajectories: Sequence[Trajectory]) -> Following:
@@ -284,46 +285,12 @@ class OpenTraffic(Traffic[OpenKind]):
         added = np.concatenate([each.shield for each in trajectories]) if trajectories else np.zeros(0)
         return following(speed, leader, gap, step, added > SHIELD_ROUNDING, np.zeros_like(added))
 
-    def _trajectories(self, driven: Driven) -> tuple[Trajectory, ...]:
-        """Return the stays of at least one decision, in order of entry."""
-        stays: defaultdict[str, list[tuple[int, int]]] = defaultdict(list)
-        """moment and row of each CAV"""
-        for time, names in enumerate(self._log_cavs):
-            for row, name in enumerate(names):
-                stays[name].append((time, row))
-        states = list(zip(*self._log_states, strict=True))
-        found = []
-        for number, (name, places) in enumerate(stays.items()):
-            start, steps = places[0][0], len(places) - 1
-            if steps == 0:
-                continue
-            found.append(
-                trajectory(
-                    vehicle=name,
-                    number=number,
-                    start=start,
-                    rows=np.array([row for _, row in places]),
-                    states=LocalState(*(_stay(values, places) for values in states)),
-                    applied=_stay(self._log_applied, places[:-1]),
-                    filtered=_stay(self._log_filtered, places[:-1]),
-                    shield=_stay(self._log_shield, places[:-1]),
-                    terminated=self.crashed and start + steps == self.decisions,
-                    driven=driven,
-                )
-            )
-        return tuple(found)
-
     def last_applied(self) -> Floats:
         """Return what the CAVs were told in the last decision, once it was filtered [m/s2], shape (CAVs,)."""
-        return np.array(self._log_applied[-1])
+        return np.array(self._stays.applied[-1])
 
     def scene(self) -> Scene:
         """Return this moment as pictures show it."""
-        names, speeds = self._log_moments[-1].names, np.array(self.speeds)
+        names, speeds = self._log.names, np.array(self.speeds)
         cavs = np.array([name in self.cavs for name in names], bool)
         return Scene(self._lines(), self._simulation.places(names), speeds, cavs)
-
-
-def _stay(values: Sequence[Any], places: Sequence[tuple[int, int]]) -> Any:
-    """Return what a CAV was told of one quantity at its moments and rows; None where the road offers none."""
-    return None if values[0] is None else np.array([values[time][row] for time, row in places])

@@ -3,20 +3,22 @@
 import hashlib
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import replace
 from itertools import accumulate
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from unjam.drivers.local_state import LARGEST_GAP, LocalState
 from unjam.scenarios.road import OwnRoad
-from unjam.worlds.record import Episode, Floats
+from unjam.worlds.record import Floats
 from unjam.worlds.sumo.files import CAV_TYPES
 from unjam.worlds.sumo.lanes import Followed, LaneTraffic
 from unjam.worlds.sumo.networks import edge_lengths, lane_counts, network_lines
-from unjam.worlds.sumo.open import Moment
-from unjam.worlds.world import Driven, OnProgress
+from unjam.worlds.world import OnProgress
+
+FUEL_SECONDS = 1.0
+"""time for which what all vehicles burn is held: SUMO computes it as long as it takes to drive"""
 
 
 class OwnTraffic(LaneTraffic[OwnRoad]):
@@ -25,10 +27,13 @@ class OwnTraffic(LaneTraffic[OwnRoad]):
     def start(self, controlled: bool, on_progress: OnProgress | None = None) -> None:
         """Run the warm-up, then hand the CAVs over; drivers remember nothing of it."""
         self._routes: Counter[tuple[str, ...]] = Counter()
-        self._log_edges: list[list[tuple[str, int, float]]] = []
-        self._allowed: list[float] = []
+        self._edges: dict[str, int] = {}
+        """number of each edge on which anybody was"""
+        self._allowed, self._counted = 0.0, 0
+        """sum of the speeds that were allowed to vehicles [m/s], and of how many"""
         self._picked = 0
         """vehicles that have entered and are CAVs"""
+        self._fuel_every = max(1, int(FUEL_SECONDS / self.scenario.decision_step))
         super().start(controlled, on_progress)
 
     @property
@@ -81,13 +86,16 @@ class OwnTraffic(LaneTraffic[OwnRoad]):
     def _ends_with(self, colliding: Sequence[str]) -> bool:
         return any(name in self.cavs for name in colliding)
 
-    def _moment(self) -> Moment:
-        names = list(self._on_road)
-        if self.full:
-            self._log_edges.append(self._simulation.edge_places(names))
-            self._allowed += self._simulation.allowed_speeds(names)
-        unknown = [float("nan")] * len(names)
-        return Moment(names, self._simulation.speeds(names), unknown, unknown)
+    def _pictured_now(self, names: Sequence[str]) -> dict[str, Any]:
+        unknown = np.full(len(names), np.nan)
+        if not self.full:
+            return {"positions": unknown, "gaps": unknown}
+        allowed = self._simulation.allowed_speeds(names)
+        self._allowed, self._counted = self._allowed + sum(allowed), self._counted + len(allowed)
+        places = self._simulation.edge_places(names)
+        rows = [(self._edges.setdefault(edge, len(self._edges)), *where) for edge, *where in places]
+        edge, lane, along = np.array(rows, np.float64).reshape(-1, 3).T
+        return {"edge": edge, "lane": lane, "along": along, "gaps": unknown}
 
     def _states(self, names: Sequence[str]) -> LocalState:
         found = [self._simulation.neighbours(name, LARGEST_GAP) for name in names]
@@ -96,14 +104,21 @@ class OwnTraffic(LaneTraffic[OwnRoad]):
         speed = np.array(self._simulation.speeds(names), np.float64)
         return LocalState(speed, leader_speed, leader_gap, follower_speed, follower_gap, unknown, unknown)
 
-    def record(self, driven: Driven) -> Episode:
-        """Return what happened since the start; positions are those along the route that is driven most.
+    def _lines(self) -> Floats:
+        return network_lines(self.road.files.network)
+
+    def _pictured(self, columns: NDArray[np.intp]) -> dict[str, Any]:
+        """Return what pictures show; positions are those along the route that is driven most.
 
         Its lanes count from the left: what widens a road is on its right most of the time.
         """
-        found = super().record(driven)
-        if not self.full or not self._routes:
-            return found
+        if not self.full:
+            return super()._pictured(columns)
+        gaps, places, edge = (self._log.pictures(name, columns) for name in ("gaps", "places", "edge"))
+        shown = {"gaps": gaps, "places": places, "positions": np.full(edge.shape, np.nan)}
+        shown["limit_speed"] = self._allowed / self._counted if self._counted else float("nan")
+        if not self._routes:
+            return shown
         network = self.road.files.network
         lengths, counts = edge_lengths(network), lane_counts(network)
         planned: Counter[str] = Counter()  # not where they were: all drivers' pictures show the same route
@@ -112,24 +127,14 @@ class OwnTraffic(LaneTraffic[OwnRoad]):
         route = max(self._routes, key=lambda edges: sum(planned[edge] for edge in set(edges)))
         starts = accumulate((lengths[edge] for edge in route), initial=0.0)
         begins = dict(reversed(list(zip(route, starts, strict=False))))
-        column = {name: index for index, name in enumerate(found.vehicle_ids)}
-        positions, lanes = np.full((2, *found.positions.shape), np.nan)
-        for time, ((names, *_), places) in enumerate(zip(self._log_moments, self._log_edges, strict=True)):
-            for name, (edge, lane, along) in zip(names, places, strict=True):
-                if edge in begins:
-                    positions[time, column[name]] = begins[edge] + along
-                    lanes[time, column[name]] = counts[edge] - 1 - lane
+        facts = [(begins.get(name, np.nan), counts.get(name, 0)) for name in self._edges]
+        nobody = (np.nan, np.nan)
+        begin, lanes = np.array([*facts, nobody]).T[:, np.nan_to_num(edge, nan=-1).astype(int)]
+        shown["positions"] = begin + self._log.pictures("along", columns)
         most = max(counts[edge] for edge in route)
         if most == 1:
-            return replace(found, positions=positions)
+            return shown
+        lane = np.where(np.isnan(begin), np.nan, lanes - 1 - self._log.pictures("lane", columns))
         further = ("2nd", "3rd", *(f"{number}th" for number in range(4, most + 1)))
         named = ("left lane", *(f"{ordinal} lane" for ordinal in further[: most - 1]))
-        return replace(found, positions=positions, lanes=lanes, lane_names=named)
-
-    def _lines(self) -> Floats:
-        return network_lines(self.road.files.network)
-
-    def _pictured(self, vehicles: Sequence[str]) -> dict[str, Any]:
-        if not self.full:
-            return {}
-        return {"limit_speed": float(np.mean(self._allowed)) if self._allowed else float("nan")}
+        return {**shown, "lanes": lane, "lane_names": named}

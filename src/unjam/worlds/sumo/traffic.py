@@ -56,7 +56,7 @@ class Traffic(World[Episode], Generic[RoadKind]):
     single = False
     cavs: Sequence[str]
     """the CAVs on the road now, in order of entry: the rows of what drivers are given and answer"""
-    speeds: Sequence[float]
+    speeds: Sequence[float] | Floats
     """of all vehicles on the road now [m/s]"""
     kept: Sequence[int] | None = None  # pyright: ignore[reportIncompatibleMethodOverride]
 
@@ -79,7 +79,6 @@ class Traffic(World[Episode], Generic[RoadKind]):
         self.entered = 0
         self.full = full
         """whether fuel and, on roads with ends, places are recorded"""
-        self.log_fuel: list[list[float]] = []
         self._controlled = False
         braking, step = scenario.safety.leader_braking, scenario.simulation_step
         self._readings = (

@@ -1,0 +1,71 @@
+"""What a road with ends keeps of its CAVs: each stay of one is a trajectory of its own."""
+
+from collections import defaultdict
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from unjam.drivers.local_state import LocalState
+from unjam.worlds.record import Trajectory, trajectory
+from unjam.worlds.world import Driven
+
+BETWEEN_SIGNS = 500
+"""stays that are put in order between two signs of life"""
+
+
+class StayLog:
+    """Which CAVs were there at each moment, what they perceived, and what they were told after it."""
+
+    def __init__(self) -> None:
+        """Begin with no moment."""
+        self.cavs: list[Sequence[str]] = []
+        self.states: list[LocalState] = []
+        self.applied: list[list[float]] = []
+        """[m/s2]; this and the next of each decision, one less than moments"""
+        self.filtered: list[list[float]] = []
+        """what the safety filter took from it [m/s2]"""
+        self.shield: list[list[float]] = []
+        """braking that SUMO added to it [m/s2]"""
+
+    def trajectories(
+        self, driven: Driven, crashed: bool, on_stay: Callable[[], object]
+    ) -> tuple[Trajectory, ...]:
+        """Return the stays of at least one decision, in order of entry.
+
+        `driven` is all that the driver decided, `crashed` whether a collision ended the episode; `on_stay` is
+        called now and then.
+        """
+        stays: defaultdict[str, list[tuple[int, int]]] = defaultdict(list)
+        """moment and row of each CAV"""
+        for time, names in enumerate(self.cavs):
+            for row, name in enumerate(names):
+                stays[name].append((time, row))
+        states = list(zip(*self.states, strict=True))
+        found = []
+        for number, (name, places) in enumerate(stays.items()):
+            if number % BETWEEN_SIGNS == 0:
+                on_stay()
+            start, steps = places[0][0], len(places) - 1
+            if steps == 0:
+                continue
+            found.append(
+                trajectory(
+                    vehicle=name,
+                    number=number,
+                    start=start,
+                    rows=np.array([row for _, row in places]),
+                    states=LocalState(*(_of_stay(values, places) for values in states)),
+                    applied=_of_stay(self.applied, places[:-1]),
+                    filtered=_of_stay(self.filtered, places[:-1]),
+                    shield=_of_stay(self.shield, places[:-1]),
+                    terminated=crashed and start + steps == len(self.applied),
+                    driven=driven,
+                )
+            )
+        return tuple(found)
+
+
+def _of_stay(values: Sequence[Any], places: Sequence[tuple[int, int]]) -> Any:
+    """Return what a CAV was told of one quantity at its moments and rows; None where the road offers none."""
+    return None if values[0] is None else np.array([values[time][row] for time, row in places])
