@@ -38,6 +38,9 @@ class Trickle(BytesIO):
     def read(self, size: int | None = -1, /) -> bytes:
         return super().read(1)
 
+    def readinto(self, buffer: Any, /) -> int:
+        return super().readinto(memoryview(buffer)[:1])
+
 
 def frame(facts: dict[str, Any], arrays: Arrays | None = None) -> bytes:
     pipe = BytesIO()
@@ -111,6 +114,13 @@ def test_pickled_objects_do_not_travel() -> None:
 
 def test_a_frame_is_two_lengths_then_json_then_arrays() -> None:
     whole = frame({"a": 1}, {"b": np.ones(1)})
-    text, data = struct.unpack(">QQ", whole[:16])
+    text, about = struct.unpack(">QQ", whole[:16])
     assert json.loads(whole[16 : 16 + text]) == {"a": 1}
-    assert len(whole) == 16 + text + data
+    assert json.loads(whole[16 + text : 16 + text + about]) == [["b", "<f8", [1]]]
+    assert whole[16 + text + about :] == np.ones(1).tobytes()
+
+
+def test_arrays_of_anything_but_numbers_are_not_read() -> None:
+    about = json.dumps([["b", "|O", [1]]]).encode()
+    with pytest.raises(ValueError, match="not allowed"):
+        read_message(BytesIO(struct.pack(">QQ", 2, len(about)) + b"{}" + about + bytes(8)))

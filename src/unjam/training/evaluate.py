@@ -163,14 +163,12 @@ def save_evaluation(folder: Path, evaluation: Evaluation, about: dict[str, Any])
     """
     make_folder(folder)
     rows = [{"driver": label, **row} for label, found in evaluation.rows.items() for row in found]
+    shown = [shown_of(label, episode) for label, episode in evaluation.shown.items()]
     arrays = {
-        f"{number}.{name}": array
-        for number, episode in enumerate(evaluation.shown.values())
-        for name, array in packed(shown_of("", episode)).items()
+        f"{number}.{name}": array for number, each in enumerate(shown) for name, array in packed(each).items()
     }
     about_shown = [
-        {"driver": label, **{name: getattr(episode, name) for name in ABOUT_SHOWN}}
-        for label, episode in evaluation.shown.items()
+        {"driver": each.driver, **{name: getattr(each, name) for name in ABOUT_SHOWN}} for each in shown
     ]
     write_whole(folder / "shown.safetensors", save(arrays))
     write_whole(folder / "episodes.parquet", frame_of_rows(evaluation.rows).to_parquet())

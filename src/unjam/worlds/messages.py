@@ -5,28 +5,48 @@ import struct
 from typing import IO, Any
 
 import numpy as np
-from safetensors.numpy import load, save
 
 from unjam.tree import Arrays
 
 _LENGTHS = struct.Struct(">QQ")
+NUMBERS = "biuf"
+"""kinds of arrays that travel: truth values and numbers"""
 
 
 def write_message(pipe: IO[bytes], facts: dict[str, Any], arrays: Arrays | None = None) -> None:
-    """Write one message: `facts` as JSON, and arrays by name."""
-    text = json.dumps(facts).encode()
-    data = save({name: np.asarray(array, order="C") for name, array in arrays.items()}) if arrays else b""
-    pipe.write(_LENGTHS.pack(len(text), len(data)) + text)
-    pipe.write(data)  # apart: joined, hours of traffic would be in memory twice
+    """Write one message: `facts` as JSON, and arrays of numbers by name.
+
+    An array is written from where it lies: hours of traffic are not in memory twice.
+    """
+    made = {name: np.asarray(array, order="C") for name, array in (arrays or {}).items()}
+    for name, array in made.items():
+        if array.dtype.kind not in NUMBERS:
+            raise TypeError(f"{name}: an array of {array.dtype} cannot travel")
+    shapes = [[name, array.dtype.str, array.shape] for name, array in made.items()]
+    text, about = json.dumps(facts).encode(), json.dumps(shapes).encode()
+    pipe.write(_LENGTHS.pack(len(text), len(about)) + text + about)
+    for array in made.values():
+        pipe.write(_bytes_of(array))
     pipe.flush()
 
 
 def read_message(pipe: IO[bytes]) -> tuple[dict[str, Any], Arrays]:
     """Return the next message; raise `EOFError` where the other side is gone."""
-    text_length, data_length = _LENGTHS.unpack(_read_exactly(pipe, _LENGTHS.size))
-    facts = json.loads(_read_exactly(pipe, text_length))
-    data = _read_exactly(pipe, data_length)
-    return facts, load(data) if data else {}
+    lengths = _LENGTHS.unpack(_read_exactly(pipe, _LENGTHS.size))
+    facts, shapes = (json.loads(_read_exactly(pipe, length)) for length in lengths)
+    arrays: Arrays = {}
+    for name, kind, shape in shapes:
+        dtype = np.dtype(kind)
+        if dtype.kind not in NUMBERS:
+            raise ValueError(f"{name}: an array of {dtype} is not allowed")
+        arrays[name] = np.empty(shape, dtype)
+        _fill(pipe, _bytes_of(arrays[name]))
+    return facts, arrays
+
+
+def _bytes_of(array: np.ndarray) -> memoryview:
+    """Return the memory of an array; what is written there is in the array."""
+    return array.reshape(-1).view(np.uint8).data
 
 
 def _read_exactly(pipe: IO[bytes], length: int) -> bytes:
@@ -38,3 +58,11 @@ def _read_exactly(pipe: IO[bytes], length: int) -> bytes:
         parts.append(part)
         length -= len(part)
     return b"".join(parts)
+
+
+def _fill(pipe: Any, memory: memoryview) -> None:
+    while memory:
+        count = pipe.readinto(memory)
+        if not count:
+            raise EOFError("the other side closed the pipe")
+        memory = memory[count:]

@@ -54,8 +54,10 @@ class TrafficLog:
         """Note the next moment: who is on the road, and how fast [m/s]."""
         if names != self.names:  # seldom: otherwise both moments share what says who is there
             self.names = list(names)
-            numbers = (self._numbers.setdefault(name, len(self._numbers)) for name in names)
-            self._row = np.fromiter(numbers, np.int32, len(names))
+            for name in names:
+                if name not in self._numbers:
+                    self._numbers[name] = len(self._numbers)
+            self._row = np.array(list(map(self._numbers.__getitem__, names)), np.int32)
         self._rows.append(self._row)
         self._speeds.append(np.array(speeds, np.float64))
 

@@ -200,8 +200,7 @@ class OpenTraffic(Traffic[OpenKind]):
             before = dict(zip(self._watched, last.tolist(), strict=True))
             last = np.array(list(map(before.get, names, speeds.tolist())), np.float64)
         if names != self._watched or driven is not self._drives:
-            chosen = set(driven)
-            self._of_cav = np.fromiter((name in chosen for name in names), np.uint8, len(names))
+            self._of_cav = np.array(list(map(set(driven).__contains__, names)), np.uint8)
             self._watched, self._drives = list(names), driven
         self._brakings.note(speeds - last, self._whose())
         self._last_speeds = speeds
