@@ -17,6 +17,7 @@ from unjam.cli.options import (
     WorkersOption,
     assignments,
     new_folder,
+    people_changes,
     scenario_changes,
     with_options,
 )
@@ -177,6 +178,7 @@ def watch_in_window(scenario: "Scenario", driver: "Driver", seed: Sequence[int],
         return run_episode(scenario, driver, seed, simulation=window)
 
 
+@with_options(changes=people_changes)
 def assess(
     *,
     scenario: Annotated[str, typer.Argument(help="Your own .sumocfg file.", metavar="FILE")],
@@ -206,6 +208,7 @@ def assess(
     workers: WorkersOption = DEFAULT_WORKERS,
     out: OutOption = None,
     json: JsonOption = False,
+    changes: dict[str, Any],
 ) -> None:
     """What would CAVs do on my road? Shares and drivers beside people alone, and a recommendation, or none.
 
@@ -219,14 +222,14 @@ def assess(
 
       unjam assess my.sumocfg --shares 0.05,0.2 -d acc -d pi --minutes 30
 
-      unjam assess my.sumocfg -d runs/my-001 --shares 0.1 --set horizon=6000 --json
+      unjam assess my.sumocfg -d runs/my-001 --shares 0.1 --begin 28800 --end 32400 --json
     """
     from unjam.training.assess import DRIVERS_OF_OPEN_ROADS, question
     from unjam.training.assess import assess as run
     from unjam.training.folder import new_and_owned
     from unjam.worlds.workers import Workers
 
-    drivers, changes = driver or DRIVERS_OF_OPEN_ROADS, assignments(settings)
+    drivers, changes = driver or DRIVERS_OF_OPEN_ROADS, {**changes, **assignments(settings)}
     asked = question(scenario, _shares(shares), episodes, precision, minutes, drivers, changes)
     folder = new_folder(out, f"assess-{Path(scenario).stem}")
     total = asked.road.horizon * episodes

@@ -43,6 +43,8 @@ HumansOption = Annotated[
     Path | None,
     typer.Option("--humans", help="Calibrated drivers, of `unjam fit-drivers`: the people on the road."),
 ]
+BeginOption = Annotated[float | None, typer.Option(help="When your own network begins [s].")]
+EndOption = Annotated[float | None, typer.Option(help="When it ends [s].")]
 
 DEFAULT_WORKERS = os.cpu_count() or 1
 
@@ -105,8 +107,8 @@ def scenario_changes(
     cav_types: Annotated[
         str | None, typer.Option(help="Vehicle types that are CAVs, on your own network: car,truck.")
     ] = None,
-    begin: Annotated[float | None, typer.Option(help="When your own network begins [s].")] = None,
-    end: Annotated[float | None, typer.Option(help="When it ends [s].")] = None,
+    begin: BeginOption = None,
+    end: EndOption = None,
     humans: HumansOption = None,
 ) -> dict[str, Any]:
     """Return the changes to a scenario that the options of a road ask for."""
@@ -118,10 +120,18 @@ def scenario_changes(
         "warmup": warmup,
         "cav_share": cav_share,
         "cav_types": cav_types.split(",") if cav_types else None,
-        "begin": begin,
-        "end": end,
-        "population": str(humans.absolute()) if humans else None,
     }
+    return {
+        **{name: value for name, value in asked.items() if value is not None},
+        **people_changes(begin, end, humans),
+    }
+
+
+def people_changes(
+    begin: BeginOption = None, end: EndOption = None, humans: HumansOption = None
+) -> dict[str, Any]:
+    """Return the changes to a scenario that say when, and who the people are."""
+    asked = {"begin": begin, "end": end, "population": str(humans.absolute()) if humans else None}
     return {name: value for name, value in asked.items() if value is not None}
 
 

@@ -14,12 +14,16 @@ from unjam.errors import InputError, wrong
 from unjam.parameters import STRICT, Count, NotNegative, Positive, build
 from unjam.scenarios.road import OwnRoad
 from unjam.scenarios.scenario import Scenario
-from unjam.sumo_files import read_sumo_files
+from unjam.sumo_files import SumoFiles, read_sumo_files
 
 LONGEST = 3600.0
 """seconds of an episode where the configuration names no end"""
 CARS = ("passenger", "private", "hov", "taxi", "evehicle", "delivery", "truck", "trailer", "bus", "coach")
 """SUMO's vehicle classes that a share picks from"""
+PASSENGER = "passenger"
+"""the class of those that calibrated people drive: SUMO's default"""
+DRAWN = 100
+"""calibrated people of an episode, drawn from the population"""
 MOST_NAMED = 8
 """things of the files that are not used, in the line that tells of them"""
 LOG = logging.getLogger(__name__)
@@ -69,14 +73,16 @@ class OwnNetwork(Scenario):
                 raise ValueError("cav_share: 0.0 is not allowed without cav_types; allowed: > 0, <= 1")
             if not any(is_car(files.types.get(name, {})) for name in files.used_types):
                 raise ValueError(f"cav_share: no vehicle is a car; its types are {known}; name cav_types")
+        if self.calibrated and self.calibrated.residual is not None:
+            raise ValueError(
+                "population: one with a residual network is not allowed on your own network: SUMO's "
+                "own IDM drives them there"
+            )
+        if self.population and not passenger_types(files):
+            raise ValueError(f"population: no vehicle is a passenger car; its types are {known}")
         if self.human_control != "native":
             raise ValueError(
                 "human_control: 'commanded' is not allowed on your own network; allowed: 'native'"
-            )
-        if self.population:
-            raise ValueError(
-                f"population: {self.population!r} is not allowed on your own network: people drive as its "
-                "vehicle types say"
             )
         return self
 
@@ -87,20 +93,25 @@ class OwnNetwork(Scenario):
             # The horizon ends an episode; SUMO would refuse an end of the configuration that is earlier.
             options = {name: value for name, value in files.options.items() if name != "end"}
             files = files._replace(begin=self.begin, options={**options, "begin": f"{self.begin:g}"})
+        cav_seed = int(generator.integers(2**31))
+        drivers = self.calibrated.draw(DRAWN, generator) if self.calibrated else ()
         return OwnRoad(
             files=files,
+            drivers=tuple(drivers),
+            driven_types=frozenset(passenger_types(files) if drivers else ()),
             limit_speed=float("nan"),
             cav_share=self.cav_share,
             cav_types=self.cav_types,
             cars=frozenset(name for name, attributes in files.types.items() if is_car(attributes)),
-            cav_seed=int(generator.integers(2**31)),
+            cav_seed=cav_seed,
             cavs=self.cavs,
         )
 
     @property
     def people_in_words(self) -> str:
         """How people drive."""
-        return "as the vehicle types of its files say"
+        files = "as the vehicle types of its files say"
+        return f"in cars {super().people_in_words}; others {files}" if self.calibrated else files
 
     def possible_cavs(self) -> tuple[str, ...]:
         """Return names for as many CAVs as there may be; what their vehicles are called SUMO alone knows.
@@ -150,6 +161,12 @@ def _tell_dropped(file: str, dropped: tuple[str, ...]) -> None:
     names = ", ".join(name[:60] for name in dropped[:MOST_NAMED])
     more = f" and {len(dropped) - MOST_NAMED} more" if len(dropped) > MOST_NAMED else ""
     LOG.warning("%s: left out, so that SUMO only simulates: %s%s", file, names, more)
+
+
+def passenger_types(files: SumoFiles) -> list[str]:
+    """Return the types of passenger cars that vehicles have; SUMO's default class is that one."""
+    classes = {name: files.types.get(name, {}).get("vClass", PASSENGER) for name in files.used_types}
+    return sorted(name for name, kind in classes.items() if kind == PASSENGER)
 
 
 def is_car(attributes: dict[str, str]) -> bool:

@@ -238,3 +238,7 @@ class OwnRoad(OpenRoad):
     """which vehicles the share picks"""
     cavs: int | None = None
     """at most so many of them, the first that enter"""
+    drivers: tuple[IDMParameters, ...] = ()
+    """calibrated people, one of whom drives each car; nobody where all drive as their types say"""
+    driven_types: frozenset[str] = frozenset()
+    """vehicle types that they drive"""

@@ -9,7 +9,7 @@ from typing import Any
 from unjam.controller.file import hash_of
 from unjam.errors import InputError, did_you_mean, wrong, wrong_name
 from unjam.measures.detectors import Measurement, read_detectors
-from unjam.scenarios.own_network import OwnNetwork, own_network
+from unjam.scenarios.own_network import OwnNetwork, own_network, passenger_types
 from unjam.sumo_files import SumoFiles, read_sumo_files
 from unjam.training.assess import NOBODY
 from unjam.training.search import Range, Space, space_of
@@ -29,7 +29,6 @@ VARIED: Space = {
 """factors on the attributes of passenger vehicle types, and on flows"""
 SUMO_DEFAULTS = {"tau": 1.0, "accel": 2.6, "decel": 4.5, "minGap": 2.5, "speedFactor": 1.0}
 """of passenger types that do not say otherwise"""
-PASSENGER = "passenger"
 DISTRIBUTED = re.compile(r"(normc?)\(([^()]*)\)")
 """a speed factor that each vehicle draws"""
 
@@ -127,15 +126,6 @@ def _lanes(network: Path, kind: str, row: Measurement) -> list[Loop]:
     if row.position > lengths[edge]:
         raise wrong(f"{kind} {row.place}: position", row.position, f"<= {lengths[edge]:g} m, its length")
     return [Loop(lane, row.position) for lane in lanes]
-
-
-def passenger_types(files: SumoFiles) -> list[str]:
-    """Return the types of passenger cars that vehicles have; SUMO's default class is that one."""
-    return [
-        name
-        for name in sorted(files.used_types)
-        if files.types.get(name, {}).get("vClass", PASSENGER) == PASSENGER
-    ]
 
 
 def changed_types(files: SumoFiles, factors: Factors) -> dict[str, dict[str, str]]:

@@ -45,13 +45,14 @@ def test_an_episode_is_the_same_wherever_sumo_runs(road: Scenario, simulation: S
 
 def test_all_that_is_asked_of_a_simulation_is_answered_alike(road: Scenario, simulation: Simulation) -> None:
     asked = [(name, of) for name, of in vars(Simulation).items() if not name.startswith("_") and callable(of)]
-    told = {"load", "step", "close", "command_speeds", "replace_speeds", "command_people", "take_control"}
+    told = {"load", "step", "close", "command_speeds", "replace_speeds", "command_people"}
+    told |= {"take_control", "change_type"}
     answers = []
     with SimulationApart() as apart:
         for each in (simulation, apart):
             make_traffic(road, (0,), each).start(controlled=False)  # pyright: ignore[reportArgumentType]
             names = ["0", "1"]
-            arguments = {"neighbours": ("1", 100.0), "leader": ("1", 100.0), "left": (), "more_expected": ()}
+            arguments = {"neighbours": ("1", 100.0), "left": (), "more_expected": ()}
             arguments |= dict.fromkeys(("type_of", "route_of"), ("1",))
             answers.append(
                 {

@@ -12,9 +12,12 @@ from tests.worlds.sumo.own_roads import game, grid, straight
 from tests.worlds.test_record import fingerprint, travelled
 from unjam.drivers import IDM, Constant, Human, PISaturation
 from unjam.drivers.command import Command
+from unjam.drivers.network import Network
 from unjam.errors import InputError
 from unjam.measures.metrics import measure
+from unjam.physics.idm import IDMParameters
 from unjam.scenarios import Scenario, make_scenario
+from unjam.scenarios.population import Population, write_population
 from unjam.worlds.episode import run_episode
 from unjam.worlds.sumo import make_traffic
 from unjam.worlds.sumo.own import OwnTraffic
@@ -93,6 +96,39 @@ def test_a_share_is_about_that_share_and_types_are_all_of_theirs(tmp_path: Path)
         driven = {name for moment in traffic._stays.cavs for name in moment}
         there = set(traffic._log.names) | driven
         assert driven == {name for name in there if "truck" in kinds.get(name, "")} != set()
+
+
+def test_calibrated_people_drive_the_cars_and_the_same_vehicles_stay_cavs(tmp_path: Path) -> None:
+    file, people = game(tmp_path, "ramp"), tmp_path / "drivers.json"
+    near, far = IDMParameters(time_headway=0.8), IDMParameters(time_headway=3.0, minimum_gap=6.0)
+    write_population(people, Population(near, (near, far), (-9.0, 3.0)))
+    plain = run_episode(scenario_of(file, horizon=400), Human(), (0,))
+    calibrated = scenario_of(file, horizon=400, population=str(people))
+    assert "2 calibrated drivers" in calibrated.people_in_words
+    driven = run_episode(calibrated, Human(), (0,))
+    assert set(plain.cav_ids) & set(driven.cav_ids)
+    assert not set(driven.cav_ids) & (set(plain.vehicle_ids) - set(plain.cav_ids))
+    assert np.nanmean(driven.speeds) != np.nanmean(plain.speeds)
+    with Simulation() as simulation:
+        traffic = own(simulation, file, population=str(people), horizon=100)
+        seen: dict[str, set[tuple[float, float]]] = {}
+        for _ in range(100):
+            traffic.advance(Command(np.zeros(len(traffic.cavs))))
+            for name in set(libsumo.vehicle.getIDList()) - set(traffic.cavs):
+                kind = libsumo.vehicle.getVehicleClass(name)
+                seen.setdefault(kind, set()).add(
+                    (libsumo.vehicle.getTau(name), libsumo.vehicle.getMinGap(name))
+                )
+    assert seen["passenger"] == {(one.time_headway, one.minimum_gap) for one in (near, far)}
+    assert not seen.get("truck", set()) & seen["passenger"]
+
+
+def test_a_population_with_a_residual_is_refused_where_sumo_drives(tmp_path: Path) -> None:
+    residual = Network(((np.zeros((3, 1)), np.zeros(1)),), 0.5)
+    one, people = IDMParameters(), tmp_path / "drivers.json"
+    write_population(people, Population(one, (one,), (-9.0, 3.0), residual))
+    with pytest.raises(InputError, match="residual network is not allowed on your own network"):
+        scenario_of(game(tmp_path, "ramp"), population=str(people))
 
 
 def test_everyone_may_be_a_cav_and_nobody(file: Path, simulation: Simulation) -> None:

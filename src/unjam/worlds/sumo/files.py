@@ -1,5 +1,6 @@
 """What SUMO reads of an episode: the network, who drives how, and who enters."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,6 +17,8 @@ ACCELERATION = 2.6
 """of commanded people and of cars, SUMO's own [m/s2]"""
 CAV_TYPES = "cav_of_{}"
 """the type of a CAV whose own type is `{}`"""
+CALIBRATED_TYPES = "{}_of_driver_{}"
+"""the type of a car whose own type is `{}`, driven by a calibrated person of that number"""
 KEPT = (
     *("vClass", "length", "width", "height", "maxSpeed", "speedFactor", "guiShape", "emissionClass"),
     "laneChangeModel",
@@ -111,13 +114,28 @@ def _motorway_types(scenario: Scenario, road: MotorwayRoad) -> list[str]:
 
 
 def _own_types_xml(scenario: Scenario, road: OwnRoad) -> str:
-    """Return the XML of a CAV type beside each of the user's types: as large, but driven by commands."""
-    types = []
-    for name, attributes in road.files.types.items():
-        kept = {key: value for key, value in attributes.items() if key in KEPT or key.startswith("lc")}
+    """Return the XML of a CAV type beside each of the user's types: as large, but driven by commands.
+
+    Where calibrated people drive, each car's type is there for each of them, as large and as fast as it was.
+    """
+    calibrated = {
+        CALIBRATED_TYPES.format(name, number): {
+            **_kept(road.files.types[name], (*KEPT, "speedDev", "color")),
+            **_idm_layer(one),
+        }
+        for name in sorted(road.driven_types)
+        for number, one in enumerate(road.drivers)
+    }
+    types = [{**attributes, "id": name} for name, attributes in calibrated.items()]
+    for name, attributes in {**road.files.types, **calibrated}.items():
         calm = {"id": CAV_TYPES.format(name), "sigma": 0.0, "speedDev": 0.0}
-        types.append({**kept, **calm, **_cav_layer(scenario)})
+        types.append({**_kept(attributes, KEPT), **calm, **_cav_layer(scenario)})
     return document("additional", "vType", types)
+
+
+def _kept(attributes: Attributes, names: Sequence[str]) -> Attributes:
+    """Return those attributes that have one of these names, or are about changing lanes."""
+    return {key: value for key, value in attributes.items() if key in names or key.startswith("lc")}
 
 
 def _vehicle_type(name: str, scenario: Scenario, **attributes: Any) -> str:
@@ -137,20 +155,24 @@ def _vehicle_type(name: str, scenario: Scenario, **attributes: Any) -> str:
 def _human_layer(scenario: Scenario, humans: IDMParameters) -> Attributes:
     """Return how SUMO drives people: its own IDM; under commanded people Flow's layer, quick, with no gap."""
     population = scenario.calibrated
-    layer = {
-        "carFollowModel": "IDM",
-        "accel": humans.max_acceleration,
-        "decel": humans.comfortable_deceleration,
-        "tau": humans.time_headway,
-        "delta": humans.exponent,
-        "minGap": humans.minimum_gap,
-        "maxSpeed": humans.desired_speed,
-    }
+    layer = {**_idm_layer(humans), "maxSpeed": humans.desired_speed}
     if scenario.human_control == "commanded":
         layer |= {"accel": ACCELERATION, "decel": 4.5, "tau": 1.0, "minGap": scenario.people_gap}
         if population:  # the layer may not hold back who keeps less than a second
             layer |= {"tau": min(1.0, population.quickest), "maxSpeed": population.fastest}
     return layer
+
+
+def _idm_layer(one: IDMParameters) -> Attributes:
+    """Return how SUMO's own IDM follows as somebody does."""
+    return {
+        "carFollowModel": "IDM",
+        "accel": one.max_acceleration,
+        "decel": one.comfortable_deceleration,
+        "tau": one.time_headway,
+        "delta": one.exponent,
+        "minGap": one.minimum_gap,
+    }
 
 
 def _cav_type(scenario: Scenario) -> str:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from unjam.drivers.command import Command
-from unjam.drivers.local_state import LARGEST_GAP, LocalState
+from unjam.drivers.local_state import LocalState
 from unjam.drivers.safety import Ahead
 from unjam.physics.kinematics import next_speed
 from unjam.worlds.audit import SHIELD_ROUNDING, Audit, BrakingLog, Following, following
@@ -67,12 +67,8 @@ class OpenTraffic(Traffic[OpenKind]):
         raise NotImplementedError
 
     def _ahead(self, names: Sequence[str]) -> list[Ahead]:
-        """Return what these CAVs' filters know now."""
-        speeds = self._simulation.speeds(names)
-        if not self.scenario.safety.active:
-            return [Ahead(speed, speed, inf) for speed in speeds]
-        near = (self._simulation.neighbours(name, LARGEST_GAP) for name in names)
-        return [Ahead(speed, ahead, gap) for speed, (ahead, gap, *_) in zip(speeds, near, strict=True)]
+        """Return what these CAVs' filters know now; nobody is ahead where there is no filter."""
+        return [Ahead(speed, speed, inf) for speed in self._simulation.speeds(names)]
 
     def _lines(self) -> Floats:
         """Return the road's lines as `Scene` has them."""

@@ -10,11 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from unjam.drivers.local_state import LARGEST_GAP, LocalState
+from unjam.drivers.safety import Ahead
 from unjam.scenarios.road import OwnRoad
 from unjam.worlds.record import Floats
-from unjam.worlds.sumo.files import CAV_TYPES
+from unjam.worlds.sumo.files import CALIBRATED_TYPES, CAV_TYPES
 from unjam.worlds.sumo.lanes import Followed, LaneTraffic
 from unjam.worlds.sumo.networks import edge_lengths, lane_counts, network_lines
+from unjam.worlds.sumo.simulation import Neighbours
 from unjam.worlds.world import OnProgress
 
 FUEL_SECONDS = 1.0
@@ -61,8 +63,23 @@ class OwnTraffic(LaneTraffic[OwnRoad]):
             return True
         if kind not in road.cars:
             return False
-        digest = hashlib.sha256(f"{road.cav_seed} {name}".encode()).digest()
-        return int.from_bytes(digest[:8], "big") < road.cav_share * 2**64
+        return self._drawn(name) < road.cav_share * 2**64
+
+    def _drawn(self, name: str) -> int:
+        """Return a number below 2**64 that a vehicle's id and the seed alone draw."""
+        digest = hashlib.sha256(f"{self.road.cav_seed} {name}".encode()).digest()
+        return int.from_bytes(digest[:8], "big")
+
+    def _follow(self) -> None:
+        """Keep up with who is on the road, and let calibrated people drive the cars that have entered."""
+        self._near: dict[str, Neighbours] = {}
+        super()._follow()
+        road, simulation = self.road, self._simulation
+        for name in simulation.departed() if road.drivers else ():
+            kind = simulation.type_of(name)
+            if kind in road.driven_types:
+                number = self._drawn(f"driver of {name}") % len(road.drivers)
+                simulation.change_type(name, CALIBRATED_TYPES.format(kind, number))
 
     def _moved(self, left: Sequence[str], entered: Sequence[str]) -> None:
         self.over = not self._simulation.more_expected()
@@ -79,9 +96,20 @@ class OwnTraffic(LaneTraffic[OwnRoad]):
         return {name: min(speed, most) for (name, speed), most in zip(told, allowed, strict=True)}
 
     def _followed(self, names: Sequence[str]) -> list[Followed]:
-        simulation, leaders = self._simulation, [self._simulation.leader(name, LARGEST_GAP) for name in names]
-        near = zip(simulation.speeds(names), leaders, strict=True)
-        return [Followed(leader, speed, ahead, gap) for speed, (leader, ahead, gap) in near]
+        near = zip(self._simulation.speeds(names), map(self._neighbours, names), strict=True)
+        return [Followed(leader, speed, ahead, gap) for speed, (leader, ahead, gap, *_) in near]
+
+    def _ahead(self, names: Sequence[str]) -> list[Ahead]:
+        if not self.scenario.safety.active:
+            return super()._ahead(names)
+        near = zip(self._simulation.speeds(names), map(self._neighbours, names), strict=True)
+        return [Ahead(speed, ahead, gap) for speed, (_, ahead, gap, *_) in near]
+
+    def _neighbours(self, name: str) -> Neighbours:
+        """Return who is ahead of a vehicle and behind it; SUMO is asked once in a step."""
+        if name not in self._near:
+            self._near[name] = self._simulation.neighbours(name, LARGEST_GAP)
+        return self._near[name]
 
     def _ends_with(self, colliding: Sequence[str]) -> bool:
         return any(name in self.cavs for name in colliding)
@@ -98,7 +126,7 @@ class OwnTraffic(LaneTraffic[OwnRoad]):
         return {"edge": edge, "lane": lane, "along": along, "gaps": unknown}
 
     def _states(self, names: Sequence[str]) -> LocalState:
-        found = [self._simulation.neighbours(name, LARGEST_GAP) for name in names]
+        found = [self._neighbours(name)[1:] for name in names]
         leader_speed, leader_gap, follower_speed, follower_gap = np.array(found).reshape(-1, 4).T
         unknown = np.full(len(names), np.nan)
         speed = np.array(self._simulation.speeds(names), np.float64)

@@ -11,7 +11,7 @@ from functools import partial
 from itertools import count, dropwhile, starmap
 from pathlib import Path
 from types import ModuleType
-from typing import Any, Literal, Self
+from typing import Any, Literal, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,20 +30,27 @@ Backend = Literal["libsumo", "traci", "gui"]
 SPEED_MODES = {"shielded": 31, "raw": 30, "flow": 25, "cruise": 31}
 """SUMO's speed mode bits for each way of actuation: bit 0 is the check for a safe speed."""
 WITHOUT_RIGHT_OF_WAY = 1
-"""the bit that stays where vehicles need not obey the right of way: who is surprised on a junction then stops
-as fast as it must, and so must who follows"""
+"""the bit that stays where vehicles need not obey the right of way: who is surprised stops as it must"""
 LIMITS_OF_ACCELERATION = 2 | 4
 """the bits by which vehicles keep to the acceleration and the braking of their type"""
 LEAVE_TO_SUMO = -1.0
 """the commanded speed that stands for none"""
-
 _exhaust = deque(maxlen=0).extend
 """runs through an iterator, in C: a loop would cost as much as the calls"""
-
 _open: "Simulation | None" = None
 """the one simulation that libsumo runs in this process"""
 _labels = count()
 """of connections over TraCI, of which a process may have many"""
+
+
+class Neighbours(NamedTuple):
+    """Who is ahead of a vehicle and behind it [m/s, m from bumper to bumper]; no name: nobody is ahead."""
+
+    leader: str
+    leader_speed: float
+    leader_gap: float
+    follower_speed: float
+    follower_gap: float
 
 
 class Simulation:
@@ -204,6 +211,10 @@ class Simulation:
         """Return a vehicle's type."""
         return self._sumo.vehicle.getTypeID(name)
 
+    def change_type(self, name: str, kind: str) -> None:
+        """Give a vehicle another type."""
+        self._sumo.vehicle.setType(name, kind)
+
     def route_of(self, name: str) -> tuple[str, ...]:
         """Return the edges of a vehicle's route."""
         return tuple(self._sumo.vehicle.getRoute(name))
@@ -217,29 +228,21 @@ class Simulation:
         """Return how fast each of `ids` may drive where it is [m/s]."""
         return [self._sumo.vehicle.getAllowedSpeed(name) for name in ids]
 
-    def neighbours(self, name: str, farthest: float) -> list[float]:
-        """Return speed and gap of the vehicle ahead and of the one behind, as SUMO sees them [m/s, m].
+    def neighbours(self, name: str, farthest: float) -> Neighbours:
+        """Return who is ahead and behind, as SUMO sees them.
 
-        The gap is bumper to bumper. Who is farther than `farthest` is not there: as fast, and that far away.
+        Who is farther than `farthest` [m] is not there: as fast, and that far away.
         """
-        vehicle = self._sumo.vehicle
-        speed = self._get_speed(name)
+        vehicle, speed = self._sumo.vehicle, self._get_speed(name)
         leader, ahead = vehicle.getLeader(name, farthest) or ("", 0.0)
         follower, behind = vehicle.getFollower(name, farthest)
-        found = []
+        found: list[float] = []
         for other, gap, keeper in ((leader, ahead, name), (follower, behind, follower)):
             # SUMO's gap lacks the one that the vehicle behind keeps.
             true_gap = gap + vehicle.getMinGap(keeper) if other else farthest
             there = true_gap < farthest
             found += [self._get_speed(other) if there else speed, min(max(true_gap, 0.0), farthest)]
-        return found
-
-    def leader(self, name: str, farthest: float) -> tuple[str, float, float]:
-        """Return the vehicle ahead, its speed and the gap to it [m/s, m]; no name where it is farther."""
-        leader, gap = self._sumo.vehicle.getLeader(name, farthest) or ("", farthest)
-        if not leader:
-            return "", 0.0, farthest
-        return leader, self._get_speed(leader), gap + self._sumo.vehicle.getMinGap(name)
+        return Neighbours(leader if found[1] < farthest else "", *found)
 
     def distances(self, ids: Sequence[str]) -> list[float]:
         """Return how far each of `ids` has driven since it entered [m]."""
