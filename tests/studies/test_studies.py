@@ -54,21 +54,23 @@ def test_controllers_and_experts_meet_what_they_have_not_trained_with(
     monkeypatch: pytest.MonkeyPatch, reproduced: Made
 ) -> None:
     folder, _ = reproduced
+    run = folder / "runs" / "little" / "plain" / "0"
     late = Condition("late", impaired={"delay": 0.3})
     conditions = (Condition("as in training"), Condition("noise", {"noise": 0.4}), late)
     monkeypatch.setitem(robustness.CONDITIONS, "little", conditions)
-    monkeypatch.setitem(robustness.CONTROLLERS, "little", PlannedRun("little", "plain", 0))
-    monkeypatch.setitem(robustness.EXPERTS, "little", ("PI",))
-    rows = robustness.under_conditions(StudyFolder(folder), "little", 2, episodes=2)
+    monkeypatch.setitem(robustness.CONTROLLERS, "little", (str(run), "pi"))
+    rows = robustness.under_conditions("little", 2, episodes=2)
     assert [(row["condition"], row["driver"]) for row in rows] == [
-        (condition.name, driver) for condition in conditions for driver in ("people", "PI", "trained")
+        (condition.name, driver)
+        for condition in conditions
+        for driver in ("human", "tuned expert", "trained")
     ]
     speeds = {(row["condition"], row["driver"]): row["mean_speed"]["mean"] for row in rows}
-    driven = read_rows(folder / "runs" / "little" / "plain" / "0")["trained"]
+    driven = read_rows(run)["trained"]
     assert speeds["as in training", "trained"] == np.mean([row["mean_speed"] for row in driven])
-    assert speeds["noise", "people"] != speeds["as in training", "people"] == speeds["late", "people"]
-    assert speeds["late", "PI"] != speeds["as in training", "PI"]
-    ours, theirs = (speeds["noise", driver] for driver in ("trained", "PI"))
+    assert speeds["noise", "human"] != speeds["as in training", "human"] == speeds["late", "human"]
+    assert speeds["late", "tuned expert"] != speeds["as in training", "tuned expert"]
+    ours, theirs = (speeds["noise", driver] for driver in ("trained", "tuned expert"))
     gain = {(row["condition"], row["driver"]): row["faster_than_expert"]["mean"] for row in rows}
     assert gain["noise", "trained"] == pytest.approx(ours - theirs)
 
