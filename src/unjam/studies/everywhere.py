@@ -30,9 +30,12 @@ from unjam.worlds.workers import EpisodeTask, Workers
 EPISODES = 10
 """of each driver on each road"""
 TUNED: dict[str, tuple[str, ...]] = {
-    "rings": ("pi", "unjam:ring-tuned", "unjam:rings-tuned", "follower-stopper"),
+    "rings": (
+        *("pi", "unjam:ring-tuned", "unjam:ring-gap-tuned", "unjam:ring-jammed-tuned", "unjam:rings-tuned"),
+        "follower-stopper",
+    ),
     "figure-eights": ("unjam:figure-eight-tuned", "pacer:varying=true"),
-    "motorways": ("jam-ahead", "unjam:on-ramp-tuned", "cruise"),
+    "motorways": ("jam-ahead", "unjam:on-ramp-tuned", "cruise", "adaptive-acc"),
 }
 """experts of which the best on a road is its 1"""
 PI_ON_RINGS = "pi:window=23,catch_up_speed=0.5994,gap_lower=3,gap_upper=50,time_constant=0.9775,safe_gap=4"
@@ -40,10 +43,10 @@ PI_ON_RINGS = "pi:window=23,catch_up_speed=0.5994,gap_lower=3,gap_upper=50,time_
 JUDGED: dict[str, str] = {
     "unjam:best": "unjam:best",
     "PI, tuned on the rings": PI_ON_RINGS,
-    "PI": "pi",
     "FollowerStopper": "follower-stopper",
     "jam-ahead": "jam-ahead",
     "unjam:ring-best": "unjam:ring-best",
+    "unjam:figure-eight-best": "unjam:figure-eight-best",
 }
 """who is judged on every road, by label"""
 KEPT = (
