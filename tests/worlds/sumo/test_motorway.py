@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from unjam.drivers import Human
+from unjam.drivers.adaptive_acc import AdaptiveACC
 from unjam.drivers.command import Command
 from unjam.drivers.local_state import LARGEST_GAP
 from unjam.drivers.road_experts import Cruise, JamAhead
@@ -189,3 +190,12 @@ def test_where_each_came_from_and_the_peak_are_recorded(capped: Episode) -> None
     stays = [trajectory for trajectory in capped.trajectories if len(trajectory.applied) > 60]
     assert stays
     assert all((np.diff(stay.states.to_merge) <= 1e-9).all() for stay in stays)
+
+
+def test_a_cav_that_is_told_something_still_brakes_as_hard_as_its_own_acc_must(simulation: Simulation) -> None:
+    """SUMO keeps who is told a speed to comfortable braking: told on, this one ran into a jam's tail."""
+    road = OnRamp(cav_share=0.3, horizon=800)
+    episode = run_episode(road, AdaptiveACC(time_step=1.0), (2,), simulation=simulation)
+    assert (episode.status, episode.collisions) == ("completed", 0)
+    assert episode.audit.cavs.hardest > road.cruise.deceleration + 0.1
+    assert episode.audit.cavs.beyond[1] == 0

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from unjam.physics.idm import IDMParameters, desired_gap
 from unjam.worlds.audit import SHORT_HEADWAY, Audit, following
 from unjam.worlds.record import Floats, Trajectory
 from unjam.worlds.sumo.open import CAV, PEOPLE, OpenTraffic
@@ -50,6 +51,13 @@ class LaneTraffic(OpenTraffic[OpenKind]):
         self._seen = array("d")
         """speed, leader's speed and gap of CAVs that follow the same for long, in each simulation step"""
         self._steps = 0
+        cruise = self.scenario.cruise
+        self._acc = IDMParameters(
+            time_headway=cruise.time_headway,
+            max_acceleration=cruise.acceleration,
+            comfortable_deceleration=cruise.deceleration,
+            minimum_gap=cruise.gap,
+        )
         super().start(controlled, on_progress)
 
     def _followed(self, names: Sequence[str]) -> list[Followed]:
@@ -84,16 +92,27 @@ class LaneTraffic(OpenTraffic[OpenKind]):
     def _legal(self, speeds: dict[str, float]) -> dict[str, float]:
         """Return wanted speeds; with an ACC of its own, who is not held back is told nothing.
 
-        Whoever is told a speed, be it a high one, makes no room for who changes lanes.
+        Whoever is told a speed, be it a high one, makes no room for who changes lanes, and brakes no harder
+        than is comfortable: SUMO takes that for a wish. Where its own ACC would, it is left to it.
         """
         if self.scenario.actuation != "cruise":
             return speeds
         most = self.limits.highest * self.scenario.simulation_step - 1e-9
-        now = self._simulation.speeds(list(speeds))
+        followed = zip(speeds.items(), self._followed(list(speeds)), strict=True)
         return {
-            name: LEAVE_TO_SUMO if speed - own >= most or self._is_free(name) else speed
-            for (name, speed), own in zip(speeds.items(), now, strict=True)
+            name: LEAVE_TO_SUMO
+            if speed - seen.speed >= most or self._is_free(name) or self._brakes_hard(seen)
+            else speed
+            for (name, speed), seen in followed
         }
+
+    def _brakes_hard(self, seen: Followed) -> bool:
+        """Return whether a CAV's own ACC brakes harder than is comfortable, behind whom it follows."""
+        if not seen.leader or seen.gap <= 0:
+            return bool(seen.leader)
+        acc = self._acc
+        wanted = desired_gap(seen.speed, seen.speed - seen.leader_speed, acc)
+        return acc.max_acceleration * (1.0 - (wanted / seen.gap) ** 2) < -acc.comfortable_deceleration
 
     def _audit(self, trajectories: Sequence[Trajectory]) -> Audit:
         """Return the physics of every simulation step; how CAVs follow whom they have followed for long."""
