@@ -13,7 +13,7 @@ drive() {
 }
 for share in 05 10 20; do
     people="" # they are the same at every share
-    [ $share = 10 ] && people="-d human -d cruise"
+    [ $share = 10 ] && people="-d human -d cruise -d adaptive-acc -d follower-stopper"
     # shellcheck disable=SC2086
     drive "share-$share" on-ramp --cav-share "0.$share" $people -d jam-ahead -d unjam:on-ramp-tuned
 done

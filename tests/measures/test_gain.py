@@ -67,6 +67,18 @@ def test_what_no_car_could_drive_or_what_lowers_flow_gains_nothing(wrong: dict[s
     assert gain(slow, PEOPLE, 4.0).mean == pytest.approx(-0.5)
 
 
+def test_who_cannot_drive_on_a_road_neither_gains_nor_loses_there() -> None:
+    failed = ring([nan] * 4, status="failed", cav_max_braking=nan, throughput_veh_per_h=nan)
+    found = gain(failed, PEOPLE, 4.0)
+    assert (found.mean, found.low, found.high) == (0.0, 0.0, 0.0)
+
+
+def test_a_single_disaster_counts_in_the_interval_as_it_counts_in_the_mean() -> None:
+    values = np.array([1.0, 1.0, 1.0, -50.0])
+    found = mean_gain([Estimate(0.0, -1.0, 1.0, 4)], [values])
+    assert found.high - found.low == pytest.approx(2 * estimate([1.0, 1.0, 1.0, WORST]).high - 2 * 0.5)
+
+
 def test_where_nothing_is_to_be_gained_a_loss_is_all_that_counts() -> None:
     best = 3.0 * (1.0 + LEAST / 2)
     assert gain(ring([3.05] * 4), PEOPLE, best).mean == 0.0

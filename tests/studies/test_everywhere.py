@@ -1,11 +1,14 @@
 """Does the study of all roads say what its files hold?"""
 
+import json
+from math import nan
 from pathlib import Path
 
 import pytest
 
 from unjam.measures.gain import MOST, WORST
-from unjam.studies.everywhere import HELD_OUT, JUDGED, gains_of, picture, table
+from unjam.measures.table import PEOPLE
+from unjam.studies.everywhere import HELD_OUT, JUDGED, best_of, gains_of, picture, table
 from unjam.training.family import FAMILY
 
 RESULTS = Path(__file__).parents[2] / "results/everywhere"
@@ -25,9 +28,18 @@ def test_each_road_has_a_row_and_the_mean_and_the_worst_follow() -> None:
 def test_the_best_of_a_road_gains_what_its_one_says() -> None:
     for road in gains_of(RESULTS).values():
         assert all(WORST <= found.mean <= MOST for found in road["gains"].values())
-        assert road["gains"][road["best"]].mean in (0.0, pytest.approx(1.0)), (
-            "nothing counts, or it is the one"
-        )
+        one = road["gains"].get(road["best"])
+        assert one is None or one.mean in (0.0, pytest.approx(1.0)), "nothing counts, or it is the one"
+
+
+def test_the_best_of_a_road_could_have_driven_so_in_every_episode() -> None:
+    rows = json.loads((RESULTS / "00.json").read_text())["rows"]
+    measured = {who: [{**row, "travel_time": nan} for row in rows[who]] for who in (PEOPLE, "unjam:best")}
+    careful = measured["unjam:best"]
+    reckless = [{**row, "mean_speed_second_half": 9.0} for row in careful]
+    reckless[1]["collisions"] = 1.0
+    assert best_of({**measured, "reckless": reckless}) == "unjam:best"
+    assert best_of({PEOPLE: measured[PEOPLE], "reckless": reckless}) == PEOPLE
 
 
 def test_the_picture_has_a_field_for_each_driver_on_each_road() -> None:

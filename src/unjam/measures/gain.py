@@ -43,12 +43,14 @@ def ceiling(row: dict[str, Any]) -> float:
 def scaled(rows: Rows, people: Rows, best: float) -> Floats:
     """Return by how much a driver is better than people on each seed, over what the best is on average.
 
-    Where that is less than `LEAST`, over that. Arguments as `gain` takes them.
+    Where that is less than `LEAST`, over that; nothing where it could not drive at all. Arguments as `gain`
+    takes them.
     """
     alone = {str(row["seed"]): worth(row) for row in people}
     before = float(np.mean(list(alone.values())))
     scale = max(best - before, LEAST * abs(before))
-    return np.array([(worth(row) - alone[str(row["seed"])]) / scale for row in rows])
+    found = np.array([(worth(row) - alone[str(row["seed"])]) / scale for row in rows])
+    return np.nan_to_num(found, nan=0.0)
 
 
 def gain(rows: Rows, people: Rows, best: float) -> Estimate:
@@ -78,7 +80,7 @@ def mean_gain(gains: Sequence[Estimate], by_seed: Sequence[Floats]) -> Estimate:
     mean = float(np.mean([each.mean for each in gains]))
     errors = [
         values - values.mean() if each.low < each.high else np.zeros(len(values))
-        for each, values in zip(gains, by_seed, strict=True)
+        for each, values in zip(gains, (np.clip(of, WORST, MOST) for of in by_seed), strict=True)
     ]
     around = estimate(np.mean(errors, axis=0).tolist())
     return Estimate(mean, mean + around.low, mean + around.high, len(gains))

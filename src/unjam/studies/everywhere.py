@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 
 from unjam.controller import make_driver
 from unjam.files import to_json, write_whole
-from unjam.measures.drivable import drivable_in_all
+from unjam.measures.drivable import DRIVABLE, drivable_in_all
 from unjam.measures.gain import MOST, WORST, Rows, gain, mean_gain, scaled, worth
 from unjam.measures.metrics import measure
 from unjam.measures.statistics import signed
@@ -78,15 +78,21 @@ def _write(studies: StudyFolder, seeds: int, folder: Path, workers: int) -> None
             group = next(group for group, kinds in GROUPS.items() if road.scenario in kinds)
             found: dict[str, Any] = json.loads(file.read_text()) if file.is_file() else {}
             if not found:
-                tuned = {expert: expert for expert in TUNED[group]}
-                tried = _driven(scenario, tuned, tuning_seeds(EPISODES, 1000), pool)
-                best = max(tried, key=lambda expert: float(np.nanmean([worth(row) for row in tried[expert]])))
-                found = {"road": name, "part": road.part, "best": best, "rows": {}}
+                tried = {driver: driver for driver in (PEOPLE, *TUNED[group])}
+                rows = _driven(scenario, tried, tuning_seeds(EPISODES, 1000), pool)
+                found = {"road": name, "part": road.part, "best": best_of(rows), "rows": {}}
             asked = {PEOPLE: PEOPLE, found["best"]: found["best"], **JUDGED}
             missing = {label: driver for label, driver in asked.items() if label not in found["rows"]}
             if missing:  # also drivers that came later
                 found["rows"] |= _driven(scenario, missing, held_out_seeds(EPISODES), pool)
                 write_whole(file, to_json(found))
+
+
+def best_of(rows: dict[str, Rows]) -> str:
+    """Return who is best of those who could have driven so in every episode: people alone, if nobody."""
+    people = rows[PEOPLE]
+    could = [who for who, of in rows.items() if who == PEOPLE or drivable_in_all(of, people) == DRIVABLE]
+    return max(could, key=lambda who: float(np.mean([worth(row) for row in rows[who]])))
 
 
 def gains_of(folder: Path) -> dict[str, dict[str, Any]]:
@@ -98,7 +104,8 @@ def gains_of(folder: Path) -> dict[str, dict[str, Any]]:
             label: [{key: np.nan if value is None else value for key, value in row.items()} for row in of]
             for label, of in found["rows"].items()
         }
-        people, best = rows.pop(PEOPLE), float(np.mean([worth(row) for row in rows[found["best"]]]))
+        best = float(np.mean([worth(row) for row in rows[found["best"]]]))
+        people = rows.pop(PEOPLE)
         roads[found["road"]] = {
             **{key: found[key] for key in ("part", "best")},
             "people": float(np.mean([worth(row) for row in people])),

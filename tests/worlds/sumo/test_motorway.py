@@ -192,7 +192,9 @@ def test_where_each_came_from_and_the_peak_are_recorded(capped: Episode) -> None
     assert all((np.diff(stay.states.to_merge) <= 1e-9).all() for stay in stays)
 
 
-def test_a_cav_that_is_told_something_still_brakes_as_hard_as_its_own_acc_must(simulation: Simulation) -> None:
+def test_a_cav_that_is_told_something_still_brakes_as_hard_as_its_own_acc_must(
+    simulation: Simulation,
+) -> None:
     """SUMO keeps who is told a speed to comfortable braking: told on, this one ran into a jam's tail."""
     road = OnRamp(cav_share=0.3, horizon=800)
     episode = run_episode(road, AdaptiveACC(time_step=1.0), (2,), simulation=simulation)
