@@ -15,7 +15,7 @@ for share in 05 10 20; do
     people="" # they are the same at every share
     [ $share = 10 ] && people="-d human -d cruise -d adaptive-acc -d follower-stopper"
     # shellcheck disable=SC2086
-    drive "share-$share" on-ramp --cav-share "0.$share" $people -d jam-ahead -d unjam:on-ramp-tuned
+    drive "share-$share" on-ramp --cav-share "0.$share" $people -d jam-ahead
 done
 # the same driver, untouched, elsewhere
 drive one-lane on-ramp-1 -d human -d jam-ahead
@@ -23,3 +23,4 @@ drive late-message on-ramp -d jam-ahead --set roadside.smoothing=60 --set roadsi
 drive other-people on-ramp -d human -d jam-ahead --set following=IDM --set time_headways=[1.4,2.0] \
     --set accelerations=[1.8,2.8] --set decelerations=[2.5,3.5] --set gaps=[2.5,3.2] --set inflow=3600
 drive no-jam on-ramp -d human -d jam-ahead --set inflow=1800 --set ramp_flow=250
+drive tuned-05 on-ramp --cav-share 0.05 -d unjam:on-ramp-tuned

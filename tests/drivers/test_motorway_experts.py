@@ -1,5 +1,7 @@
 """Do the experts of motorways hold back where the road ahead is slow, and nowhere else?"""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -21,21 +23,32 @@ def state(speed: float, ahead: float, to_merge: float = 500.0, allowed: float = 
     return near._replace(**told, lane_speeds=speeds, road_speeds=speeds - 1.0)
 
 
+AT_ONCE = JamAhead(time_constant=1.0, margin=0.0)
+
+
 def answer(driver: JamAhead, *args: float) -> float:
     return float(driver.act(state(*args), {})[0][0])
 
 
 def test_it_drives_towards_the_mean_speed_ahead_and_never_brakes_hard_for_it() -> None:
-    driver = JamAhead()
+    driver = AT_ONCE
     assert answer(driver, 20.0, 19.5) == pytest.approx(-0.5)
     assert answer(driver, 20.0, 10.0) == -1.5
     assert answer(driver, 4.0, 1.0) == pytest.approx(1.0)  # towards the lowest, 5 m/s
-    assert answer(JamAhead(time_constant=2.0), 20.0, 19.0) == pytest.approx(-0.5)
-    assert answer(JamAhead(margin=0.4), 20.0, 19.5) == pytest.approx(-0.1)
+    assert answer(replace(AT_ONCE, time_constant=2.0), 20.0, 19.0) == pytest.approx(-0.5)
+    assert answer(replace(AT_ONCE, margin=0.4), 20.0, 19.5) == pytest.approx(-0.1)
+
+
+def test_the_more_cavs_there_are_the_less_each_holds_back() -> None:
+    """Else each follows the mean of others who hold back, and all come to a stop."""
+    crowd = state(20.0, 19.0)._replace(cav_share=np.array([0.2]))
+    driver = replace(AT_ONCE, margin_by_share=10.0)
+    assert driver.act(crowd, {})[0].tolist() == pytest.approx([1.0])
+    assert answer(driver, 20.0, 19.0) == pytest.approx(-1.0)  # where nobody counts CAVs
 
 
 def test_it_never_asks_for_more_than_is_allowed() -> None:
-    assert answer(JamAhead(), 27.9, 40.0) == pytest.approx(0.1)
+    assert answer(AT_ONCE, 27.9, 40.0) == pytest.approx(0.1)
 
 
 def test_behind_the_merge_and_without_a_message_it_holds_nobody_back() -> None:
@@ -47,8 +60,8 @@ def test_behind_the_merge_and_without_a_message_it_holds_nobody_back() -> None:
 
 def test_sections_and_lanes_are_the_users_to_choose() -> None:
     mixed = (3 * 10.0 + 2 * 28.0) / 5  # sections 2 to 6, of which 2, 3 and 4 are slow
-    assert answer(JamAhead(first=2, last=6), 17.0, 10.0) == pytest.approx(mixed - 17.0)
-    assert answer(JamAhead(all_lanes=True), 20.0, 20.0) == pytest.approx(-1.0)
+    assert answer(replace(AT_ONCE, first=2, last=6), 17.0, 10.0) == pytest.approx(mixed - 17.0)
+    assert answer(replace(AT_ONCE, all_lanes=True), 20.0, 20.0) == pytest.approx(-1.0)
     with pytest.raises(InputError, match="last: 2 is not allowed; allowed: >= first, 3"):
         named_driver("jam-ahead:first=3,last=2", 1.0)
 

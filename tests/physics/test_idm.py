@@ -9,6 +9,7 @@ from unjam.parameters import build
 from unjam.physics.idm import (
     IDMParameters,
     desired_gap,
+    desired_speed_for,
     equilibrium_gap,
     equilibrium_speed,
     idm_acceleration,
@@ -30,6 +31,15 @@ def test_reference_values_of_a_standing_driver() -> None:
 def test_reference_values_closing_in_and_falling_back() -> None:
     found = idm_acceleration(np.array([10.0, 10.0]), np.array([8.0, 12.0]), np.array([20.0, 20.0]))
     np.testing.assert_allclose(found, [-0.028913, 0.950886], atol=3e-6)
+
+
+@given(speeds, st.floats(-3.0, 0.99))
+def test_with_the_desired_speed_for_an_acceleration_a_free_driver_accelerates_so(
+    speed: float, acceleration: float
+) -> None:
+    wanted = desired_speed_for(acceleration, speed + 0.1)
+    driver = IDMParameters(desired_speed=wanted)
+    assert idm_acceleration(speed + 0.1, speed + 0.1, 1e9, driver) == pytest.approx(acceleration, abs=1e-9)
 
 
 @given(speeds, speeds, gaps)

@@ -48,6 +48,8 @@ class LocalState(NamedTuple):
     where nobody or no lane is. Before a ramp joins, its vehicles are on the lane that it becomes"""
     beside_speeds: Array = None
     """their speeds [m/s]; its own where nobody is"""
+    cav_share: Array = None
+    """how many of all that have entered so far are CAVs, as a roadside service counts"""
 
     def each(self, function: Callable[..., Any], *others: "LocalState") -> "LocalState":
         """Return `function` of each quantity, and of the same quantity of the other states."""
@@ -78,7 +80,7 @@ SECTIONS_AHEAD = 11
 SPEED_SCALE = 10.0
 """what speeds are divided by before a network sees them [m/s]"""
 
-_UNITS = ("m/s", "m/s", "m", "m/s", "m", "m", "m", "m", "m/s", "m", "m/s", "m/s", "m", "m/s")
+_UNITS = ("m/s", "m/s", "m", "m/s", "m", "m", "m", "m", "m/s", "m", "m/s", "m/s", "m", "m/s", "")
 STATE_UNITS = dict(zip(LocalState._fields, _UNITS, strict=True))
 """units of a `LocalState`, in its order"""
 

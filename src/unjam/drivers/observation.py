@@ -156,6 +156,12 @@ FEATURES: dict[str, Feature] = {
     ),
     "lane_speeds": _sections_ahead("lane_speeds", "in its lane"),
     "road_speeds": _sections_ahead("road_speeds", "on the road"),
+    "cav_share": Feature(
+        lambda seen: as_column(seen.state.cav_share),
+        (Observed("share of CAVs", 1.0, ""),),
+        needs="motorway",
+        told=("cav_share",),
+    ),
     "beside": Feature(
         lambda seen: _beside(seen.state),
         (
@@ -169,8 +175,8 @@ FEATURES: dict[str, Feature] = {
 }
 """all that a network can be shown: the paper's five numbers; the expert's acceleration; what the expert
 remembers; the length of the closed road; the place on it; the position along a road with ends; on motorways
-the wanted speed, the way to where a ramp joins, the speeds ahead in its lane and on all, and who drives
-beside it"""
+the wanted speed, the way to where a ramp joins, the speeds ahead in its lane and on all, the share of CAVs,
+and who drives beside it"""
 
 
 def _known(name: str) -> str:

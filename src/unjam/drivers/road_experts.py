@@ -222,28 +222,31 @@ class Cruise(Formula):
 class JamAhead(Formula):
     """Upstream of a ramp, drives no faster than its own lane does a few hundred metres ahead.
 
-    So it arrives at the tail of a jam as fast as the jam moves, keeps room for those who merge, and the jam
-    ahead gets less than it lets go. Elsewhere, and where no message says how fast the road ahead is, its own
-    ACC drives. It gives way to nobody on purpose: those behind pass where there are lanes.
+    So it arrives at the tail of a jam hardly faster than the jam moves, keeps room for those who merge, and
+    the jam ahead gets less than it lets go. Elsewhere, and where no message says how fast the road ahead is,
+    its own ACC drives. It gives way to nobody on purpose: those behind pass where there are lanes.
     """
 
     name: ClassVar[str] = "jam-ahead"
     plain_numbers: ClassVar[bool] = False
-    told: ClassVar[tuple[str, ...]] = ("allowed_speed", "to_merge", "lane_speeds", "road_speeds")
+    told: ClassVar[tuple[str, ...]] = ("allowed_speed", "to_merge", "lane_speeds", "road_speeds", "cav_share")
 
     first: Section = 0
     """first section ahead that counts, of 100 m each; 0 is the one that it is in"""
     last: Section = 4
     """last section ahead that counts"""
-    margin: float = 0.0
-    """how much faster than the mean ahead it may drive [m/s]"""
+    margin: float = -2.0
+    """how much faster than the mean ahead it may drive where CAVs are few [m/s]"""
+    margin_by_share: float = 20.0
+    """what more it may, times the share of CAVs [m/s]: where they are many, the mean ahead is that of others who
+    hold back, and each would be slower than the next"""
     lowest: NotNegative = 5.0
     """it is never held back below this [m/s]"""
     slowing: Positive = 1.5
     """largest braking for the sake of the cap [m/s2]"""
     all_lanes: bool = False
     """whether the mean is that of all lanes of the main road"""
-    time_constant: Positive = 1.0
+    time_constant: Positive = 3.0
     """time over which the cap is reached [s]"""
 
     @model_validator(mode="after")
@@ -260,6 +263,8 @@ class JamAhead(Formula):
             return free, memory
         ahead = speeds[..., self.first : self.last + 1].mean(-1)
         xp = namespace(free)
-        cap = xp.minimum(at_least(ahead + self.margin, self.lowest), state.allowed_speed)
+        share = 0.0 if state.cav_share is None else state.cav_share
+        wanted = ahead + self.margin + self.margin_by_share * share
+        cap = xp.minimum(at_least(wanted, self.lowest), state.allowed_speed)
         towards = at_least((cap - state.speed) / self.time_constant, -self.slowing)
         return xp.where(state.to_merge > 0.0, towards, free), memory

@@ -118,6 +118,14 @@ def idm_acceleration(
     return p.max_acceleration * (1.0 - free_road - interaction)
 
 
+def desired_speed_for(acceleration: float, speed: float, parameters: IDMParameters = PAPER_IDM) -> float:
+    """Return the desired speed v0 with which a driver accelerates so where nobody is ahead [m/s].
+
+    Closed form of Eq. 5 without its interaction; `acceleration` below the largest, `speed` in m/s.
+    """
+    return speed / (1.0 - acceleration / parameters.max_acceleration) ** (1.0 / parameters.exponent)
+
+
 def equilibrium_gap(speed: float, parameters: IDMParameters = PAPER_IDM) -> float:
     """Return the gap at which a platoon at constant `speed` neither accelerates nor brakes [m].
 

@@ -117,6 +117,15 @@ def test_a_cav_is_held_back_upstream_and_left_alone_where_the_lane_closes(simula
     assert max(free) > 0.5
 
 
+def test_it_is_told_how_many_of_all_that_have_entered_are_cavs(simulation: Simulation) -> None:
+    traffic = motorway(simulation, replace(BUSY, cav_share=0.3))
+    for _ in range(100):
+        traffic.advance(Command(np.full(traffic.rows, 1.0)))
+    came = {*libsumo.vehicle.getIDList(), *simulation.left()}
+    share = np.unique(traffic.perceive().cav_share)
+    assert share == pytest.approx([sum(name in traffic.road.cav_ids for name in came) / len(came)], abs=0.02)
+
+
 def test_who_is_not_held_back_drives_as_its_own_acc_does(simulation: Simulation) -> None:
     episode = run_episode(BUSY, Cruise(), (3,), simulation=simulation)
     assert episode.status == "completed"
@@ -192,9 +201,7 @@ def test_where_each_came_from_and_the_peak_are_recorded(capped: Episode) -> None
     assert all((np.diff(stay.states.to_merge) <= 1e-9).all() for stay in stays)
 
 
-def test_a_cav_that_is_told_something_still_brakes_as_hard_as_its_own_acc_must(
-    simulation: Simulation,
-) -> None:
+def test_a_cav_that_is_held_back_still_brakes_as_hard_as_its_own_acc_must(simulation: Simulation) -> None:
     """SUMO keeps who is told a speed to comfortable braking: told on, this one ran into a jam's tail."""
     road = OnRamp(cav_share=0.3, horizon=800)
     episode = run_episode(road, AdaptiveACC(time_step=1.0), (2,), simulation=simulation)

@@ -12,11 +12,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from unjam.physics.idm import IDMParameters, desired_gap
+from unjam.physics.idm import IDMParameters, desired_speed_for
 from unjam.worlds.audit import SHORT_HEADWAY, Audit, following
 from unjam.worlds.record import Floats, Trajectory
 from unjam.worlds.sumo.open import CAV, PEOPLE, OpenTraffic
-from unjam.worlds.sumo.simulation import LEAVE_TO_SUMO
 from unjam.worlds.sumo.traffic import OpenKind
 from unjam.worlds.world import OnProgress
 
@@ -24,6 +23,8 @@ CUT_IN = 3.0
 """time after a change of leader in which braking is counted apart [s]"""
 SETTLED = 5.0
 """time behind the same leader after which headways are a car's own choice [s]"""
+SLOWEST = 0.1
+"""set speed below which SUMO has none [m/s]"""
 CAV_CUT_IN = 2
 """whose braking it is, beside PEOPLE and CAV"""
 
@@ -51,13 +52,8 @@ class LaneTraffic(OpenTraffic[OpenKind]):
         self._seen = array("d")
         """speed, leader's speed and gap of CAVs that follow the same for long, in each simulation step"""
         self._steps = 0
-        cruise = self.scenario.cruise
-        self._acc = IDMParameters(
-            time_headway=cruise.time_headway,
-            max_acceleration=cruise.acceleration,
-            comfortable_deceleration=cruise.deceleration,
-            minimum_gap=cruise.gap,
-        )
+        self._fastest: dict[str, float] = {}
+        """of CAVs that have a set speed, how fast they would drive without it"""
         super().start(controlled, on_progress)
 
     def _followed(self, names: Sequence[str]) -> list[Followed]:
@@ -89,30 +85,27 @@ class LaneTraffic(OpenTraffic[OpenKind]):
                 self._seen.extend(seen)
         return whose
 
-    def _legal(self, speeds: dict[str, float]) -> dict[str, float]:
-        """Return wanted speeds; with an ACC of its own, who is not held back is told nothing.
+    def _tell(self, speeds: dict[str, float]) -> None:
+        """With an ACC of its own, a CAV is given a set speed; none, where it may drive as it likes.
 
-        Whoever is told a speed, be it a high one, makes no room for who changes lanes, and brakes no harder
-        than is comfortable: SUMO takes that for a wish. Where its own ACC would, it is left to it.
+        So SUMO goes on to drive it: it brakes as hard as its ACC must, and makes room for who changes lanes.
+        Who is told its speed does neither. With nobody near, the ACC accelerates as it was asked to.
         """
+        cruise, step = self.scenario.cruise, self.scenario.simulation_step
         if self.scenario.actuation != "cruise":
-            return speeds
-        most = self.limits.highest * self.scenario.simulation_step - 1e-9
-        followed = zip(speeds.items(), self._followed(list(speeds)), strict=True)
-        return {
-            name: LEAVE_TO_SUMO
-            if speed - seen.speed >= most or self._is_free(name) or self._brakes_hard(seen)
-            else speed
-            for (name, speed), seen in followed
-        }
-
-    def _brakes_hard(self, seen: Followed) -> bool:
-        """Return whether a CAV's own ACC brakes harder than is comfortable, behind whom it follows."""
-        if not seen.leader or seen.gap <= 0:
-            return bool(seen.leader)
-        acc = self._acc
-        wanted = desired_gap(seen.speed, seen.speed - seen.leader_speed, acc)
-        return acc.max_acceleration * (1.0 - (wanted / seen.gap) ** 2) < -acc.comfortable_deceleration
+            super()._tell(speeds)
+            return
+        acc = IDMParameters(max_acceleration=cruise.acceleration)
+        most = min(self.limits.highest, cruise.acceleration) - 1e-6
+        now = self._simulation.speeds(list(speeds))
+        for (name, speed), own in zip(speeds.items(), now, strict=True):
+            wanted = (speed - own) / step
+            if wanted < most and not self._is_free(name):
+                fastest = self._fastest.setdefault(name, self._simulation.fastest(name))
+                held = speed if wanted <= 0 else max(speed, desired_speed_for(wanted, own, acc))
+                self._simulation.set_fastest(name, min(max(held, SLOWEST), fastest))
+            elif name in self._fastest:
+                self._simulation.set_fastest(name, self._fastest.pop(name))
 
     def _audit(self, trajectories: Sequence[Trajectory]) -> Audit:
         """Return the physics of every simulation step; how CAVs follow whom they have followed for long."""

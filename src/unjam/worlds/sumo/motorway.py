@@ -31,6 +31,8 @@ class MotorwayTraffic(LaneTraffic[MotorwayRoad]):
         self._factors = {entry.name: road.kinds[entry.kind].speed_factor for entry in road.entries}
         ways, step = int(self._ways.max()) + 1, scenario.decision_step
         self._messages = Messages(road.roadside, ways, road.length, step, self._noise_generator)
+        self._came: list[bool] = []
+        """of all who have entered, whether they are CAVs"""
         super().start(controlled, on_progress)
 
     @property
@@ -39,6 +41,7 @@ class MotorwayTraffic(LaneTraffic[MotorwayRoad]):
 
     def _moved(self, left: Sequence[str], entered: Sequence[str]) -> None:
         """Look who is where: SUMO's lanes, joined to ways, say who follows whom."""
+        self._came += [name in self.road.cav_ids for name in entered]
         simulation, names, lanes = self._simulation, list[str](), list[int]()
         for number, lane in enumerate(self.road.lanes):
             there = simulation.on_lane(lane.name)
@@ -101,6 +104,7 @@ class MotorwayTraffic(LaneTraffic[MotorwayRoad]):
             road_speeds=road_speeds,
             beside_gaps=beside_gaps,
             beside_speeds=beside_speeds,
+            cav_share=np.full(len(rows), sum(self._came) / max(len(self._came), 1)),
         )
 
     def _beside(self, rows: NDArray[np.intp]) -> tuple[Floats, Floats]:

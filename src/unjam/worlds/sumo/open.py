@@ -83,6 +83,10 @@ class OpenTraffic(Traffic[OpenKind]):
         """Return wanted speeds of CAVs, none above what the road allows [m/s]."""
         return speeds
 
+    def _tell(self, speeds: dict[str, float]) -> None:
+        """Command CAVs to have these speeds after the next step [m/s]."""
+        self._simulation.command_speeds(speeds.keys(), speeds.values())
+
     def _ends_with(self, colliding: Sequence[str]) -> bool:
         """Whether a collision of these vehicles ends the episode."""
         return True
@@ -168,7 +172,7 @@ class OpenTraffic(Traffic[OpenKind]):
     def _simulate(self, commanded: dict[str, float]) -> None:
         """Simulate one step after which these CAVs shall have these speeds [m/s]."""
         self._command_people()
-        self._simulation.command_speeds(commanded.keys(), commanded.values())
+        self._tell(commanded)
         self._simulation.step()
         self._follow()
         self._watch()

@@ -91,9 +91,10 @@ class OwnTraffic(LaneTraffic[OwnRoad]):
         return "{}" if self.scenario.actuation == "flow" else CAV_TYPES
 
     def _legal(self, speeds: dict[str, float]) -> dict[str, float]:
+        if self.scenario.actuation == "cruise":  # SUMO keeps to it, and takes set speeds for allowed ones
+            return speeds
         allowed = self._simulation.allowed_speeds(list(speeds))
-        told = super()._legal(speeds).items()
-        return {name: min(speed, most) for (name, speed), most in zip(told, allowed, strict=True)}
+        return dict(zip(speeds, map(min, speeds.values(), allowed), strict=True))
 
     def _followed(self, names: Sequence[str]) -> list[Followed]:
         near = zip(self._simulation.speeds(names), map(self._neighbours, names), strict=True)
@@ -118,7 +119,8 @@ class OwnTraffic(LaneTraffic[OwnRoad]):
         unknown = np.full(len(names), np.nan)
         if not self.full:
             return {"positions": unknown, "gaps": unknown}
-        allowed = self._simulation.allowed_speeds(names)
+        free = [name for name in names if name not in self._fastest] or names
+        allowed = self._simulation.allowed_speeds(free)
         self._allowed, self._counted = self._allowed + sum(allowed), self._counted + len(allowed)
         places = self._simulation.edge_places(names)
         rows = [(self._edges.setdefault(edge, len(self._edges)), *where) for edge, *where in places]

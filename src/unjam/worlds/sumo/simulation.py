@@ -88,6 +88,14 @@ class Simulation:
         self._get_along = call("vehicle", "getLanePosition")
         self._get_fuel = call("vehicle", "getFuelConsumption")
         self._set_speed = call("vehicle", "setSpeed")
+        self.type_of: Callable[[str], str] = call("vehicle", "getTypeID")
+        """a vehicle's type"""
+        self.change_type: Callable[[str, str], object] = call("vehicle", "setType")
+        """gives a vehicle another type"""
+        self.fastest: Callable[[str], float] = call("vehicle", "getMaxSpeed")
+        """how fast a vehicle drives at most, whatever the road allows [m/s]"""
+        self.set_fastest: Callable[[str, float], object] = call("vehicle", "setMaxSpeed")
+        """changes that for one vehicle"""
         self._set_previous_speed = call("vehicle", "setPreviousSpeed")
         self.on_lane: Callable[[str], Sequence[str]] = call("lane", "getLastStepVehicleIDs")
         """whose front bumpers are on a lane"""
@@ -206,14 +214,6 @@ class Simulation:
     def more_expected(self) -> bool:
         """Return whether anybody is on the road or will be."""
         return self._sumo.simulation.getMinExpectedNumber() > 0
-
-    def type_of(self, name: str) -> str:
-        """Return a vehicle's type."""
-        return self._sumo.vehicle.getTypeID(name)
-
-    def change_type(self, name: str, kind: str) -> None:
-        """Give a vehicle another type."""
-        self._sumo.vehicle.setType(name, kind)
 
     def route_of(self, name: str) -> tuple[str, ...]:
         """Return the edges of a vehicle's route."""
