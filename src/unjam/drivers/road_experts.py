@@ -238,8 +238,8 @@ class JamAhead(Formula):
     margin: float = -2.0
     """how much faster than the mean ahead it may drive where CAVs are few [m/s]"""
     margin_by_share: float = 20.0
-    """what more it may, times the share of CAVs [m/s]: where they are many, the mean ahead is that of others who
-    hold back, and each would be slower than the next"""
+    """what more it may, times the share of CAVs [m/s]: where they are many, the mean ahead is that of others
+    who hold back, and each would be slower than the next"""
     lowest: NotNegative = 5.0
     """it is never held back below this [m/s]"""
     slowing: Positive = 1.5

@@ -112,7 +112,7 @@ def _around(value: Any, hint: Any) -> Range | Choice | None:
     if not isinstance(value, int | float):
         return None
     if value == 0:
-        return Range(0.0, TO_ONE)
+        return Range(0, round(WIDTH)) if isinstance(value, int) else Range(0.0, TO_ONE)
     if isinstance(value, int):
         return Range(max(1, round(value / WIDTH)), round(value * WIDTH), log=True)
     ends = sorted((float(value) / WIDTH, float(value) * WIDTH))
