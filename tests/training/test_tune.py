@@ -120,7 +120,8 @@ def test_the_space_around_an_expert_has_its_numbers_words_and_truths() -> None:
     assert space_around("pacer", 0.1)["varying"] == Choice((False, True))
     first = space_around("jam-ahead", 1.0)["first"]  # zero by default
     assert first == Range(0, 4)
-    assert isinstance(first, Range) and first.whole
+    assert isinstance(first, Range)
+    assert first.whole
     for name in ("human", "nobody"):
         with pytest.raises(InputError):
             space_around(name, 0.1)
