@@ -293,7 +293,11 @@ def random_state(generator: np.random.Generator, rows: int, told: bool = False) 
     allowed, to_merge = generator.uniform(20.0, 30.0, rows), generator.uniform(-500.0, 2000.0, rows)
     ahead = LocalState(*near, None, allowed, to_merge, *speeds)
     beside = generator.uniform(-5.0, 60.0, (rows, len(BESIDE)))
-    return ahead._replace(beside_gaps=beside, beside_speeds=generator.uniform(0.0, 30.0, beside.shape))
+    return ahead._replace(
+        beside_gaps=beside,
+        beside_speeds=generator.uniform(0.0, 30.0, beside.shape),
+        cav_share=generator.uniform(0.0, 0.3, rows),
+    )
 
 
 def _equal(memory: Memory, other: Memory) -> bool:
