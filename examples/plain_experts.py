@@ -26,6 +26,7 @@ class State(NamedTuple):
     road_speeds: Sequence[float] = ()
     beside_gaps: Sequence[float] = ()
     beside_speeds: Sequence[float] = ()
+    cav_share: float = 0.0
 
 
 def clip(value: float, low: float, high: float) -> float:
@@ -152,7 +153,8 @@ def jam_ahead(p: Any, s: State, m: Any) -> float:
     told = (s.road_speeds if p.all_lanes else s.lane_speeds)[p.first : p.last + 1]
     if not told or not s.to_merge > 0.0:
         return cruise(p, s, m)
-    cap = min(max(sum(told) / len(told) + p.margin, p.lowest), s.allowed_speed)
+    wanted = sum(told) / len(told) + p.margin + p.margin_by_share * s.cav_share
+    cap = min(max(wanted, p.lowest), s.allowed_speed)
     return max((cap - s.speed) / p.time_constant, -p.slowing)
 
 

@@ -66,6 +66,7 @@ class Driver:
                 *((speed - s.speed) / 5.0 for speed in s.beside_speeds),
                 *(gap / 20.0 for gap in s.beside_gaps),
             ),
+            "cav_share": (s.cav_share,),
             "route_position": (s.route_position / 100.0,),
             "place": (math.cos(lap := 2.0 * math.pi * s.route_position / s.loop_length), math.sin(lap)),
         }
