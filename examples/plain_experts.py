@@ -191,6 +191,7 @@ EXPERTS |= {"ovm": ovm, "pacer": pacer, "jam-absorber": jam_absorber, "constant"
 EXPERTS |= {
     "cruise": cruise,
     "jam-ahead": jam_ahead,
+    "gap-maker": jam_ahead,  # but for the time headway that it asks of the car's own ACC
     "pi-from-gap": pi_from_gap,
     "adaptive-acc": adaptive_acc,
 }

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from unjam.drivers.command import Command, Limits, accelerations
+from unjam.drivers.command import Command, Limits, accelerations, time_headways
 from unjam.errors import InputError
 
 LIMITS = Limits(-1.0, 0.5)
@@ -38,3 +38,11 @@ def test_no_command_is_right_where_there_is_nobody() -> None:
     assert accelerations(None, LIMITS, [], 0) == []
     with pytest.raises(InputError, match=r"driver: step 2: acceleration has shape \(0,\); allowed: \(2,\)"):
         accelerations(None, LIMITS, "ab", 2)
+
+
+def test_an_acc_keeps_at_least_its_own_time_headway() -> None:
+    assert time_headways(Command(np.zeros(3), np.array([np.nan, 0.5, 2.0])), 1.1, "abc", 0) == [1.1, 1.1, 2.0]
+    assert time_headways(Command(np.zeros(2)), 1.1, "ab", 0) == [1.1, 1.1]
+    assert time_headways(None, 1.1, [], 0) == []
+    with pytest.raises(InputError, match=r"driver: step 4: time headway has shape \(1,\); allowed: \(2,\)"):
+        time_headways(Command(np.zeros(2), np.ones(1)), 1.1, "ab", 4)

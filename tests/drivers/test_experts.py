@@ -36,6 +36,7 @@ EXPERTS = [
     "cruise",
     "jam-ahead",
     "jam-ahead:all_lanes=true,last=9",
+    "gap-maker:room=1.5,behind=300",
     "adaptive-acc",
     "adaptive-acc:time_headway=1.2,front=0.5",
     "constant:acceleration=0.2",

@@ -9,7 +9,7 @@ from tests.conftest import random_network
 from unjam.drivers.local_state import EVERYWHERE, SECTIONS_AHEAD, LocalState, like_ones
 from unjam.drivers.registry import named_driver
 from unjam.drivers.residual import ResidualDriver
-from unjam.drivers.road_experts import FREELY, Cruise, JamAhead
+from unjam.drivers.road_experts import FREELY, Cruise, GapMaker, JamAhead
 from unjam.errors import InputError
 
 
@@ -64,6 +64,31 @@ def test_sections_and_lanes_are_the_users_to_choose() -> None:
     assert answer(replace(AT_ONCE, all_lanes=True), 20.0, 20.0) == pytest.approx(-1.0)
     with pytest.raises(InputError, match="last: 2 is not allowed; allowed: >= first, 3"):
         named_driver("jam-ahead:first=3,last=2", 1.0)
+
+
+@pytest.mark.parametrize(
+    ("to_merge", "right", "headway"),
+    [
+        (200.0, 10.0, 2.0),
+        (200.0, -3.0, 2.0),
+        (200.0, 50.0, np.nan),
+        (400.0, 10.0, np.nan),
+        (-1.0, 10.0, np.nan),
+    ],
+)
+def test_room_is_made_just_before_the_merge_for_those_on_the_right(
+    to_merge: float, right: float, headway: float
+) -> None:
+    beside = np.array([[1.0, 1.0, right, 100.0]])
+    driver, seen = GapMaker(room=2.0), state(20.0, 19.0, to_merge)._replace(beside_gaps=beside)
+    np.testing.assert_array_equal(driver.time_headways(seen, {}), [headway])
+    np.testing.assert_array_equal(driver.act(seen, {})[0], JamAhead().act(seen, {})[0])
+
+
+def test_nobody_makes_room_who_is_not_told_of_it() -> None:
+    alone = like_ones(EVERYWHERE, np.ones)
+    assert GapMaker().time_headways(alone, {}) is None
+    assert JamAhead().decide(state(20.0, 19.0), {}).command.time_headway is None
 
 
 def test_it_says_what_it_must_be_told() -> None:

@@ -4,11 +4,16 @@ import numpy as np
 import pytest
 import torch
 
+from tests.conftest import random_network
 from unjam.controller import make_driver
 from unjam.drivers import IDM, Driver, FollowerStopper, PISaturation, check_driver
-from unjam.drivers.from_file import random_state
+from unjam.drivers.by_road import ByRoad
+from unjam.drivers.driver import Memory
+from unjam.drivers.from_file import as_driver, random_state
+from unjam.drivers.local_state import LocalState
 from unjam.drivers.registry import driver_from_recipe, recipe_of
-from unjam.drivers.wrappers import Impaired, Mixed
+from unjam.drivers.residual import ResidualDriver
+from unjam.drivers.wrappers import Impaired, Mixed, Remembering
 from unjam.errors import InputError
 from unjam.scenarios import Merge, Ring
 from unjam.tree import mapped
@@ -29,6 +34,36 @@ def test_each_row_drives_as_its_own_driver_would() -> None:
             wanted, alone[number] = driver.act(state, alone[number])
             expected.append(wanted)
         np.testing.assert_array_equal(found, np.where(np.arange(5) % 2 == 0, *expected))
+
+
+def test_wrappers_pass_on_what_is_asked_of_the_cars_own_accs() -> None:
+    def asked(driver: Driver) -> Any:
+        return driver.decide(state, driver.initial_memory(4)).command.time_headway
+
+    state = random_state(np.random.default_rng(1), 4)
+    nan, two, asks = np.nan, 2.0, as_driver(AsksForTwoSeconds())
+    everyone = [two] * 4
+    np.testing.assert_array_equal(asked(Mixed((PI, asks, STOPPER))), [nan, two, nan, nan])
+    np.testing.assert_array_equal(asked(Impaired(asks, delay=0.3)), everyone)
+    np.testing.assert_array_equal(asked(Remembering(asks, 0.1)), everyone)
+    np.testing.assert_array_equal(asked(ResidualDriver(asks, random_network(5), 1.0)), everyone)
+    np.testing.assert_array_equal(asked(ByRoad(PI, PI, asks, PI)), everyone)
+    np.testing.assert_array_equal(asked(asks), everyone)
+    assert asked(Mixed((PI, STOPPER))) is None
+    assert asked(as_driver(lambda state: state.speed * 0.0)) is None
+
+
+class AsksForTwoSeconds:
+    """A driver as a user may bring it."""
+
+    def initial_memory(self, n: int) -> Memory:
+        return {}
+
+    def act(self, state: LocalState, memory: Memory) -> tuple[Any, Memory]:
+        return state.speed * 0.0, memory
+
+    def time_headways(self, state: LocalState, memory: Memory) -> Any:
+        return np.full(len(state.speed), 2.0)
 
 
 def test_it_drives_tensors_as_it_drives_arrays() -> None:

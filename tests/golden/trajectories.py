@@ -28,7 +28,7 @@ ROADS = {
     "on-ramp": ("on-ramp", {"horizon": 150, "peak": [0, 150], "cav_share": 0.3}),
     "own-network": ("", {"horizon": 250, "cav_types": ["van"]}),
 }
-ON_MOTORWAYS = ("cruise", "jam-ahead", "adaptive-acc")
+ON_MOTORWAYS = ("cruise", "jam-ahead", "gap-maker", "adaptive-acc")
 VANS = "".join(
     f'<vehicle id="{number}" type="{"car" if number % 3 else "van"}" route="along" '
     f'depart="{2 * number}" departSpeed="8"/>'

@@ -48,6 +48,11 @@ class ByRoad(Wrapper):
         wanted, after = self.inner[kind].act(state, memory[kind])
         return wanted, {**memory, kind: after}
 
+    def time_headways(self, state: LocalState, memory: Memory) -> Array | None:
+        """Return those of the driver of this kind of road."""
+        kind = _kind(state)
+        return self.inner[kind].time_headways(state, memory[kind])
+
     def describe(self) -> str:
         """Return all of them with their roads."""
         return ", ".join(f"{kind}: {driver.describe()}" for kind, driver in self.inner.items())

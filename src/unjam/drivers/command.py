@@ -20,6 +20,9 @@ class Command(NamedTuple):
 
     acceleration: Array
     """[m/s2]"""
+    time_headway: Array | None = None
+    """that their own ACCs shall keep to leaders, on roads that have such ACCs [s], shape (n,); NaN, or None
+    for all: as long as they would by themselves"""
 
 
 class Limits(NamedTuple):
@@ -40,15 +43,15 @@ class Limits(NamedTuple):
         return cls(-limit, limit)
 
 
-def as_rows(acceleration: Any, rows: int, where: str) -> NDArray[np.float64]:
+def as_rows(answer: Any, rows: int, where: str, what: str = "acceleration") -> NDArray[np.float64]:
     """Return what a driver answered as an array; raise `InputError` unless it is `rows` numbers."""
     try:
-        array = np.asarray(acceleration, np.float64)
+        array = np.asarray(answer, np.float64)
     except (TypeError, ValueError):
-        raise InputError(f"{where}: acceleration is not numbers: {acceleration!r}") from None
+        raise InputError(f"{where}: {what} is not numbers: {answer!r}") from None
     if array.shape != (rows,):
         allowed = f"({rows},), one for each CAV"
-        raise InputError(f"{where}: acceleration has shape {array.shape}; allowed: {allowed}")
+        raise InputError(f"{where}: {what} has shape {array.shape}; allowed: {allowed}")
     return array
 
 
@@ -71,3 +74,16 @@ def accelerations(command: Command | None, limits: Limits, names: Sequence[str],
         first = int(np.isfinite(values).argmin())
         raise InputError(f"{where}: acceleration of {names[first]} is {values[first]}; allowed: finite")
     return limits.keep(values).tolist()
+
+
+def time_headways(command: Command | None, least: float, names: Sequence[str], step: int) -> list[float]:
+    """Return the time headways that the vehicles `names` shall keep [s]: none below `least`, their ACCs' own.
+
+    Raises:
+        InputError: there are not as many as vehicles.
+    """
+    wanted = None if command is None else command.time_headway
+    if wanted is None:
+        return [least] * len(names)
+    values = as_rows(wanted, len(names), f"driver: step {step}", "time headway")
+    return np.fmax(values, least).tolist()  # NaN gives way

@@ -100,7 +100,12 @@ class Driver:
     def decide(self, state: LocalState, memory: Memory, noise: Noise | None = None) -> Decision:
         """Return the decision taken apart; with `noise`, what was learned explores."""
         acceleration, after = self.act(state, memory)
-        return Decision(Command(acceleration), acceleration, 0.0, None, after)
+        command = Command(acceleration, self.time_headways(state, memory))
+        return Decision(command, acceleration, 0.0, None, after)
+
+    def time_headways(self, state: LocalState, memory: Memory) -> Array | None:
+        """Return the time headways that its cars' own ACCs shall keep now, as a `Command` has them."""
+        return None
 
     def observation(self, state: LocalState, memory: Memory) -> Array | None:
         """Return what a network would see now, (n, inputs), whether or not it is asked; None without one."""

@@ -133,6 +133,11 @@ class Brought(Driver):
             return np.zeros(0), memory
         return self.ask(self.held.act, state, memory)
 
+    def time_headways(self, state: LocalState, memory: Memory) -> Array | None:
+        """Return what the user's driver asks of its cars' ACCs, if it asks for anything."""
+        asked = getattr(self.held, "time_headways", None)
+        return self.ask(asked, state, memory) if asked and np.size(state.speed) else None
+
     def memory_features(self, memory: Memory) -> Array | None:
         """Return the user's features of the memory, if the driver has any."""
         features = getattr(self.held, "memory_features", None)

@@ -19,7 +19,7 @@ from unjam.drivers.network import network_from_arrays
 from unjam.drivers.observation import FEATURES, FeatureName, observation_size
 from unjam.drivers.pi_saturation import PIFromGap, PISaturation
 from unjam.drivers.residual import EXPERT, ResidualDriver
-from unjam.drivers.road_experts import Cruise, JamAbsorber, JamAhead, Pacer
+from unjam.drivers.road_experts import Cruise, GapMaker, JamAbsorber, JamAhead, Pacer
 from unjam.drivers.safety import SafetyFilter
 from unjam.drivers.wrappers import INNER, Filtered, Impaired, Mixed, Remembering
 from unjam.errors import InputError, did_you_mean, wrong
@@ -28,7 +28,7 @@ from unjam.tree import Arrays
 
 _KINDS = (
     *(Human, IDM, PISaturation, PIFromGap, FollowerStopper, ACC, LACC, BCM, OVM),
-    *(Pacer, JamAbsorber, Cruise, JamAhead, AdaptiveACC),
+    *(Pacer, JamAbsorber, Cruise, JamAhead, GapMaker, AdaptiveACC),
     Constant,
 )
 DRIVERS: dict[str, type[Driver]] = {kind.name: kind for kind in _KINDS}

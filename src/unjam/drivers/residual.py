@@ -77,7 +77,8 @@ class ResidualDriver(Wrapper):
         remembered = {EXPERT: after}
         if hold > 1:
             remembered = {EXPERT: after, RESIDUAL: residual, AGE: memory[AGE] + 1.0}
-        command = Command(limits.keep(expert + residual))
+        headways = self.expert.time_headways(state, memory[EXPERT])
+        command = Command(limits.keep(expert + residual), headways)
         return Decision(command, expert, residual, observation, remembered)
 
     def observation(self, state: LocalState, memory: Memory) -> Array:

@@ -27,6 +27,9 @@ OVERRUN = 50.0
 FREELY = 100.0
 """acceleration that no ACC has: nothing holds it back [m/s2]"""
 
+NO_HEADWAY = float("nan")
+"""as long as the car's own ACC keeps by itself"""
+
 Section = Annotated[int, Field(ge=0, lt=SECTIONS_AHEAD)]
 
 
@@ -268,3 +271,34 @@ class JamAhead(Formula):
         cap = xp.minimum(at_least(wanted, self.lowest), state.allowed_speed)
         towards = at_least((cap - state.speed) / self.time_constant, -self.slowing)
         return xp.where(state.to_merge > 0.0, towards, free), memory
+
+
+@dataclass(frozen=True, config=STRICT)
+class GapMaker(JamAhead):
+    """As `jam-ahead`, and just before a ramp joins keeps a longer time headway while others are on its right.
+
+    There somebody from the ramp, or from the lane that the ramp's vehicles push into, finds a gap without
+    making anybody brake. It needs a car with an ACC of its own. After cooperative merging, as in Scarinci and
+    Heydecker 2014, Transp. Rev. 34:775-797.
+    """
+
+    name: ClassVar[str] = "gap-maker"
+    told: ClassVar[tuple[str, ...]] = (*JamAhead.told, "beside_gaps")
+
+    room: Positive = 2.0
+    """time headway while it makes room [s]"""
+    before: NotNegative = 300.0
+    """how far before a ramp joins it begins [m]"""
+    behind: NotNegative = 0.0
+    """how far behind it it ends [m]: there the ramp's lane runs beside the road"""
+    near: Positive = 40.0
+    """gap to somebody on the right, ahead or behind, for whom it makes room [m]"""
+
+    def time_headways(self, state: LocalState, memory: Memory) -> Array | None:
+        """Return the time headway of those who make room [s], NaN for the others."""
+        if state.beside_gaps is None or state.to_merge is None:
+            return None
+        xp, beside = namespace(state.speed), state.beside_gaps[..., 2:]
+        somebody = (beside < self.near).any(-1)
+        makes = somebody & (state.to_merge > -self.behind) & (state.to_merge < self.before)
+        return xp.where(makes, state.speed * 0.0 + self.room, state.speed * 0.0 + NO_HEADWAY)

@@ -60,6 +60,10 @@ class Around(Wrapper):
         """The other driver."""
         return {INNER: self.driver}
 
+    def time_headways(self, state: LocalState, memory: Memory) -> Array | None:
+        """Return those of the other driver."""
+        return self.driver.time_headways(state, memory[INNER])
+
 
 @dataclass(frozen=True)
 class Mixed(Wrapper):
@@ -92,6 +96,20 @@ class Mixed(Wrapper):
             mine = memory[KIND] == number
             chosen = wanted if chosen is None else namespace(wanted).where(mine, wanted, chosen)
         return chosen, after
+
+    def time_headways(self, state: LocalState, memory: Memory) -> Array | None:
+        """Return for each CAV that of its own driver."""
+        found = {
+            number: wanted
+            for number, (key, driver) in enumerate(self.inner.items())
+            if (wanted := driver.time_headways(state, memory[key])) is not None
+        }
+        if not found:
+            return None
+        chosen = np.full(len(memory[KIND]), np.nan)
+        for number, wanted in found.items():
+            chosen = np.where(memory[KIND] == number, wanted, chosen)
+        return chosen
 
     def describe(self) -> str:
         """Return all of them, joined by +."""

@@ -58,7 +58,8 @@ class Outside(Driver):
         """Return the sum of what the expert wanted when it was looked at and what was added since."""
         if not len(state.speed):
             return Decision(Command(np.zeros(0)), np.zeros(0), np.zeros(0), None, memory)
-        command = Command(self._within.keep(self._wanted + self.actions))
+        headways = self.expert.time_headways(state, memory)
+        command = Command(self._within.keep(self._wanted + self.actions), headways)
         return Decision(command, self._wanted, self.actions, None, self._after)
 
 

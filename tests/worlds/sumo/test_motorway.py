@@ -126,6 +126,29 @@ def test_it_is_told_how_many_of_all_that_have_entered_are_cavs(simulation: Simul
     assert share == pytest.approx([sum(name in traffic.road.cav_ids for name in came) / len(came)], abs=0.02)
 
 
+def test_an_acc_keeps_the_time_headway_that_it_is_asked_for_until_it_is_asked_no_more(
+    simulation: Simulation,
+) -> None:
+    def shortest(asked: float) -> float:
+        """Return a short time headway of CAVs on a full road [s], and look that SUMO knows what was asked."""
+        traffic, own, found = motorway(simulation), BUSY.cruise.time_headway, list[float]()
+        for decision in range(200):
+            free = np.full(traffic.rows, 100.0)
+            traffic.advance(Command(free, np.full(traffic.rows, asked)))
+            if decision > 100:
+                seen = traffic.perceive()
+                found += (seen.leader_gap / seen.speed.clip(0.1))[seen.leader_gap < LARGEST_GAP].tolist()
+        told = traffic.cavs
+        traffic.advance(Command(np.full(traffic.rows, 100.0), np.full(traffic.rows, asked)))
+        kept = [name for name in told if name in traffic.cavs]
+        assert {libsumo.vehicle.getTau(name) for name in kept} == {max(asked, own)}
+        traffic.advance(Command(np.full(traffic.rows, 100.0), np.full(traffic.rows, np.nan)))
+        assert {libsumo.vehicle.getTau(name) for name in kept if name in traffic.cavs} == {own}
+        return float(np.quantile(found, 0.1))
+
+    assert shortest(2.0) > shortest(0.5) + 0.3
+
+
 def test_who_is_not_held_back_drives_as_its_own_acc_does(simulation: Simulation) -> None:
     episode = run_episode(BUSY, Cruise(), (3,), simulation=simulation)
     assert episode.status == "completed"

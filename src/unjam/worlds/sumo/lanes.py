@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from unjam.drivers.command import Command, time_headways
 from unjam.physics.idm import IDMParameters, desired_speed_for
 from unjam.worlds.audit import SHORT_HEADWAY, Audit, following
 from unjam.worlds.record import Floats, Trajectory
@@ -54,7 +55,20 @@ class LaneTraffic(OpenTraffic[OpenKind]):
         self._steps = 0
         self._fastest: dict[str, float] = {}
         """of CAVs that have a set speed, how fast they would drive without it"""
+        self._headways: dict[str, float] = {}
+        """of CAVs whose ACC was asked for a time headway: the one that it keeps now [s]"""
         super().start(controlled, on_progress)
+
+    def advance(self, command: Command | None) -> None:
+        """Simulate one decision; CAVs' own ACCs, if they have any, are asked for time headways first."""
+        least = self.scenario.cruise.time_headway
+        if self._controlled and self.scenario.actuation == "cruise":
+            wanted = time_headways(command, least, self.cavs, self.decisions)
+            for name, headway in zip(self.cavs, wanted, strict=True):
+                if headway != self._headways.get(name, least):
+                    self._simulation.set_headway(name, headway)
+                    self._headways[name] = headway
+        super().advance(command)
 
     def _followed(self, names: Sequence[str]) -> list[Followed]:
         """Return whom these CAVs follow now."""

@@ -96,6 +96,8 @@ class Simulation:
         """how fast a vehicle drives at most, whatever the road allows [m/s]"""
         self.set_fastest: Callable[[str, float], object] = call("vehicle", "setMaxSpeed")
         """changes that for one vehicle"""
+        self.set_headway: Callable[[str, float], object] = call("vehicle", "setTau")
+        """changes the time headway that a vehicle keeps [s]"""
         self._set_previous_speed = call("vehicle", "setPreviousSpeed")
         self.on_lane: Callable[[str], Sequence[str]] = call("lane", "getLastStepVehicleIDs")
         """whose front bumpers are on a lane"""
@@ -264,8 +266,7 @@ class Simulation:
         """Let SUMO keep `ids` safe and to the right of way and, if `bounded`, to limits of acceleration."""
         mode = SPEED_MODES["flow"] if right_of_way else SPEED_MODES["flow"] & WITHOUT_RIGHT_OF_WAY
         mode |= LIMITS_OF_ACCELERATION if bounded else 0
-        for name in ids:
-            self._sumo.vehicle.setSpeedMode(name, mode)
+        _exhaust(self._sumo.vehicle.setSpeedMode(name, mode) for name in ids)
 
     def take_control(
         self, ids: Iterable[str], actuation: Actuation, right_of_way: bool = True, types: str = "cav"
@@ -285,8 +286,7 @@ class Simulation:
         if self._running:
             self._end()
         self._folder.cleanup()
-        if _open is self:
-            _open = None
+        _open = None if _open is self else _open
 
     def _end(self) -> None:
         """End SUMO; one that is gone already is no error."""
