@@ -79,7 +79,7 @@ def road_of(manifest: dict[str, Any]) -> str:
     made = manifest.get("scenario")
     if not isinstance(made, dict):
         return ""
-    facts = [f"{name} {_short(made[name])}" for name in FACTS if name in made]
+    facts = [f"{name} {_short(made[name])}" for name in FACTS if made.get(name) is not None]
     return ", ".join([str(made.get("kind")), *facts])
 
 
