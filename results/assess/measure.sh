@@ -7,6 +7,5 @@ game=$(python3 -c 'import pathlib, sumo; print(pathlib.Path(sumo.SUMO_HOME) / "t
 mkdir -p runs
 cp -r "$game/ramp" "$game/ramp.sumocfg" "$game/input_additional.add.xml" runs
 rm -rf runs/assess-ramp
-unjam assess runs/ramp.sumocfg --shares 0.05,0.2 -d acc -d idm:time_headway=1,max_acceleration=2.5 \
-    -d follower-stopper --set actuation=shielded --set safety.active=true --episodes 130 --out runs/assess-ramp
+unjam assess runs/ramp.sumocfg --shares 0.05,0.2 --episodes 130 --out runs/assess-ramp
 cp runs/assess-ramp/assessment.json results/assess/ramp.json
