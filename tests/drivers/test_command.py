@@ -46,3 +46,9 @@ def test_an_acc_keeps_at_least_its_own_time_headway() -> None:
     assert time_headways(None, 1.1, [], 0) == []
     with pytest.raises(InputError, match=r"driver: step 4: time headway has shape \(1,\); allowed: \(2,\)"):
         time_headways(Command(np.zeros(2), np.ones(1)), 1.1, "ab", 4)
+
+
+def test_no_acc_keeps_an_infinite_time_headway() -> None:
+    asked = Command(np.zeros(2), np.array([2.0, np.inf]))
+    with pytest.raises(InputError, match="driver: step 7: time headway of b is inf; allowed: finite, or NaN"):
+        time_headways(asked, 1.1, "ab", 7)

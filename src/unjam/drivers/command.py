@@ -80,10 +80,15 @@ def time_headways(command: Command | None, least: float, names: Sequence[str], s
     """Return the time headways that the vehicles `names` shall keep [s]: none below `least`, their ACCs' own.
 
     Raises:
-        InputError: there are not as many as vehicles.
+        InputError: one is infinite, or there are not as many as vehicles.
     """
     wanted = None if command is None else command.time_headway
     if wanted is None:
         return [least] * len(names)
-    values = as_rows(wanted, len(names), f"driver: step {step}", "time headway")
-    return np.fmax(values, least).tolist()  # NaN gives way
+    where = f"driver: step {step}"
+    found = np.fmax(as_rows(wanted, len(names), where, "time headway"), least)  # NaN gives way
+    if not np.isfinite(found).all():
+        first = int(np.isfinite(found).argmin())
+        wrong = f"time headway of {names[first]} is {found[first]}"
+        raise InputError(f"{where}: {wrong}; allowed: finite, or NaN")
+    return found.tolist()

@@ -3,6 +3,7 @@
 from collections.abc import Iterable
 from dataclasses import replace
 from functools import cached_property
+from math import nan
 from typing import Annotated, Any, ClassVar
 
 import numpy as np
@@ -26,9 +27,6 @@ OVERRUN = 50.0
 """[m] beyond `last_position`, where it waits no longer"""
 FREELY = 100.0
 """acceleration that no ACC has: nothing holds it back [m/s2]"""
-
-NO_HEADWAY = float("nan")
-"""as long as the car's own ACC keeps by itself"""
 
 Section = Annotated[int, Field(ge=0, lt=SECTIONS_AHEAD)]
 
@@ -301,4 +299,5 @@ class GapMaker(JamAhead):
         xp, beside = namespace(state.speed), state.beside_gaps[..., 2:]
         somebody = (beside < self.near).any(-1)
         makes = somebody & (state.to_merge > -self.behind) & (state.to_merge < self.before)
-        return xp.where(makes, state.speed * 0.0 + self.room, state.speed * 0.0 + NO_HEADWAY)
+        zero = state.speed * 0.0
+        return xp.where(makes, zero + self.room, zero + nan)

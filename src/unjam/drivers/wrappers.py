@@ -99,16 +99,12 @@ class Mixed(Wrapper):
 
     def time_headways(self, state: LocalState, memory: Memory) -> Array | None:
         """Return for each CAV that of its own driver."""
-        found = {
-            number: wanted
-            for number, (key, driver) in enumerate(self.inner.items())
-            if (wanted := driver.time_headways(state, memory[key])) is not None
-        }
-        if not found:
-            return None
-        chosen = np.full(len(memory[KIND]), np.nan)
-        for number, wanted in found.items():
-            chosen = np.where(memory[KIND] == number, wanted, chosen)
+        chosen = None
+        for number, (key, driver) in enumerate(self.inner.items()):
+            wanted = driver.time_headways(state, memory[key])
+            if wanted is not None:
+                others = np.nan if chosen is None else chosen
+                chosen = np.where(memory[KIND] == number, wanted, others)
         return chosen
 
     def describe(self) -> str:

@@ -144,6 +144,9 @@ def test_an_acc_keeps_the_time_headway_that_it_is_asked_for_until_it_is_asked_no
         assert {libsumo.vehicle.getTau(name) for name in kept} == {max(asked, own)}
         traffic.advance(Command(np.full(traffic.rows, 100.0), np.full(traffic.rows, np.nan)))
         assert {libsumo.vehicle.getTau(name) for name in kept if name in traffic.cavs} == {own}
+        traffic.advance(Command(np.full(traffic.rows, 100.0), np.full(traffic.rows, asked)))
+        traffic.advance(Command(np.full(traffic.rows, 100.0)))  # nothing asked is as NaN for all
+        assert {libsumo.vehicle.getTau(name) for name in kept if name in traffic.cavs} == {own}
         return float(np.quantile(found, 0.1))
 
     assert shortest(2.0) > shortest(0.5) + 0.3

@@ -25,8 +25,8 @@ from unjam.scenarios.road import ClosedRoad
 from unjam.scenarios.scenario import VEHICLE_LENGTH, Scenario
 from unjam.worlds.closed import HISTORY, NOISE_BLOCK, ClosedLog, loop_neighbours, loop_state, places_along
 from unjam.worlds.record import Episode, Floats
-from unjam.worlds.sumo.simulation import LEAVE_TO_SUMO, Simulation
-from unjam.worlds.sumo.traffic import Scene, Seed, Traffic
+from unjam.worlds.sumo.simulation import Simulation
+from unjam.worlds.sumo.traffic import LEAVE_TO_SUMO, Scene, Seed, Traffic
 from unjam.worlds.world import Driven, OnProgress
 
 

@@ -61,8 +61,9 @@ class LaneTraffic(OpenTraffic[OpenKind]):
 
     def advance(self, command: Command | None) -> None:
         """Simulate one decision; CAVs' own ACCs, if they have any, are asked for time headways first."""
-        least = self.scenario.cruise.time_headway
-        if self._controlled and self.scenario.actuation == "cruise":
+        asks = command is not None and command.time_headway is not None
+        if self.scenario.actuation == "cruise" and (asks or self._headways):
+            least = self.scenario.cruise.time_headway
             wanted = time_headways(command, least, self.cavs, self.decisions)
             for name, headway in zip(self.cavs, wanted, strict=True):
                 if headway != self._headways.get(name, least):

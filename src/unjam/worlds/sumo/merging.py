@@ -23,7 +23,7 @@ from unjam.scenarios.scenario import VEHICLE_LENGTH
 from unjam.worlds.record import Episode, Floats
 from unjam.worlds.sumo.networks import network_file, network_lines
 from unjam.worlds.sumo.open import OpenTraffic
-from unjam.worlds.sumo.simulation import LEAVE_TO_SUMO
+from unjam.worlds.sumo.traffic import LEAVE_TO_SUMO
 from unjam.worlds.world import Driven, OnProgress
 
 BRANCHES = ("highway", "ramp")

@@ -33,8 +33,6 @@ WITHOUT_RIGHT_OF_WAY = 1
 """the bit that stays where vehicles need not obey the right of way: who is surprised stops as it must"""
 LIMITS_OF_ACCELERATION = 2 | 4
 """the bits by which vehicles keep to the acceleration and the braking of their type"""
-LEAVE_TO_SUMO = -1.0
-"""the commanded speed that stands for none"""
 _exhaust = deque(maxlen=0).extend
 """runs through an iterator, in C: a loop would cost as much as the calls"""
 _open: "Simulation | None" = None
@@ -266,7 +264,8 @@ class Simulation:
         """Let SUMO keep `ids` safe and to the right of way and, if `bounded`, to limits of acceleration."""
         mode = SPEED_MODES["flow"] if right_of_way else SPEED_MODES["flow"] & WITHOUT_RIGHT_OF_WAY
         mode |= LIMITS_OF_ACCELERATION if bounded else 0
-        _exhaust(self._sumo.vehicle.setSpeedMode(name, mode) for name in ids)
+        for name in ids:
+            self._sumo.vehicle.setSpeedMode(name, mode)
 
     def take_control(
         self, ids: Iterable[str], actuation: Actuation, right_of_way: bool = True, types: str = "cav"
@@ -286,7 +285,8 @@ class Simulation:
         if self._running:
             self._end()
         self._folder.cleanup()
-        _open = None if _open is self else _open
+        if _open is self:
+            _open = None
 
     def _end(self) -> None:
         """End SUMO; one that is gone already is no error."""

@@ -23,6 +23,8 @@ from unjam.worlds.world import OnProgress, World
 ODOMETER_TOLERANCE = 1e-6
 """by how much positions may differ from SUMO's odometer at the end [m]"""
 WARMUP_PROGRESS_STEPS = 500
+LEAVE_TO_SUMO = -1.0
+"""the commanded speed that stands for none"""
 
 
 class Seed(NamedTuple):
