@@ -240,9 +240,10 @@ def test_rings_of_many_kinds_come_back_in_their_order() -> None:
         EpisodeTask(replace(SHORT, cavs=2), pi, (2,)),
         EpisodeTask(SHORT.part(0, 2), pi, (3,)),
         EpisodeTask(SHORT.part(0, 2), idm, (4,)),
+        EpisodeTask(replace(SHORT, vehicles=40, length=(400, 480)), pi, (5,)),  # who do not fit on the others
     ]
     found = run_batches(asked)
-    assert [episode.seed for episode in found] == [(1,), (2,), (3,), (4,)]
+    assert [episode.seed for episode in found] == [(1,), (2,), (3,), (4,), (5,)]
     for episode, task in zip(found, asked, strict=True):
         (alone,) = run_batch([task])
         assert np.array_equal(episode.speeds, alone.speeds)
