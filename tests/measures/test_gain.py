@@ -3,11 +3,10 @@
 from math import nan
 from typing import Any
 
-import numpy as np
 import pytest
 
-from unjam.measures.gain import LEAST, MOST, WORST, ceiling, gain, mean_gain, worth
-from unjam.measures.statistics import Estimate, estimate
+from unjam.measures.gain import LEAST, MOST, WORST, ceiling, gain, gain_by_seed, worth
+from unjam.measures.statistics import estimate
 
 CLOSED: dict[str, Any] = {
     "status": "completed",
@@ -73,10 +72,11 @@ def test_who_cannot_drive_on_a_road_neither_gains_nor_loses_there() -> None:
     assert (found.mean, found.low, found.high) == (0.0, 0.0, 0.0)
 
 
-def test_a_single_disaster_counts_in_the_interval_as_it_counts_in_the_mean() -> None:
-    values = np.array([1.0, 1.0, 1.0, -50.0])
-    found = mean_gain([Estimate(0.0, -1.0, 1.0, 4)], [values])
-    assert found.high - found.low == pytest.approx(2 * estimate([1.0, 1.0, 1.0, WORST]).high - 2 * 0.5)
+def test_a_single_disaster_counts_no_more_than_the_worst_that_counts() -> None:
+    rows = ring([4.0, 4.1, 3.9, -50.0])
+    found = gain_by_seed(rows, PEOPLE, 4.0)
+    assert found.mean() == pytest.approx(gain(rows, PEOPLE, 4.0).mean)
+    assert found - found.min() == pytest.approx([1.0 - WORST] * 3 + [0.0])
 
 
 def test_where_nothing_is_to_be_gained_a_loss_is_all_that_counts() -> None:
@@ -85,19 +85,12 @@ def test_where_nothing_is_to_be_gained_a_loss_is_all_that_counts() -> None:
     assert gain(ring([2.955] * 4), PEOPLE, best).mean == pytest.approx(-0.5)
 
 
-def test_the_mean_over_roads_is_no_surer_than_each_where_a_seed_is_kind_on_all() -> None:
-    values = np.array([0.2, 0.4, 0.6, 0.8])
-    each = estimate(values.tolist())
-    together = mean_gain([each] * 4, [values] * 4)
-    assert (together.mean, together.count) == (pytest.approx(0.5), 4)
-    assert (together.low, together.high) == (pytest.approx(each.low), pytest.approx(each.high))
-    apart = mean_gain([each, each], [values, values[::-1]])
-    assert (apart.low, apart.high) == (pytest.approx(0.5), pytest.approx(0.5))
+def test_seed_by_seed_a_gain_has_the_same_mean_and_interval() -> None:
+    rows = ring([3.4, 3.7, 3.1, 3.9])
+    found, alone = estimate(gain_by_seed(rows, PEOPLE, 4.0).tolist()), gain(rows, PEOPLE, 4.0)
+    assert (found.mean, found.low, found.high) == pytest.approx((alone.mean, alone.low, alone.high))
 
 
-def test_a_gain_that_a_rule_has_fixed_adds_no_error() -> None:
-    values = np.array([0.2, 0.4, 0.6, 0.8])
-    each = estimate(values.tolist())
-    found = mean_gain([each, Estimate(0.0, 0.0, 0.0, 4)], [values, 10.0 * values])
-    assert found.mean == pytest.approx(0.25)
-    assert found.high - found.low == pytest.approx((each.high - each.low) / 2)
+def test_a_gain_that_a_rule_has_fixed_has_no_errors() -> None:
+    crashed = ring([3.4, 3.7, 3.1, 3.9], collisions=2.0)
+    assert gain_by_seed(crashed, PEOPLE, 4.0).tolist() == [0.0] * 4

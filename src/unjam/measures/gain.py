@@ -71,16 +71,12 @@ def gain(rows: Rows, people: Rows, best: float) -> Estimate:
     return Estimate(mean, low, high, found.count)
 
 
-def mean_gain(gains: Sequence[Estimate], by_seed: Sequence[Floats]) -> Estimate:
-    """Return the mean gain over roads that were driven on the same seeds, with its interval over seeds.
+def gain_by_seed(rows: Rows, people: Rows, best: float) -> Floats:
+    """Return the gain on one road, seed by seed around its mean; one that a rule has fixed has no errors.
 
-    A seed may be kind to a driver on many roads: their errors are not independent. A gain that a rule has
-    fixed has none. `by_seed` is what `scaled` says of each road, arrays of shape (seeds,).
+    So means over roads that were driven on the same seeds have an interval over seeds: one may be kind to a
+    driver on many roads. Arguments as `gain` takes them.
     """
-    mean = float(np.mean([each.mean for each in gains]))
-    errors = [
-        values - values.mean() if each.low < each.high else np.zeros(len(values))
-        for each, values in zip(gains, (np.clip(of, WORST, MOST) for of in by_seed), strict=True)
-    ]
-    around = estimate(np.mean(errors, axis=0).tolist())
-    return Estimate(mean, mean + around.low, mean + around.high, len(gains))
+    found = gain(rows, people, best)
+    values = np.clip(scaled(rows, people, best), WORST, MOST)
+    return found.mean + (values - values.mean()) * (found.low < found.high)

@@ -6,6 +6,7 @@ from unjam.studies.envelope import ENVELOPE
 from unjam.studies.everywhere import EVERYWHERE_STUDY
 from unjam.studies.figure_6 import FIGURE_6
 from unjam.studies.imagined import imagined
+from unjam.studies.rings import on_rings
 from unjam.studies.robustness import FIGURE_10, ROBUSTNESS
 from unjam.studies.study import PAPERS_ROADS, Study
 from unjam.studies.theory import FIGURE_8, THEORY
@@ -60,6 +61,13 @@ STUDIES: dict[str, Study] = {
     "drivable-eight": DRIVABLE_EIGHT,
     "envelope": ENVELOPE,
     "everywhere": EVERYWHERE_STUDY,
+    "rings": on_rings(
+        "what one residual, trained on all rings of the family together, gains on each", {"rings": 10}
+    ),
+    "rings-alone": on_rings(
+        "what TRPO and PPO gain on the rings of the family without an expert",
+        {"rings-trpo": 5, "rings-ppo": 5},
+    ),
 }
 """every study by name"""
 

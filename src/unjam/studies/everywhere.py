@@ -5,6 +5,7 @@ decide than those that judge.
 """
 
 import json
+from collections.abc import Callable, Iterable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -16,19 +17,24 @@ from matplotlib.figure import Figure
 from unjam.controller import make_driver
 from unjam.files import to_json, write_whole
 from unjam.measures.drivable import DRIVABLE, drivable_in_all
-from unjam.measures.gain import MOST, WORST, Rows, gain, mean_gain, scaled, worth
+from unjam.measures.gain import MOST, WORST, Rows, gain, gain_by_seed, worth
 from unjam.measures.metrics import measure
-from unjam.measures.statistics import signed
+from unjam.measures.statistics import estimate, signed
 from unjam.measures.table import PEOPLE
 from unjam.reports.figures import INK, new_figure
 from unjam.scenarios.scenario import Scenario
 from unjam.studies.study import Study, StudyFolder
 from unjam.training.family import FAMILY, GROUPS
 from unjam.training.seeds import held_out_seeds, tuning_seeds
+from unjam.worlds.record import Episode
 from unjam.worlds.workers import EpisodeTask, Workers
 
 EPISODES = 10
 """of each driver on each road"""
+CHOOSING, JUDGING = tuning_seeds(EPISODES, 1000), held_out_seeds(EPISODES)
+"""seeds that choose the best tuned expert of a road, and those that judge"""
+Run = Callable[[list[EpisodeTask]], Iterable[Episode]]
+"""drives tasks, in their order"""
 TUNED: dict[str, tuple[str, ...]] = {
     "rings": (
         *("pi", "unjam:ring-tuned", "unjam:ring-gap-tuned", "unjam:ring-jammed-tuned", "unjam:rings-tuned"),
@@ -57,15 +63,16 @@ KEPT = (
 """of each episode"""
 
 
-def _driven(
-    scenario: Scenario, drivers: dict[str, str], seeds: list[tuple[int, ...]], workers: Workers
+def driven(
+    scenario: Scenario, drivers: dict[str, str], seeds: list[tuple[int, ...]], run: Run
 ) -> dict[str, Rows]:
+    """Return what is kept of each driver's episodes, by label; `drivers` are names of drivers by label."""
     tasks = [
         EpisodeTask(scenario.part(index, len(seeds)), make_driver(name, scenario.decision_step), seed)
         for name in drivers.values()
         for index, seed in enumerate(seeds)
     ]
-    rows = [{key: row[key] for key in KEPT} for row in map(measure, workers.run(tasks))]
+    rows = [{key: row[key] for key in KEPT} for row in map(measure, run(tasks))]
     count = len(seeds)
     return {label: rows[n * count : (n + 1) * count] for n, label in enumerate(drivers)}
 
@@ -79,12 +86,12 @@ def _write(studies: StudyFolder, seeds: int, folder: Path, workers: int) -> None
             found: dict[str, Any] = json.loads(file.read_text()) if file.is_file() else {}
             if not found:
                 tried = {driver: driver for driver in (PEOPLE, *TUNED[group])}
-                rows = _driven(scenario, tried, tuning_seeds(EPISODES, 1000), pool)
+                rows = driven(scenario, tried, CHOOSING, pool.run)
                 found = {"road": name, "part": road.part, "best": best_of(rows), "rows": {}}
             asked = {PEOPLE: PEOPLE, found["best"]: found["best"], **JUDGED}
             missing = {label: driver for label, driver in asked.items() if label not in found["rows"]}
             if missing:  # also drivers that came later
-                found["rows"] |= _driven(scenario, missing, held_out_seeds(EPISODES), pool)
+                found["rows"] |= driven(scenario, missing, JUDGING, pool.run)
                 write_whole(file, to_json(found))
 
 
@@ -95,22 +102,27 @@ def best_of(rows: dict[str, Rows]) -> str:
     return max(could, key=lambda who: float(np.mean([worth(row) for row in rows[who]])))
 
 
+def rows_of(found: dict[str, Any]) -> dict[str, Rows]:
+    """Return the rows of a road's file, by label: what JSON has nothing for is not a number again."""
+    return {
+        label: [{key: np.nan if value is None else value for key, value in row.items()} for row in of]
+        for label, of in found["rows"].items()
+    }
+
+
 def gains_of(folder: Path) -> dict[str, dict[str, Any]]:
     """Return of each road its part, its best expert, and each driver's gain and verdict, by label."""
     roads: dict[str, dict[str, Any]] = {}
     for file in sorted(folder.glob("[0-9]*.json")):
         found = json.loads(file.read_text())
-        rows: dict[str, Rows] = {
-            label: [{key: np.nan if value is None else value for key, value in row.items()} for row in of]
-            for label, of in found["rows"].items()
-        }
+        rows = rows_of(found)
         best = float(np.mean([worth(row) for row in rows[found["best"]]]))
         people = rows.pop(PEOPLE)
         roads[found["road"]] = {
             **{key: found[key] for key in ("part", "best")},
             "people": float(np.mean([worth(row) for row in people])),
             "gains": {label: gain(of, people, best) for label, of in rows.items()},
-            "by_seed": {label: scaled(of, people, best) for label, of in rows.items()},
+            "by_seed": {label: gain_by_seed(of, people, best) for label, of in rows.items()},
             "verdicts": {label: drivable_in_all(of, people) for label, of in rows.items()},
         }
     return roads
@@ -123,7 +135,7 @@ def table(parts: tuple[str, ...], folder: Path) -> pd.DataFrame:
     mean, worst = {"road": "mean"}, {"road": "worst"}
     for label in JUDGED:
         gains = [road["gains"][label] for road in roads.values()]
-        mean[label] = signed(mean_gain(gains, [road["by_seed"][label] for road in roads.values()]), 2)
+        mean[label] = signed(estimate(np.mean([road["by_seed"][label] for road in roads.values()], 0)), 2)
         worst[label] = f"{min(each.mean for each in gains):+.2f}"
     rows += [mean, worst]
     return pd.DataFrame(rows).fillna("")

@@ -124,7 +124,7 @@ def _trained_by(run: PlannedRun, studies: StudyFolder) -> dict[str, Any]:
     """Return what is needed to repeat a training, and what its network is known by, whoever repeats it."""
     folder = studies.folder_of(run)
     commit = json.loads((folder / "manifest.json").read_text())["commit"]
-    weights = unpack_parts(folder / "controller.unjam")[WEIGHTS]
+    weights = unpack_parts(studies.controller_of(run) / "controller.unjam")[WEIGHTS]
     return {"run": run.name, "commit": commit, "weights_sha256": hash_of(weights)}
 
 

@@ -37,6 +37,7 @@ MILLION = 1_000_000
 ROADS: dict[str, dict[str, Any]] = {
     "ring": {"scenario": "ring"},
     "ring-jammed": {"scenario": "ring-jammed"},
+    "rings": {"scenario": "ring"},
     "ring-11": {"scenario": "ring", "road.vehicles": 11},
     "ring-5": {"scenario": "ring", "road.vehicles": 5},
     "figure-eight": {"scenario": "figure-eight"},
@@ -144,6 +145,8 @@ IMAGINED = {
 """iterations as large as those of `best` on the ring, of which an eighth is actual"""
 ALONE = {"expert": "none", "virtual.virtual_ratio": 0.0}
 TO_THE_END = {"evaluation.converged": 0}
+TWO_EACH = {"evaluation.episodes": 2}
+"""of each road; a study judges on all of them, held out or seen"""
 VARIANTS: dict[str, Variant] = {
     "trpo": Variant("TRPO", "paper", ALONE),
     "ppo": Variant("PPO", "paper", {"agent": "ppo", **ALONE}),
@@ -171,6 +174,9 @@ VARIANTS: dict[str, Variant] = {
     "best": Variant("ours, all its steps", "best", {}, None),
     "best-few": Variant("ours, few steps", "best", SMALL, 756_000),
     "best-middle": Variant("ours, twice as many", "best", {"trpo.batch_steps": 24_000}, 1_512_000),
+    "rings": Variant("residual", "rings", TWO_EACH, None),
+    "rings-trpo": Variant("TRPO", "rings", {"expert": "none", **TWO_EACH}, None),
+    "rings-ppo": Variant("PPO", "rings", {"agent": "ppo", "expert": "none", **TWO_EACH}, None),
     "best-imagined": Variant("ours, few steps and whole roads imagined", "best", IMAGINED, 756_000),
 }
 """the paper's methods with the paper's settings, and what we make of them"""
@@ -251,6 +257,10 @@ class StudyFolder:
         """Return where a training is."""
         return self.folder / "runs" / run.name
 
+    def controller_of(self, run: PlannedRun) -> Path:
+        """Return where its controller is: of several roads, which one network drives, that of the first."""
+        return self.folder_of(run) / next(iter(run.config.roads()))
+
     def drives_of(self, road: str) -> Path:
         """Return where the drivers that do not learn are, on a road."""
         return self.folder / "drives" / road
@@ -258,7 +268,8 @@ class StudyFolder:
     def has(self, run: PlannedRun) -> bool:
         """Return whether a training is finished, with these settings."""
         folder = self.folder_of(run)
-        return (folder / EVALUATION_FILE).is_file() and read_config(folder) == run.config
+        judged = [folder / road / EVALUATION_FILE for road in run.config.roads()]
+        return all(file.is_file() for file in judged) and read_config(folder) == run.config
 
     def trained(self, road: str, variant: str, seeds: int) -> list[TrainedRun]:
         """Return the finished trainings of a variant on a road, one of each seed."""

@@ -173,10 +173,8 @@ class RunConfig(Agents):
         """Return the driver that the residual is added to."""
         from unjam.controller import make_driver
 
-        if self.expert == "none":
-            return Constant()
         step = self.make_scenario().decision_step
-        expert = make_driver(self.expert, step)
+        expert = Constant() if self.expert == "none" else make_driver(self.expert, step)
         return Remembering(expert, step) if self.policy.remember else expert
 
 
