@@ -51,6 +51,12 @@ def test_it_never_asks_for_more_than_is_allowed() -> None:
     assert answer(AT_ONCE, 27.9, 40.0) == pytest.approx(0.1)
 
 
+def test_where_no_map_says_where_ramps_join_it_holds_back_for_jams_alone() -> None:
+    jammed, dense = (state(20.0, ahead)._replace(to_merge=None) for ahead in (20.9, 21.1))  # of 28 m/s
+    assert AT_ONCE.act(jammed, {})[0].tolist() == pytest.approx([0.9])
+    assert AT_ONCE.act(dense, {})[0].tolist() == [FREELY]
+
+
 def test_behind_the_merge_and_without_a_message_it_holds_nobody_back() -> None:
     assert answer(JamAhead(), 20.0, 5.0, -1.0) == FREELY
     alone = like_ones(EVERYWHERE, np.ones)

@@ -4,23 +4,27 @@ import numpy as np
 import pytest
 
 from unjam.drivers.local_state import SECTIONS_AHEAD
-from unjam.drivers.roadside import Messages, Roadside
+from unjam.drivers.roadside import MainRoad, Messages, Roadside
 
 ALLOWED = 30.0
 RAMP, RIGHT, LEFT = 0, 1, 2
 
 
+ROAD = MainRoad(3, 1000.0)
+
+
 def messages(**how: float) -> Messages:
-    return Messages(Roadside(**how), 3, 1000.0, 1.0, np.random.default_rng(0))
+    return Messages(Roadside(**how), 1.0, np.random.default_rng(0))
 
 
 def measure(told: Messages, *vehicles: tuple[int, float, float]) -> None:
     ways, places, speeds = zip(*vehicles, strict=True) if vehicles else ((), (), ())
-    told.measure(np.array(ways, np.intp), np.array(places, float), np.array(speeds, float), ALLOWED)
+    arrays = np.array(ways, np.intp), np.array(places, float), np.array(speeds, float)
+    told.send(ROAD.means(*arrays, ALLOWED))
 
 
 def ahead(told: Messages, way: int, place: float) -> tuple[np.ndarray, np.ndarray]:
-    lane, road = told.ahead(np.array([way]), np.array([place]))
+    lane, road = ROAD.ahead(told.arrived, np.array([way]), np.array([place]))
     return lane[0], road[0]
 
 

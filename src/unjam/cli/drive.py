@@ -37,15 +37,16 @@ def drive(
     *,
     scenario: ScenarioArgument,
     driver: Annotated[
-        list[str],
+        list[str] | None,
         typer.Option(
             "--driver",
             "-d",
             help="Who drives the CAVs: a name, name:parameter=value, your own path.py:name, a run folder, or "
             "a .unjam file; joined by + they share the CAVs. Given several times, they are compared on "
             "the same traffic.",
+            show_default="unjam:best; on your own network CAVs then have an ACC of their own, as in assess",
         ),
-    ],
+    ] = None,
     episodes: Annotated[int, typer.Option("--episodes", "-n", min=1, help="Number of episodes.")] = 5,
     seed: SeedOption = 0,
     held_out: Annotated[
@@ -71,18 +72,25 @@ def drive(
 
       unjam drive ring --driver my_driver.py:gentle --json
 
-      unjam drive my.sumocfg --cav-share 0.1 --driver pi
+      unjam drive my.sumocfg --cav-share 0.1
 
       unjam drive ring-jammed -d human -d pi --humans drivers.json
 
       unjam drive ring -d pi -d runs/ring-001 --held-out --episodes 20
     """
+    from unjam.controller import BEST
     from unjam.measures.effect import beside_people
     from unjam.scenarios import make_scenario
+    from unjam.scenarios.own_network import WITH_OWN_ACC
     from unjam.training.evaluate import drive as run
     from unjam.training.evaluate import raise_failures
 
     changes |= assignments(settings)
+    untyped: list[str] = []
+    if not driver:
+        driver, acc = [BEST], WITH_OWN_ACC if scenario.endswith(".sumocfg") else {}
+        changes = acc | changes
+        untyped = ["-d", BEST, *(f"--set={key}={str(value).lower()}" for key, value in acc.items())]
     total = make_scenario(scenario, changes).horizon * episodes * len(driver)
     folder = new_folder(out, f"drive-{Path(scenario).stem}") if report else None
     with counting_steps(f"driving {Path(scenario).name}", total) as steps:
@@ -98,7 +106,7 @@ def drive(
             aside.print(f"note: {note}", markup=False, soft_wrap=True)
         if result.report is not None:
             aside.print(f"report: {result.report}")
-        after_drive(scenario, driver)
+        after_drive(scenario, driver, untyped)
     raise_failures(result)
 
 

@@ -18,6 +18,7 @@ from unjam.drivers.wrappers import Mixed
 from unjam.errors import wrong_name
 
 __all__ = [
+    "BEST",
     "SHIPPED",
     "SUFFIX",
     "controller_bytes",
@@ -29,6 +30,8 @@ __all__ = [
 
 SHIPPED = "unjam:"
 """what the name of a controller begins with that is part of the package"""
+BEST = "unjam:best"
+"""who drives where nobody is named: the controller for every road"""
 SHIPPED_FOLDER = Path(str(files("unjam") / "controllers"))
 
 _SEVERAL = re.compile(r"\+(?=[^\W\d]|[./~])")

@@ -133,6 +133,11 @@ class Driver:
         asked = {*EVERYWHERE, *self.told}.union(*(held.perceives for held in self.inner.values()))
         return tuple(name for name in LocalState._fields if name in asked)
 
+    @property
+    def asks(self) -> frozenset[str]:
+        """The fields of a `LocalState` that a road measures for it: what it and those it holds perceive."""
+        return frozenset(self.perceives).union(*(held.asks for held in self.inner.values()))
+
     def describe(self) -> str:
         """Return it in a few words: its name and the parameters that differ from the defaults."""
         if not self.name:

@@ -111,6 +111,11 @@ class Brought(Driver):
 
     held: Any
 
+    @property
+    def asks(self) -> frozenset[str]:
+        """All that a road tells: what the user's code looks at it alone knows."""
+        return frozenset(LocalState._fields)
+
     def ask(self, function: Callable[..., Any], *arguments: Any) -> Any:
         """Return what the user's function answers."""
         return function(*arguments)

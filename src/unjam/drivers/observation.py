@@ -54,11 +54,10 @@ class Feature:
     """answers them, about unit size, shape (n, m); a tuple of m for plain numbers; None: there are none"""
     numbers: tuple[Observed, ...] | None
     """what they are, in order; None: what the expert remembers is its own to say"""
-    needs: Literal["", "loop", "coordinate", "motorway"] = ""
-    """what the road must have: `loop` no ends, `coordinate` a position along it, `motorway` lanes, and a
-    service that tells of the road ahead"""
+    needs: Literal["", "loop", "coordinate"] = ""
+    """what the road must have: `loop` no ends, `coordinate` a position along it"""
     told: tuple[str, ...] = ()
-    """fields of a `LocalState` that it looks at and that only some roads offer"""
+    """fields of a `LocalState` that it looks at and that only some roads tell (`Scenario.tells`)"""
     plain: bool = True
     """whether it takes plain numbers and tensors; otherwise it is asked through NumPy"""
 
@@ -99,7 +98,6 @@ def _sections_ahead(field: str, where: str) -> Feature:
     return Feature(
         lambda seen: (getattr(seen.state, field) - seen.state.speed[..., None]) / SPEED_SCALE,
         tuple(Observed(each, SPEED_SCALE, "m/s") for each in words),
-        needs="motorway",
         told=(field,),
         plain=False,
     )
@@ -145,13 +143,11 @@ FEATURES: dict[str, Feature] = {
     "allowed_speed": Feature(
         lambda seen: as_column((seen.state.allowed_speed - seen.state.speed) / SPEED_SCALE),
         (Observed("wanted speed - own", SPEED_SCALE, "m/s"),),
-        needs="motorway",
         told=("allowed_speed",),
     ),
     "to_merge": Feature(
         lambda seen: as_column(clip(seen.state.to_merge / TO_MERGE_SCALE, -1.0, 2.0)),
         (Observed("way to where a ramp joins", TO_MERGE_SCALE, "m"),),
-        needs="motorway",
         told=("to_merge",),
     ),
     "lane_speeds": _sections_ahead("lane_speeds", "in its lane"),
@@ -159,7 +155,6 @@ FEATURES: dict[str, Feature] = {
     "cav_share": Feature(
         lambda seen: as_column(seen.state.cav_share),
         (Observed("share of CAVs", 1.0, ""),),
-        needs="motorway",
         told=("cav_share",),
     ),
     "beside": Feature(
@@ -168,7 +163,6 @@ FEATURES: dict[str, Feature] = {
             *(Observed(f"speed {where} - own", RELATIVE_SPEED_SCALE, "m/s") for where in BESIDE),
             *(Observed(f"gap {where}", GAP_SCALE, "m") for where in BESIDE),
         ),
-        needs="motorway",
         told=("beside_gaps", "beside_speeds"),
         plain=False,
     ),

@@ -221,7 +221,7 @@ class Cruise(Formula):
 
 @dataclass(frozen=True, config=STRICT)
 class JamAhead(Formula):
-    """Upstream of a ramp, drives no faster than its own lane does a few hundred metres ahead.
+    """Upstream of a ramp or a jam, drives no faster than its own lane does a few hundred metres ahead.
 
     So it arrives at the tail of a jam hardly faster than the jam moves, keeps room for those who merge, and
     the jam ahead gets less than it lets go. Elsewhere, and where no message says how fast the road ahead is,
@@ -249,6 +249,9 @@ class JamAhead(Formula):
     """whether the mean is that of all lanes of the main road"""
     time_constant: Positive = 3.0
     """time over which the cap is reached [s]"""
+    jam: Positive = 0.75
+    """share of what is allowed below which the road ahead is jammed, where no map says where ramps join: the
+    cap is for jams alone there"""
 
     @model_validator(mode="after")
     def _in_order(self) -> "JamAhead":
@@ -268,7 +271,8 @@ class JamAhead(Formula):
         wanted = ahead + self.margin + self.margin_by_share * share
         cap = xp.minimum(at_least(wanted, self.lowest), state.allowed_speed)
         towards = at_least((cap - state.speed) / self.time_constant, -self.slowing)
-        return xp.where(state.to_merge > 0.0, towards, free), memory
+        holds = ahead < self.jam * state.allowed_speed if state.to_merge is None else state.to_merge > 0.0
+        return xp.where(holds, towards, free), memory
 
 
 @dataclass(frozen=True, config=STRICT)

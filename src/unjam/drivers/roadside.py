@@ -27,23 +27,39 @@ class Roadside:
 
 
 class Messages:
-    """Mean speeds of all sections, as they arrive decision by decision."""
+    """What was measured all along the road, as it arrives decision by decision."""
 
-    def __init__(
-        self, roadside: Roadside, ways: int, length: float, step: float, generator: np.random.Generator
-    ) -> None:
-        """Begin without a message; `step` is the time between two decisions [s], `length` the road's [m]."""
-        self._shape = ways, int(np.ceil(length / SECTION))
+    def __init__(self, roadside: Roadside, step: float, generator: np.random.Generator) -> None:
+        """Begin without a message; `step` is the time between two decisions [s]."""
         self._kept = exp(-step / roadside.smoothing) if roadside.smoothing else 0.0
         self._late: deque[Floats] = deque(maxlen=1 + round(roadside.age / step))
         self._loss, self._generator = roadside.loss, generator
         self._smooth: Floats | None = None
-        self._arrived = np.zeros(0)
+        self.arrived: Floats = np.zeros(0)
+        """the last message that came"""
 
-    def measure(self, ways: NDArray[np.intp], places: Floats, speeds: Floats, allowed: float) -> None:
-        """Take who is where and how fast; a section where nobody is counts as `allowed` [m/s].
+    def send(self, measured: Floats) -> None:
+        """Take what is measured now, of the same shape each time."""
+        if self._smooth is not None:
+            measured = self._kept * self._smooth + (1.0 - self._kept) * measured
+        self._smooth = measured
+        self._late.append(measured)
+        if not self.arrived.size or self._loss == 0 or self._generator.random() >= self._loss:
+            self.arrived = self._late[0]
 
-        Arrays of shape (vehicles,): the way that each is on, its place along the road [m], its speed.
+
+class MainRoad:
+    """The sections of a main road and of its ramps by way, and which of them lie ahead."""
+
+    def __init__(self, ways: int, length: float) -> None:
+        """Cut a road of a length [m] into sections; way 0 is the ramp's."""
+        self._shape = ways, int(np.ceil(length / SECTION))
+
+    def means(self, ways: NDArray[np.intp], places: Floats, speeds: Floats, allowed: float) -> Floats:
+        """Return mean speeds by way and section, in the last row of all ways of the main road [m/s].
+
+        A section where nobody is counts as `allowed`, and so do those behind the end. Arrays of shape
+        (vehicles,): the way that each is on, its place along the road [m], its speed.
         """
         rows, sections = self._shape
         cell = ways * sections + (places // SECTION).astype(np.intp).clip(0, sections - 1)
@@ -52,15 +68,10 @@ class Messages:
         count, total = (each.reshape(self._shape).astype(np.float64) for each in (count, total))
         count, total = (np.vstack([each, each[1:].sum(0)]) for each in (count, total))
         mean = np.where(count > 0, total / count.clip(1), allowed)
-        if self._smooth is not None:
-            mean = self._kept * self._smooth + (1.0 - self._kept) * mean
-        self._smooth = mean
-        self._late.append(np.pad(mean, ((0, 0), (0, SECTIONS_AHEAD)), constant_values=allowed))
-        if not self._arrived.size or self._loss == 0 or self._generator.random() >= self._loss:
-            self._arrived = self._late[0]
+        return np.pad(mean, ((0, 0), (0, SECTIONS_AHEAD)), constant_values=allowed)
 
-    def ahead(self, ways: NDArray[np.intp], places: Floats) -> tuple[Floats, Floats]:
-        """Return the speeds of the sections ahead, on the own way and on the whole main road: (n, ahead)."""
+    def ahead(self, means: Floats, ways: NDArray[np.intp], places: Floats) -> tuple[Floats, Floats]:
+        """Return the means of the sections ahead, on the own way and on the whole main road: (n, ahead)."""
         first = (places // SECTION).astype(np.intp).clip(0, self._shape[1] - 1)
         columns = first[:, None] + np.arange(SECTIONS_AHEAD)
-        return self._arrived[ways[:, None], columns], self._arrived[-1][columns]
+        return means[ways[:, None], columns], means[-1][columns]

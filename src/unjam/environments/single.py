@@ -14,7 +14,7 @@ from unjam.drivers.car_following import Constant
 from unjam.drivers.command import Command, Limits
 from unjam.drivers.driver import Decision, Driver, Memory, Noise
 from unjam.drivers.local_state import LocalState
-from unjam.drivers.observation import FeatureName, Seen, observation_size, observe
+from unjam.drivers.observation import FeatureName, Seen, feature, observation_size, observe
 from unjam.errors import EpisodeError, InputError, MissingPartError, UnjamError, wrong_name
 from unjam.processes import has_display
 from unjam.scenarios import make_scenario
@@ -22,7 +22,8 @@ from unjam.worlds.drive import Drive
 from unjam.worlds.reward import Outcome, make_reward, time_headway
 from unjam.worlds.sumo import make_traffic
 from unjam.worlds.sumo.apart import simulation_for
-from unjam.worlds.sumo.simulation import Backend, Simulation
+from unjam.worlds.sumo.library import Backend
+from unjam.worlds.sumo.simulation import Simulation
 from unjam.worlds.sumo.traffic import Traffic
 
 Observations = NDArray[np.float32]
@@ -39,6 +40,11 @@ class Outside(Driver):
         self.expert, self.names, self._within = expert, tuple(names), limits
         self.actions: Any = np.zeros(0)
         """[m/s2], shape (CAVs,)"""
+
+    @property
+    def asks(self) -> frozenset[str]:
+        """What the expert and the features look at."""
+        return self.expert.asks.union(*(feature(name).told for name in self.names))
 
     def initial_memory(self, n: int) -> Memory:
         """Return the expert's."""
@@ -126,7 +132,9 @@ class SteppedRoad:
         if self._simulation is None:
             own = self._backend == "libsumo"
             self._simulation = simulation_for(self.scenario) if own else Simulation(self._backend)
-        self._traffic = traffic = make_traffic(self.scenario, numbers, self._simulation)
+        self._traffic = traffic = make_traffic(
+            self.scenario, numbers, self._simulation, asked=self._driver.asks
+        )
         self._drive = Drive(traffic, self._driver)
         self._decisions = iter(self._drive)
         self._await_cav()

@@ -55,7 +55,10 @@ class OnRamp(Scenario):
     title: ClassVar[str] = "on-ramp"
     reward: ClassVar[str] = "travel-time"
     closed: ClassVar[bool] = False
-    is_motorway: ClassVar[bool] = True
+    tells: ClassVar[tuple[str, ...]] = (
+        *("allowed_speed", "to_merge", "lane_speeds", "road_speeds"),
+        *("beside_gaps", "beside_speeds", "cav_share"),
+    )
 
     lanes: Literal[1, 2] = 2
     """of the motorway"""

@@ -1,7 +1,7 @@
 """The user's own road: any SUMO network with its traffic, some of whose vehicles become CAVs."""
 
 import logging
-from dataclasses import replace
+from dataclasses import field, replace
 from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
@@ -10,6 +10,7 @@ import numpy as np
 from pydantic import Field, model_validator
 from pydantic.dataclasses import dataclass
 
+from unjam.drivers.roadside import Roadside
 from unjam.errors import InputError, wrong
 from unjam.parameters import STRICT, Count, NotNegative, Positive, build
 from unjam.scenarios.road import OwnRoad
@@ -24,6 +25,8 @@ PASSENGER = "passenger"
 """the class of those that calibrated people drive: SUMO's default"""
 DRAWN = 100
 """calibrated people of an episode, drawn from the population"""
+WITH_OWN_ACC: dict[str, Any] = {"actuation": "cruise", "safety.active": False}
+"""CAVs have an ACC that follows and makes room for who changes lanes; drivers hold it back"""
 MOST_NAMED = 8
 """things of the files that are not used, in the line that tells of them"""
 LOG = logging.getLogger(__name__)
@@ -42,6 +45,7 @@ class OwnNetwork(Scenario):
     reward: ClassVar[str] = "released"
     closed: ClassVar[bool] = False
     has_coordinate: ClassVar[bool] = False
+    tells: ClassVar[tuple[str, ...]] = ("allowed_speed", "lane_speeds", "cav_share")
 
     file: str = ""
     """the .sumocfg file"""
@@ -55,6 +59,8 @@ class OwnNetwork(Scenario):
     """time at which SUMO begins [s]; None: as its configuration says. Who departs before is left out"""
     end: Positive | None = None
     """time at which an episode ends, where no horizon is given [s]; None: as its configuration says"""
+    roadside: Roadside = field(default_factory=Roadside)
+    """how late and how smooth CAVs are told of the speeds ahead"""
     noise: Annotated[float, Field(ge=0, le=0)] = 0.0
     """none: people drive as the vehicle types say"""
 
@@ -105,6 +111,7 @@ class OwnNetwork(Scenario):
             cars=frozenset(name for name, attributes in files.types.items() if is_car(attributes)),
             cav_seed=cav_seed,
             cavs=self.cavs,
+            roadside=self.roadside,
         )
 
     @property

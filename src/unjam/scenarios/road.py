@@ -242,3 +242,5 @@ class OwnRoad(OpenRoad):
     """calibrated people, one of whom drives each car; nobody where all drive as their types say"""
     driven_types: frozenset[str] = frozenset()
     """vehicle types that they drive"""
+    roadside: Roadside = field(default_factory=Roadside)
+    """what CAVs are told of the road ahead"""

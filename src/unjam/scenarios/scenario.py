@@ -71,7 +71,8 @@ class Scenario:
     """whether the road is a loop"""
     has_coordinate: ClassVar[bool] = True
     """whether vehicles have a position along the road"""
-    is_motorway: ClassVar[bool] = False
+    tells: ClassVar[tuple[str, ...]] = ()
+    """fields of a `LocalState` that CAVs are told here and not everywhere"""
     """whether there are lanes, and CAVs are told how fast the road ahead is and who is beside them"""
     people_gap: ClassVar[float] = 0.0
     """gap that SUMO keeps for commanded people [m]"""

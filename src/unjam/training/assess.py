@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from unjam.controller import make_driver
+from unjam.controller import BEST, make_driver
 from unjam.drivers.driver import Driver
 from unjam.errors import InputError, wrong
 from unjam.files import to_json, write_whole
@@ -18,6 +18,7 @@ from unjam.measures.effect import Judged, headline, recommended, shown_beside
 from unjam.measures.statistics import estimate_of
 from unjam.reports.assessment import ASSESSMENT_FILE, ASSESSMENT_PAGE, write_assessment
 from unjam.scenarios import make_scenario, scenario_recipe
+from unjam.scenarios.own_network import WITH_OWN_ACC
 from unjam.scenarios.scenario import Scenario
 from unjam.training.choice import (
     PEOPLE,
@@ -37,10 +38,8 @@ from unjam.training.seeds import choosing_seeds, held_out_seeds
 from unjam.worlds.episode import can_drive
 from unjam.worlds.workers import Workers
 
-DRIVERS_OF_OPEN_ROADS = ("cruise", "acc", "follower-stopper", "pi")
+DRIVERS_OF_OPEN_ROADS = (BEST, "cruise", "follower-stopper", "pi")
 """who is tried where nobody is named: drivers that fit roads with ends"""
-WITH_OWN_ACC: dict[str, Any] = {"actuation": "cruise", "safety.active": False}
-"""how CAVs are driven: their own ACC follows and makes room for who changes lanes, drivers hold it back"""
 FOR_PICTURES = 2
 """episodes of the budget that are kept for pictures"""
 NOBODY = 1e-12

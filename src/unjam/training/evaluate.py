@@ -37,6 +37,7 @@ from unjam.worlds.reward import make_reward
 from unjam.worlds.sumo.apart import simulation_for
 from unjam.worlds.workers import EpisodeTask, Workers
 
+WANTS_ACC = "holds back a car's own ACC, which none has: --set actuation=cruise --set safety.active=false"
 TRAINED = "trained"
 """label of the trained controller in tables and pictures"""
 Progress = Callable[[tuple[str, int], int], None]
@@ -236,6 +237,12 @@ def gain_of(config: RunConfig, rows: Rows) -> Estimate | None:
     return paired_difference(rows[TRAINED], rows[config.make_expert().describe()], "return")
 
 
+def _lacks_acc(driver: Driver, scenario: Scenario) -> bool:
+    """Whether a driver is told of the road ahead to hold back an ACC which CAVs have not got."""
+    told = set(scenario.tells).intersection(driver.perceives)
+    return "lane_speeds" in told and scenario.actuation != "cruise"
+
+
 def _hashes(controllers: dict[str, str]) -> dict[str, str]:
     """Return the hashes of the files that were judged, by the driver's label; others are none."""
     found = {label: hash_of_controller(text) for label, text in controllers.items()}
@@ -297,6 +304,7 @@ def drive(
     with new_and_owned(folder) if folder is not None else nullcontext(), pool:
         found = evaluate(made, drivers, seeds, pool, reward, progress)
         report, notes = None, notes_on_controllers(scenario_recipe(made), drivers, found.shown)
+        notes += [f"{name} {WANTS_ACC}" for name, one in drivers.items() if _lacks_acc(one, made)]
         ran = any(row["status"] != "failed" for rows in found.rows.values() for row in rows)
         if folder is not None and ran:
             about = {"scenario": Path(scenario).name, "reward": reward or made.reward, "manifest": manifest()}

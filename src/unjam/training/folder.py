@@ -53,11 +53,11 @@ def check_possible(config: RunConfig) -> None:
     for road in config.roads().values():
         scenario = road.make_scenario()
         for name in road.policy.observe:
-            needs = feature(name).needs
+            needs, told = feature(name).needs, feature(name).told
             if needs == "loop" and not scenario.closed:
                 raise InputError(f"policy.observe: {name!r} is not allowed on a road with ends")
-            if needs == "motorway" and not scenario.is_motorway:
-                raise InputError(f"policy.observe: {name!r} is not allowed on a road that is no motorway")
+            if not set(told) <= set(scenario.tells):
+                raise InputError(f"policy.observe: {name!r} is not allowed on {scenario.title}")
             if needs == "coordinate" and not scenario.has_coordinate:
                 raise InputError(f"policy.observe: {name!r} is not allowed on a network of one's own")
         observation_size(road.policy.observe, road.make_expert())

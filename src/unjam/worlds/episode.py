@@ -70,7 +70,7 @@ def run_episode(
     if simulation is None:
         with simulation_for(scenario) as simulation:
             return run_episode(scenario, driver, seed, reward, explore, full, simulation, progress)
-    traffic = make_traffic(scenario, seed, simulation, driver.plain_numbers, full)
+    traffic = make_traffic(scenario, seed, simulation, driver.plain_numbers, full, driver.asks)
     episode = drive(traffic, driver, explore, on_progress=progress)
     if traffic.entered == 0 and not driver.native:
         raise InputError(f"no CAV was on the road in {episode.steps} decisions: let more vehicles be CAVs")

@@ -52,7 +52,7 @@ def test_all_that_is_asked_of_a_simulation_is_answered_alike(road: Scenario, sim
         for each in (simulation, apart):
             make_traffic(road, (0,), each).start(controlled=False)  # pyright: ignore[reportArgumentType]
             names = ["0", "1"]
-            arguments = {"neighbours": ("1", 100.0), "left": (), "more_expected": ()}
+            arguments = {"neighbours": ("1", 100.0), "left": (), "more_expected": (), "lanes": ()}
             arguments |= dict.fromkeys(("type_of", "route_of"), ("1",))
             answers.append(
                 {

@@ -1,6 +1,6 @@
 """The actual environment: SUMO. The only room that knows its files and its speed modes."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Any
 
 from unjam.scenarios.road import ClosedRoad, MergingRoad, MotorwayRoad, OwnRoad, Road
@@ -27,13 +27,16 @@ def make_traffic(
     simulation: Simulation,
     plain_numbers: bool = False,
     full: bool = False,
+    asked: Collection[str] = (),
 ) -> Traffic:
     """Put the vehicles of `seed` on the road; nothing moves yet.
 
     With `plain_numbers`, a single CAV on a closed road perceives and is driven in floats instead of arrays
-    of one row. With `full`, fuel is recorded, and on roads with ends where on the plane vehicles are.
+    of one row. With `full`, fuel is recorded, and on roads with ends where on the plane vehicles are. On a
+    network of the user's own CAVs are told of the road ahead where `asked` has that field of `LocalState`.
     """
     road, seeds = scenario.of_seed(seed)
     traffic = KINDS[type(road)](scenario, road, Seed(tuple(seed), seeds), simulation, full)
+    traffic.asked = asked
     traffic.single = plain_numbers and isinstance(traffic, ClosedTraffic) and traffic.rows == 1
     return traffic

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from unjam.drivers.local_state import LARGEST_GAP, LocalState
-from unjam.drivers.roadside import Messages
+from unjam.drivers.roadside import MainRoad, Messages
 from unjam.drivers.safety import Ahead
 from unjam.scenarios.road import MotorwayRoad
 from unjam.worlds.record import Floats
@@ -30,7 +30,8 @@ class MotorwayTraffic(LaneTraffic[MotorwayRoad]):
         self._closing = {number for number, lane in enumerate(road.lanes) if lane.closing}
         self._factors = {entry.name: road.kinds[entry.kind].speed_factor for entry in road.entries}
         ways, step = int(self._ways.max()) + 1, scenario.decision_step
-        self._messages = Messages(road.roadside, ways, road.length, step, self._noise_generator)
+        self._main_road = MainRoad(ways, road.length)
+        self._messages = Messages(road.roadside, step, self._noise_generator)
         self._came: list[bool] = []
         """of all who have entered, whether they are CAVs"""
         super().start(controlled, on_progress)
@@ -73,7 +74,8 @@ class MotorwayTraffic(LaneTraffic[MotorwayRoad]):
         return self._place[leaders] - self.road.vehicle_length - self._place[rows]
 
     def _note_moment(self) -> None:
-        self._messages.measure(self._way, self._place, self._speed, self.road.limit_speed)
+        means = self._main_road.means(self._way, self._place, self._speed, self.road.limit_speed)
+        self._messages.send(means)
 
     def _pictured_now(self, names: Sequence[str]) -> dict[str, Any]:
         ahead = self._leader
@@ -88,7 +90,7 @@ class MotorwayTraffic(LaneTraffic[MotorwayRoad]):
         ahead, behind = self._gap(rows, leader), self._gap(follower, rows)
         near, close = (leader >= 0) & (ahead < LARGEST_GAP), (follower >= 0) & (behind < LARGEST_GAP)
         factors = np.array([self._factors[name] for name in names])
-        lane_speeds, road_speeds = self._messages.ahead(way, place)
+        lane_speeds, road_speeds = self._main_road.ahead(self._messages.arrived, way, place)
         beside_gaps, beside_speeds = self._beside(rows)
         return LocalState(
             speed=speed,

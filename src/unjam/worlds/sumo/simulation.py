@@ -1,31 +1,27 @@
-"""SUMO: start, read, command, step. The only module that imports libsumo or traci."""
+"""SUMO: start, read, command, step."""
 
-import importlib
 import io
 import weakref
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import redirect_stdout, suppress
+from contextlib import redirect_stdout
 from functools import partial
 from itertools import count, dropwhile, starmap
 from pathlib import Path
-from types import ModuleType
-from typing import Any, Literal, NamedTuple, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from unjam.errors import EpisodeError, MissingPartError, UnjamError
+from unjam.errors import EpisodeError, UnjamError
 from unjam.processes import PrivateFolder
 from unjam.sandbox import keep_disk
 from unjam.scenarios.scenario import Actuation
 from unjam.sumo_files import copy_harmless, stamp_of
 from unjam.worlds.sumo.files import Files
+from unjam.worlds.sumo.library import Backend, close, function_of, library
 from unjam.worlds.sumo.networks import sumo_program, sumo_words
-
-Backend = Literal["libsumo", "traci", "gui"]
-"""`libsumo`: in this process; `traci`: SUMO as a child process; `gui`: the same, with its window."""
 
 SPEED_MODES = {"shielded": 31, "raw": 30, "flow": 25, "cruise": 31}
 """SUMO's speed mode bits for each way of actuation: bit 0 is the check for a safe speed."""
@@ -51,6 +47,19 @@ class Neighbours(NamedTuple):
     follower_gap: float
 
 
+class NetworkLane(NamedTuple):
+    """A lane of a network that is no junction's."""
+
+    name: str
+    edge: str
+    length: float
+    """[m]"""
+    speed: float
+    """what it allows [m/s]"""
+    leads_to: tuple[str, ...]
+    """lanes of the next edges"""
+
+
 class Simulation:
     """One SUMO simulation, loaded anew for each episode.
 
@@ -69,7 +78,7 @@ class Simulation:
             _open = self
         self.backend = backend
         self._gui_options = gui_options
-        self._sumo: Any = _import(backend)
+        self._sumo: Any = library(backend)
         self._folder = PrivateFolder()
         self._error_log = Path(self._folder.name) / "error.log"
         self._copies: dict[Path, tuple[tuple[int, int] | None, Path]] = {}
@@ -80,10 +89,11 @@ class Simulation:
 
     def _bind(self) -> None:
         """Look up the functions that are called often."""
-        call = partial(_function, self._sumo)
+        call = partial(function_of, self._sumo)
         self._get_speed = call("vehicle", "getSpeed")
         self._get_distance = call("vehicle", "getDistance")
         self._get_along = call("vehicle", "getLanePosition")
+        self._get_lane = call("vehicle", "getLaneID")
         self._get_fuel = call("vehicle", "getFuelConsumption")
         self._set_speed = call("vehicle", "setSpeed")
         self.type_of: Callable[[str], str] = call("vehicle", "getTypeID")
@@ -159,7 +169,7 @@ class Simulation:
             self._sumo.start(command)
             return
         label = f"unjam-{next(_labels)}"
-        traci = _import("traci")
+        traci = library("traci")
 
         def start() -> None:
             keep_disk(Path(self._folder.name), Path("/dev"))  # screens and sockets it needs
@@ -170,7 +180,7 @@ class Simulation:
             confined.submit(start).result()  # traci announces each of its attempts to connect
         self._sumo = traci.getConnection(label)
         # One that nobody closes would complain aloud of the lost connection as this process ends.
-        weakref.finalize(self, _close, self._sumo)
+        weakref.finalize(self, close, self._sumo)
         self._bind()
 
     def _options(self, step: float, seed: int) -> list[str]:
@@ -219,10 +229,26 @@ class Simulation:
         """Return the edges of a vehicle's route."""
         return tuple(self._sumo.vehicle.getRoute(name))
 
-    def edge_places(self, ids: Sequence[str]) -> list[tuple[str, int, float]]:
-        """Return on which edge each of `ids` is, in which lane from the right, and where along it [m]."""
-        here = self._sumo.vehicle
-        return [(here.getRoadID(name), here.getLaneIndex(name), here.getLanePosition(name)) for name in ids]
+    def lanes(self) -> list[NetworkLane]:
+        """Return all lanes of the network but those of junctions."""
+        lane = self._sumo.lane
+        names = [name for name in lane.getIDList() if not name.startswith(":")]
+        links = [tuple(link[0] for link in lane.getLinks(name)) for name in names]
+        facts = map(lane.getEdgeID, names), map(lane.getLength, names), map(lane.getMaxSpeed, names)
+        return list(map(NetworkLane, names, *facts, links))
+
+    def lane_places(self, ids: Sequence[str]) -> list[tuple[str, float]]:
+        """Return in which lane each of `ids` is, and how far along it [m]."""
+        return list(zip(map(self._get_lane, ids), map(self._get_along, ids), strict=True))
+
+    def ways(self, ids: Sequence[str]) -> list[tuple[str, ...]]:
+        """Return the edges that each of `ids` has before it, its own first."""
+        vehicle = self._sumo.vehicle
+        return [tuple(vehicle.getRoute(name)[vehicle.getRouteIndex(name) :]) for name in ids]
+
+    def wishes(self, ids: Sequence[str]) -> list[tuple[float, float]]:
+        """Return how fast each of `ids` wants to drive over what a road allows, and at most [m/s]."""
+        return list(zip(map(self._sumo.vehicle.getSpeedFactor, ids), map(self.fastest, ids), strict=True))
 
     def allowed_speeds(self, ids: Sequence[str]) -> list[float]:
         """Return how fast each of `ids` may drive where it is [m/s]."""
@@ -291,7 +317,7 @@ class Simulation:
     def _end(self) -> None:
         """End SUMO; one that is gone already is no error."""
         self._running = False
-        _close(self._sumo)
+        close(self._sumo)
 
     def __enter__(self) -> Self:
         return self
@@ -300,31 +326,6 @@ class Simulation:
         self.close()
 
 
-def _close(sumo: Any) -> None:
-    with suppress(Exception):
-        sumo.close()
-
-
 def is_open() -> bool:
     """Return whether libsumo runs a simulation in this process."""
     return _open is not None
-
-
-def _function(sumo: Any, domain: str, name: str) -> Callable[..., Any]:
-    """Return a function of libsumo or traci; of libsumo the compiled one, without its Python wrapper.
-
-    The wrapper only passes its arguments on, and is a third of the cost of a call.
-    """
-    compiled = getattr(getattr(sumo, "libsumo", None), "_libsumo", None)
-    wrapped = sumo.simulationStep if name == "step" else getattr(getattr(sumo, domain), name)
-    return getattr(compiled, f"{domain}_{name}", wrapped)
-
-
-def _import(backend: Backend) -> ModuleType:
-    name = "libsumo" if backend == "libsumo" else "traci"
-    try:
-        return importlib.import_module(name)
-    except ImportError as error:
-        raise MissingPartError(
-            f"{name} cannot be imported ({error}); install it: pip install {name}==1.28.0"
-        ) from None

@@ -1,6 +1,6 @@
 """The actual environment, step by step: what its roads have in common."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
@@ -56,6 +56,8 @@ class Traffic(World[Episode], Generic[RoadKind]):
     """The world of a road in SUMO: what roads with and without ends have in common."""
 
     single = False
+    asked: Collection[str] = ()
+    """fields of a `LocalState` that the driver looks at: what only costs time otherwise is not measured"""
     cavs: Sequence[str]
     """the CAVs on the road now, in order of entry: the rows of what drivers are given and answer"""
     speeds: Sequence[float] | Floats
