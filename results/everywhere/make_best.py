@@ -7,7 +7,7 @@ from unjam.drivers.by_road import ByRoad
 
 HELD = {
     "motorway": ("jam-ahead", 1.0),
-    "crossing": ("unjam:figure-eight-tuned", 0.1),
+    "crossing": ("unjam:figure-eight-best", 0.1),
     "loop": ("unjam:rings-tuned", 0.1),
     "elsewhere": ("idm", 0.1),
 }
