@@ -79,7 +79,10 @@ def _on_ring(name: str, trained: dict[str, str]) -> dict[str, Any]:
 
 
 def _gains(folder: Path, parts: tuple[str, ...], labels: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """Return of each ring its best expert, and by label the gains, shape (drivers of that label, seeds)."""
+    """Return of each ring its best expert, and by label the gains, shape (drivers of that label, seeds).
+
+    Besides the mean speed of the whole episode, start and waves included, in the same shape [m/s].
+    """
     found: dict[str, dict[str, Any]] = {}
     for file in sorted(folder.glob("[0-9]*.json")):
         of = json.loads(file.read_text())
@@ -91,6 +94,10 @@ def _gains(folder: Path, parts: tuple[str, ...], labels: Sequence[str]) -> dict[
                 "best": of["best"],
                 "gains": {
                     label: np.array([gain_by_seed(rows[who], rows[PEOPLE], best) for who in group])
+                    for label, group in groups.items()
+                },
+                "speed": {
+                    label: np.array([[row["mean_speed"] for row in rows[who]] for who in group])
                     for label, group in groups.items()
                 },
                 "undrivable": {label: _undrivable(rows, group) for label, group in groups.items()},
@@ -114,24 +121,32 @@ def table(labels: Sequence[str], parts: tuple[str, ...], folder: Path) -> pd.Dat
     """
     everybody = (*BESIDE, *labels)
     found = _gains(folder, parts, everybody)
-    gains = {road: of["gains"] for road, of in found.items()}
+    gains, speeds = ({road: of[name] for road, of in found.items()} for name in ("gains", "speed"))
     rows = [
-        {"road": road, "best expert there": found[road]["best"].removeprefix("unjam:"), **_cells(of, labels)}
+        {
+            "road": road,
+            "best expert there": found[road]["best"].removeprefix("unjam:"),
+            **_cells(of, speeds[road], labels),
+        }
         for road, of in gains.items()
     ]
     mean: dict[str, Floats] = {}
+    speed: dict[str, Floats] = {}
     worst, undrivable = {"road": "worst"}, {"road": "not drivable"}
     for label in everybody:
-        mean[label] = np.mean([of[label] for of in gains.values()], axis=0)
+        mean[label], speed[label] = (
+            np.mean([of[label] for of in each.values()], axis=0) for each in (gains, speeds)
+        )
         worst[label] = f"{min(float(of[label].mean()) for of in gains.values()):+.2f}"
         count = sum(of["undrivable"][label] for of in found.values())
         undrivable[label] = f"{count} of {len(mean[label]) * len(found)}"
-    rows += [{"road": "mean", **_cells(mean, labels)}, worst, undrivable]
+    rows += [{"road": "mean", **_cells(mean, speed, labels)}, worst, undrivable]
     return pd.DataFrame(rows).fillna("")
 
 
-def _cells(gains: dict[str, Floats], labels: Sequence[str]) -> dict[str, str]:
+def _cells(gains: dict[str, Floats], speeds: dict[str, Floats], labels: Sequence[str]) -> dict[str, str]:
     beyond = {f"{label}, {BEYOND}": gains[label] - gains[RINGS_TUNED] for label in labels}
+    beyond |= {f"{label}, mean speed {BEYOND} [m/s]": speeds[label] - speeds[RINGS_TUNED] for label in labels}
     return {label: signed(_estimate(values), 2) for label, values in {**gains, **beyond}.items()}
 
 

@@ -1,0 +1,70 @@
+"""Does the study of a residual for all rings say what its files hold?"""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from unjam.studies.rings import BESIDE, BEYOND, RINGS, _on_ring, table
+from unjam.studies.study import PlannedRun, StudyFolder
+from unjam.training.family import FAMILY
+from unjam.training.presets import RINGS_TUNED
+
+EVERYWHERE = Path(__file__).parents[2] / "results/everywhere"
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """Three rings with three trainings each, which drive as known drivers do."""
+    for number, name in enumerate(("ring-22-grown", "ring-44-grown", "ring-22-dense")):
+        at = list(FAMILY).index(name)
+        found = json.loads((EVERYWHERE / f"{at:02d}.json").read_text())
+        rows = found["rows"]
+        careful, slow = rows["unjam:best"], rows["jam-ahead"]
+        found["rows"] |= dict.fromkeys(BESIDE, careful) | {found["best"]: careful}
+        found["rows"] |= {"residual 0": careful, "residual 1": careful, "residual 2": slow}
+        (tmp_path / f"{number:02d}.json").write_text(json.dumps(found))
+    return tmp_path
+
+
+def test_a_row_is_the_mean_of_the_trainings_and_of_what_they_are_beyond_the_expert(folder: Path) -> None:
+    shown = table(["residual"], ("seen",), folder).set_index("road")
+    assert list(shown.index) == ["ring-22-grown", "ring-44-grown", "mean", "worst", "not drivable"]
+    assert shown.loc["ring-22-grown", RINGS_TUNED].startswith("+1.00")
+    # Two of three are the expert, and one gains next to nothing: 0.08 and 0.05 of what it gains.
+    assert shown.loc["ring-22-grown", "residual"].startswith("+0.69")
+    assert shown.loc["mean", f"residual, {BEYOND}"].startswith("-0.31")
+    faster = shown.loc["ring-22-grown", f"residual, mean speed {BEYOND} [m/s]"]
+    assert faster.startswith("-0."), "the whole episode, beside a driver that dissolves the wave"
+    assert shown.loc["worst", "residual"] == "+0.68"
+    assert shown.loc["not drivable", "residual"] == "0 of 6"
+
+
+def test_roads_of_another_part_have_a_table_of_their_own(folder: Path) -> None:
+    rows = list(table(["residual"], ("axis",), folder)["road"])
+    assert rows == ["ring-22-dense", "mean", "worst", "not drivable"]
+
+
+def test_a_training_on_several_roads_is_finished_when_all_are_judged(tmp_path: Path) -> None:
+    studies, run = StudyFolder(tmp_path), PlannedRun("rings", "rings", 0)
+    assert studies.controller_of(run) == studies.folder_of(run) / "ring-22-standing"
+    assert set(run.config.roads()) == {name for name in RINGS if FAMILY[name].part == "seen"}
+    assert not studies.has(run)
+
+
+def test_a_ring_is_driven_by_all_on_the_same_seeds(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[tuple[set[str], list[tuple[int, ...]]]] = []
+
+    def driven(scenario: object, drivers: dict[str, str], seeds: list[tuple[int, ...]], run: object) -> Any:
+        asked.append((set(drivers.values()), seeds))
+        return {label: [] for label in drivers}
+
+    monkeypatch.setattr("unjam.studies.rings.driven", driven)
+    monkeypatch.setattr("unjam.studies.rings.best_of", lambda rows: "pi")
+    found = _on_ring("ring-22-grown", {"residual 0": "runs/0"})
+    (chose, tuning), (judged, judging) = asked
+    assert {"human", "pi", RINGS_TUNED} <= judged
+    assert "runs/0" in judged - chose
+    assert not set(tuning) & set(judging)
+    assert (found["best"], found["part"]) == ("pi", "seen")
