@@ -137,7 +137,8 @@ class OwnTraffic(LaneTraffic[OwnRoad]):
         rows: list[tuple[float, ...]] = []
         for name, along in self._simulation.lane_places(names):
             edge, _, number = name.rpartition("_")
-            rows.append((self._edges.setdefault(edge, len(self._edges)), float(number), along))
+            number = float(number or -1)  # nowhere, where SUMO has lifted a vehicle off the road
+            rows.append((self._edges.setdefault(edge, len(self._edges)), number, along))
         edge, lane, along = np.array(rows, np.float64).reshape(-1, 3).T
         return {"edge": edge, "lane": lane, "along": along, "gaps": unknown}
 
