@@ -44,7 +44,7 @@ def drive(
             help="Who drives the CAVs: a name, name:parameter=value, your own path.py:name, a run folder, or "
             "a .unjam file; joined by + they share the CAVs. Given several times, they are compared on "
             "the same traffic.",
-            show_default="unjam:best; on your own network CAVs then have an ACC of their own, as in assess",
+            show_default="human and unjam:best; on your own network CAVs then have ACCs, as in assess",
         ),
     ] = None,
     episodes: Annotated[int, typer.Option("--episodes", "-n", min=1, help="Number of episodes.")] = 5,
@@ -86,11 +86,9 @@ def drive(
     from unjam.training.evaluate import raise_failures
 
     changes |= assignments(settings)
-    untyped: list[str] = []
     if not driver:
-        driver, acc = [BEST], WITH_OWN_ACC if scenario.endswith(".sumocfg") else {}
-        changes = acc | changes
-        untyped = ["-d", BEST, *(f"--set={key}={str(value).lower()}" for key, value in acc.items())]
+        driver = ["human", BEST]
+        changes = (WITH_OWN_ACC if scenario.endswith(".sumocfg") else {}) | changes
     total = make_scenario(scenario, changes).horizon * episodes * len(driver)
     folder = new_folder(out, f"drive-{Path(scenario).stem}") if report else None
     with counting_steps(f"driving {Path(scenario).name}", total) as steps:
@@ -106,7 +104,7 @@ def drive(
             aside.print(f"note: {note}", markup=False, soft_wrap=True)
         if result.report is not None:
             aside.print(f"report: {result.report}")
-        after_drive(scenario, driver, untyped)
+        after_drive(scenario, driver)
     raise_failures(result)
 
 

@@ -153,16 +153,13 @@ def say_next(why: str, *words: object) -> None:
     aside.print(f"{why}: {shlex.join(['unjam', *map(str, words)])}", soft_wrap=True, markup=False)
 
 
-def after_drive(scenario: str, drivers: Sequence[str], untyped: Sequence[str] = ()) -> None:
-    """Compare with people first, then learn on an expert, then look at what was learned.
-
-    `untyped` is what the command would have said, had it named the driver that drives where none is named.
-    """
+def after_drive(scenario: str, drivers: Sequence[str]) -> None:
+    """Compare with people first, then learn on an expert, then look at what was learned."""
     from unjam.drivers.registry import DRIVERS
 
     experts = [driver for driver in drivers if driver.partition(":")[0] in DRIVERS and driver != "human"]
     if "human" not in drivers:
-        say_next("compare with people", *_command_without_out(), "-d", "human", *untyped)
+        say_next("compare with people", *_command_without_out(), "-d", "human")
     elif experts and len(experts) == len(drivers) - 1:
         say_next("learn on an expert", "train", scenario, "--expert", experts[-1], "--preset", "demo")
     elif drivers != ["human"]:
