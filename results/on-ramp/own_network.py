@@ -6,7 +6,9 @@ Writes own-network.json. Each seed that judges gives its vehicles once; of them 
 import shutil
 import sys
 import tempfile
+from itertools import product
 from pathlib import Path
+from typing import Any
 
 from unjam.controller import make_driver
 from unjam.files import to_json, write_whole
@@ -22,11 +24,6 @@ from unjam.worlds.sumo.simulation import Simulation
 SEEDS = 10
 SHARES = (0.05, 0.1, 0.2)
 DRIVERS = ("unjam:best", "cruise")
-KEPT = (
-    *("seed", "status", "floor", "lanes", "travel_time", "throughput_veh_per_h", "mean_speed", "min_headway"),
-    *("collisions", "cav_min_ttc", "cav_max_braking", "cut_in_max_braking", "share_short_headway"),
-    *("overridden", "people_beyond_4_5", "people_max_braking"),
-)
 
 
 def network(seed: tuple[int, ...], folder: Path) -> Path:
@@ -46,22 +43,20 @@ def network(seed: tuple[int, ...], folder: Path) -> Path:
 
 def main() -> None:
     """Drive people alone, and each driver at each share, on the same vehicles."""
-    found: dict[str, list[dict[str, object]]] = {}
+    rows: list[dict[str, Any]] = []
     with tempfile.TemporaryDirectory() as place, Simulation() as simulation:
         for seed in held_out_seeds(SEEDS):
             file = network(seed, Path(place))
-            asked = [(1e-9, "human"), *((share, name) for share in SHARES for name in DRIVERS)]
-            for share, name in asked:
+            for share, name in [(1e-9, "human"), *product(SHARES, DRIVERS)]:
                 changes = {"cav_share": share, "steps_per_decision": 2, **WITH_OWN_ACC}
                 road = make_scenario(str(file), changes)
-                row = measure(
-                    run_episode(road, make_driver(name, road.decision_step), seed, simulation=simulation)
-                )
+                driver = make_driver(name, road.decision_step)
+                row = measure(run_episode(road, driver, seed, full=True, simulation=simulation))
                 label = name if name == "human" else f"{name}, {100 * share:g} %"
-                found.setdefault(label, []).append({key: row[key] for key in KEPT if key in row})
+                rows.append({"driver": label, **row})
                 print(seed, label, round(row["travel_time"], 1), flush=True)
     target = Path(sys.argv[1] if len(sys.argv) > 1 else Path(__file__).with_name("own-network.json"))
-    write_whole(target, to_json({"rows": found, "manifest": manifest()}, indent=1))
+    write_whole(target, to_json({"rows": rows, "manifest": manifest()}, indent=1))
 
 
 if __name__ == "__main__":
