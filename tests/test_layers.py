@@ -151,7 +151,7 @@ def test_what_measures_draws_nothing() -> None:
 
 
 def test_sumo_is_imported_in_one_place() -> None:
-    assert importers({"libsumo", "traci", "sumolib"}) == {"worlds/sumo/simulation.py"}
+    assert importers({"libsumo", "traci", "sumolib"}) == {"worlds/sumo/library.py"}
 
 
 def test_learning_libraries_are_imported_only_where_we_learn() -> None:

@@ -20,7 +20,7 @@ SMALL = ["--length", "60", "--vehicles", "5", "--set", "horizon=60"]
 WRONG: dict[str, tuple[str, list[str]]] = {
     "unknown verb": ("fly", ["fly"]),
     "unknown option": ("--fast", ["drive ring --driver pi --fast"]),
-    "no driver": ("--driver", ["drive ring"]),
+    "no driver": ("--driver", ["watch ring"]),
     "nothing to vary": ("at least one key", ["search ring"]),
     "what is no range": ("low < high", ["search ring --vary trpo.gamma=1..0"]),
     "unknown executor": ("local, ray", ["search ring --vary trpo.gamma=0.9..0.95 --executor cloud"]),

@@ -48,14 +48,12 @@ class Neighbours(NamedTuple):
 
 
 class NetworkLane(NamedTuple):
-    """A lane of a network that is no junction's."""
+    """A lane of a network that is no junction's: its edge, its length [m], what it allows [m/s]."""
 
     name: str
     edge: str
     length: float
-    """[m]"""
     speed: float
-    """what it allows [m/s]"""
     leads_to: tuple[str, ...]
     """lanes of the next edges"""
 
