@@ -102,20 +102,18 @@ def best_of(rows: dict[str, Rows]) -> str:
     return max(could, key=lambda who: float(np.mean([worth(row) for row in rows[who]])))
 
 
-def rows_of(found: dict[str, Any]) -> dict[str, Rows]:
-    """Return the rows of a road's file, by label: what JSON has nothing for is not a number again."""
-    return {
-        label: [{key: np.nan if value is None else value for key, value in row.items()} for row in of]
-        for label, of in found["rows"].items()
-    }
-
-
 def gains_of(folder: Path) -> dict[str, dict[str, Any]]:
-    """Return of each road its part, its best expert, and each driver's gain and verdict, by label."""
+    """Return of each road its part, its best expert, and each driver's gain, speeds and verdict, by label.
+
+    Speeds are means of the whole episode, start and waves included, seed by seed [m/s].
+    """
     roads: dict[str, dict[str, Any]] = {}
     for file in sorted(folder.glob("[0-9]*.json")):
         found = json.loads(file.read_text())
-        rows = rows_of(found)
+        rows: dict[str, Rows] = {
+            label: [{key: np.nan if value is None else value for key, value in row.items()} for row in of]
+            for label, of in found["rows"].items()
+        }
         best = float(np.mean([worth(row) for row in rows[found["best"]]]))
         people = rows.pop(PEOPLE)
         roads[found["road"]] = {
@@ -123,6 +121,7 @@ def gains_of(folder: Path) -> dict[str, dict[str, Any]]:
             "people": float(np.mean([worth(row) for row in people])),
             "gains": {label: gain(of, people, best) for label, of in rows.items()},
             "by_seed": {label: gain_by_seed(of, people, best) for label, of in rows.items()},
+            "speeds": {label: np.array([row["mean_speed"] for row in of]) for label, of in rows.items()},
             "verdicts": {label: drivable_in_all(of, people) for label, of in rows.items()},
         }
     return roads
