@@ -4,13 +4,12 @@ import hashlib
 from collections import Counter
 from collections.abc import Sequence
 from itertools import accumulate
-from math import inf
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from unjam.drivers.local_state import LARGEST_GAP, SECTIONS_AHEAD, LocalState
+from unjam.drivers.local_state import LARGEST_GAP, LocalState
 from unjam.drivers.roadside import Messages
 from unjam.drivers.safety import Ahead
 from unjam.scenarios.road import OwnRoad
@@ -18,7 +17,7 @@ from unjam.worlds.record import Floats
 from unjam.worlds.sumo.files import CALIBRATED_TYPES, CAV_TYPES
 from unjam.worlds.sumo.lanes import Followed, LaneTraffic
 from unjam.worlds.sumo.networks import edge_lengths, lane_counts, network_lines
-from unjam.worlds.sumo.sections import NOWHERE, LaneSections
+from unjam.worlds.sumo.sections import RoadAhead
 from unjam.worlds.sumo.simulation import Neighbours
 from unjam.worlds.world import OnProgress
 
@@ -38,15 +37,11 @@ class OwnTraffic(LaneTraffic[OwnRoad]):
         """sum of the speeds that were allowed to vehicles [m/s], and of how many"""
         self._came, self._picked = 0, 0
         """vehicles that have entered, and CAVs among them"""
-        self._sections, self._messages = None, None
+        self._service = None
         if "lane_speeds" in self.asked:
-            self._sections = LaneSections(self._simulation)
             step = self.scenario.decision_step
-            self._messages = Messages(self.road.roadside, step, self._noise_generator)
-        self._last_sections: dict[str, list[int]] = {}
-        """of each CAV the sections ahead when it was last outside a junction"""
-        self._wishes: dict[str, tuple[float, float]] = {}
-        """of each CAV how fast it wants to drive over what is allowed, and at most [m/s]"""
+            messages = Messages(self.road.roadside, step, self._noise_generator)
+            self._service = RoadAhead(self._simulation, messages)
         self._fuel_every = max(1, int(FUEL_SECONDS / self.scenario.decision_step))
         super().start(controlled, on_progress)
 
@@ -85,6 +80,7 @@ class OwnTraffic(LaneTraffic[OwnRoad]):
     def _follow(self) -> None:
         """Keep up with who is on the road, and let calibrated people drive the cars that have entered."""
         self._near: dict[str, Neighbours] = {}
+        self._places: dict[str, tuple[str, float]] = {}
         super()._follow()
         road, simulation = self.road, self._simulation
         for name in simulation.departed() if road.drivers else ():
@@ -135,7 +131,7 @@ class OwnTraffic(LaneTraffic[OwnRoad]):
         allowed = self._simulation.allowed_speeds(free)
         self._allowed, self._counted = self._allowed + sum(allowed), self._counted + len(allowed)
         rows: list[tuple[float, ...]] = []
-        for name, along in self._simulation.lane_places(names):
+        for name, along in self._places_of(names):
             edge, _, number = name.rpartition("_")
             number = float(number or -1)  # nowhere, where SUMO has lifted a vehicle off the road
             rows.append((self._edges.setdefault(edge, len(self._edges)), number, along))
@@ -148,34 +144,21 @@ class OwnTraffic(LaneTraffic[OwnRoad]):
         unknown = np.full(len(names), np.nan)
         speed = np.array(self._simulation.speeds(names), np.float64)
         near = LocalState(speed, leader_speed, leader_gap, follower_speed, follower_gap, unknown, unknown)
-        return near if self._messages is None else near._replace(**self._told_ahead(names))
+        if self._service is None:
+            return near
+        share = np.full(len(names), self._picked / max(self._came, 1))
+        return near._replace(**self._service.told(names, self._places_of(names)), cav_share=share)
 
     def _note_moment(self) -> None:
-        if self._sections is not None and self._messages is not None:
+        if self._service is not None:
             names, speeds = self._everybody()
-            places = self._simulation.lane_places(names)
-            self._messages.send(self._sections.means(places, speeds))
+            self._service.measure(self._places_of(names), speeds)
 
-    def _told_ahead(self, names: Sequence[str]) -> dict[str, Any]:
-        """Return what a service tells CAVs of the road ahead: in a junction, that of the lane before it."""
-        assert self._sections is not None
-        assert self._messages is not None
-        simulation, sections, last = self._simulation, self._sections, self._last_sections
-        beyond = [NOWHERE] * SECTIONS_AHEAD
-        for name, place, way in zip(
-            names, simulation.lane_places(names), simulation.ways(names), strict=True
-        ):
-            if place[0] in sections:
-                last[name] = sections.ahead(*place, way)
-        ahead = np.array([last.get(name, beyond) for name in names], np.intp).reshape(-1, SECTIONS_AHEAD)
-        new = [name for name in names if name not in self._wishes]
-        self._wishes |= zip(new, simulation.wishes(new), strict=True)  # before anybody is held back
-        factors, fastest = np.array([self._wishes[name] for name in names]).reshape(-1, 2).T
-        legal = np.where(ahead[:, 0] == NOWHERE, inf, sections.allowed[ahead[:, 0]])
-        allowed = np.minimum(legal * factors, fastest)
-        told = np.where(ahead == NOWHERE, allowed[:, None], self._messages.arrived[ahead])
-        share = np.full(len(names), self._picked / max(self._came, 1))
-        return {"allowed_speed": allowed, "lane_speeds": told, "cav_share": share}
+    def _places_of(self, names: Sequence[str]) -> list[tuple[str, float]]:
+        """Return in which lane vehicles are, and how far along it [m]; SUMO is asked once in a step."""
+        new = [name for name in names if name not in self._places]
+        self._places |= zip(new, self._simulation.lane_places(new) if new else (), strict=True)
+        return [self._places[name] for name in names]
 
     def _lines(self) -> Floats:
         return network_lines(self.road.files.network)

@@ -1,4 +1,4 @@
-"""The lanes of a user's network in sections, and which of them lie ahead of a vehicle on its route."""
+"""The lanes of a user's network in sections, and what a service tells CAVs of those ahead on their routes."""
 
 from collections.abc import Sequence
 from itertools import accumulate, pairwise
@@ -7,6 +7,7 @@ from math import ceil, inf
 import numpy as np
 
 from unjam.drivers.local_state import SECTION, SECTIONS_AHEAD
+from unjam.drivers.roadside import Messages
 from unjam.physics.arrays import Floats
 from unjam.worlds.sumo.simulation import Simulation
 
@@ -73,3 +74,37 @@ class LaneSections:
                 return following
         beside = (f"{edge}_{number}" for number in range(int(lane.rpartition("_")[2]), -1, -1))
         return next((name for name in beside if name in lanes), "")
+
+
+class RoadAhead:
+    """What CAVs are told of the road ahead; in a junction, of that before which they last were in a lane."""
+
+    def __init__(self, simulation: Simulation, messages: Messages) -> None:
+        """Begin where nothing was measured yet."""
+        self._simulation, self._messages, self._sections = simulation, messages, LaneSections(simulation)
+        self._last: dict[str, list[int]] = {}
+        """of each CAV the sections ahead when it was last in a lane"""
+        self._wishes: dict[str, tuple[float, float]] = {}
+        """of each CAV how fast it wants to drive over what is allowed, and at most [m/s]"""
+
+    def measure(self, places: Sequence[tuple[str, float]], speeds: Floats) -> None:
+        """Take where everybody is, in which lane and how far along it [m], and how fast."""
+        self._messages.send(self._sections.means(places, speeds))
+
+    def told(self, names: Sequence[str], places: Sequence[tuple[str, float]]) -> dict[str, Floats]:
+        """Return what these CAVs are told, by field of a `LocalState`."""
+        sections, wishes = self._sections, self._wishes
+        for name, place, way in zip(names, places, self._simulation.ways(names), strict=True):
+            if place[0] in sections:
+                self._last[name] = sections.ahead(*place, way)
+        beyond = [NOWHERE] * SECTIONS_AHEAD
+        ahead = np.array([self._last.get(name, beyond) for name in names], np.intp).reshape(
+            -1, SECTIONS_AHEAD
+        )
+        new = [name for name in names if name not in wishes]
+        wishes |= zip(new, self._simulation.wishes(new), strict=True)  # before anybody is held back
+        factors, fastest = np.array([wishes[name] for name in names]).reshape(-1, 2).T
+        legal = np.where(ahead[:, 0] == NOWHERE, inf, sections.allowed[ahead[:, 0]])
+        allowed = np.minimum(legal * factors, fastest)
+        speeds = np.where(ahead == NOWHERE, allowed[:, None], self._messages.arrived[ahead])
+        return {"allowed_speed": allowed, "lane_speeds": speeds}
