@@ -73,7 +73,6 @@ class Scenario:
     """whether vehicles have a position along the road"""
     tells: ClassVar[tuple[str, ...]] = ()
     """fields of a `LocalState` that CAVs are told here and not everywhere"""
-    """whether there are lanes, and CAVs are told how fast the road ahead is and who is beside them"""
     people_gap: ClassVar[float] = 0.0
     """gap that SUMO keeps for commanded people [m]"""
 

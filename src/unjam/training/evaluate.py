@@ -239,8 +239,8 @@ def gain_of(config: RunConfig, rows: Rows) -> Estimate | None:
 
 def _lacks_acc(driver: Driver, scenario: Scenario) -> bool:
     """Whether a driver is told of the road ahead to hold back an ACC which CAVs have not got."""
-    told = set(scenario.tells).intersection(driver.perceives)
-    return "lane_speeds" in told and scenario.actuation != "cruise"
+    told = "lane_speeds" in driver.perceives and "lane_speeds" in scenario.tells
+    return told and scenario.actuation != "cruise"
 
 
 def _hashes(controllers: dict[str, str]) -> dict[str, str]:
