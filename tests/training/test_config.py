@@ -99,7 +99,7 @@ def test_merging_changes_neither_side() -> None:
         ({"road.length": [250, 230]}, "scenario ring.length: 230 m is not allowed as the largest"),
         ({"scenario": "merge", "world": "batch"}, "world: batch is not allowed; allowed: sumo, for merge"),
         (
-            {"world": "batch", "tasks": [{"scenario": "ring"}, {"scenario": "figure-eight"}]},
+            {"world": "batch", "tasks": [{"scenario": "figure-eight"}, {"scenario": "merge"}]},
             "world: batch is not allowed; allowed: sumo, for figure-eight",
         ),
     ],

@@ -22,6 +22,7 @@ from unjam.worlds.workers import Workers
 
 torch.set_num_threads(1)  # as a training does
 
+EIGHT = {"radius": [30, 31], "vehicles": 8}
 SHORT = {"road": {"length": [90, 100], "vehicles": 6}, "name": "short"}
 MIXTURE: list[dict[str, Any]] = [{"weight": 2.0}, SHORT]
 VIRTUAL = {"virtual__members": 2, "virtual__epochs": 2, "virtual__hidden": [8]}
@@ -186,3 +187,43 @@ def test_a_training_in_the_batch_is_that_in_sumo(tmp_path: Path) -> None:
             # Rounding differs, and learning in single precision makes more of it.
             learned = name == "return_validation" or one["iteration"] > 1
             assert one[name] == pytest.approx(other[name], rel=1e-9, abs=2e-3 if learned else 0.0)
+
+
+def test_roads_that_cannot_be_batched_are_driven_in_sumo_beside_those_that_can(tmp_path: Path) -> None:
+    ring = {"length": [120, 130], "vehicles": 8}
+    tasks = [{"road": ring}, {"scenario": "figure-eight", "road": EIGHT}, {"road": ring, "name": "other"}]
+    small = {"tasks": tasks, "road": {"horizon": 100}, "trpo.batch_steps": 300, "policy.hidden": [8]}
+    folders = {world: tmp_path / world for world in ("sumo", "batch")}
+    driven = {}
+    for world, folder in folders.items():
+        with Workers(1) as workers:
+            trainer = Trainer(folder, load_config(changes=small | {"world": world}), workers)
+            driven[world] = trainer.collect(trainer.training.learner.network(), 1)
+    for one, other in zip(driven["sumo"], driven["batch"], strict=True):
+        assert [episode.seed for episode in one] == [episode.seed for episode in other]
+        for actual, found in zip(one, other, strict=True):
+            np.testing.assert_allclose(found.speeds, actual.speeds, atol=1e-9)
+
+
+def test_more_is_driven_where_a_validation_shows_that_the_policy_falls_short(tmp_path: Path) -> None:
+    config = mixture(sampling="regret", tasks=[{}, SHORT], trpo__batch_steps=600, steps=1200)
+    with Workers(1) as workers:
+        trainer = Trainer(tmp_path / "run", config, workers)
+        network = trainer.training.learner.network()
+        assert [len(driven) for driven in trainer.collect(network, 1)] == [3, 3]
+        trainer._reached = [0.0, 1e6]  # the short one can be driven better than it is
+        trainer._follow([0.0, 0.0])
+        assert [len(driven) for driven in trainer.collect(network, 2)] == [2, 5]
+        assert trainer._reached == [0.0, 1e6]
+
+
+def test_a_training_that_was_stopped_goes_on_sampling_where_it_did(tmp_path: Path) -> None:
+    config, places = mixture(sampling="regret", steps=900), [tmp_path / "one go", tmp_path / "run"]
+    with Workers(1) as workers:
+        learn_with(workers, places[0], config)
+        with pytest.raises(Stop):
+            learn_with(workers, places[1], config, stop_after(2))
+        learn_with(workers, places[1], config, resume=True)
+    one, other = (progress(place) for place in places)
+    assert one == other
+    assert all(row["tasks"]["short"]["episodes"] >= 1 for row in one)

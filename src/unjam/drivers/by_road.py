@@ -8,7 +8,9 @@ from unjam.drivers.local_state import LocalState
 from unjam.drivers.wrappers import Wrapper
 from unjam.physics.arrays import Array, namespace
 
-KINDS_OF_ROAD = ("motorway", "crossing", "loop", "elsewhere")
+KINDS_OF_ROAD = ("motorway", "crossing", "loop", "elsewhere", "shared")
+SEVERAL = 0.05
+"""share of CAVs from which a closed road counts as shared among them"""
 
 
 @dataclass(frozen=True)
@@ -21,7 +23,7 @@ class ByRoad(Wrapper):
 
     tensors: ClassVar[bool] = False  # pyright: ignore[reportIncompatibleMethodOverride]
     needs_loop: ClassVar[bool] = False  # pyright: ignore[reportIncompatibleMethodOverride]
-    told: ClassVar[tuple[str, ...]] = ("to_crossing",)
+    told: ClassVar[tuple[str, ...]] = ("to_crossing", "cav_share")
 
     motorway: Driver
     """where a service tells how fast the lanes ahead are"""
@@ -31,26 +33,32 @@ class ByRoad(Wrapper):
     """on any other closed road"""
     elsewhere: Driver
     """on roads with ends of which nothing is told"""
+    shared: Driver | None = None
+    """on closed roads that do not cross themselves, where a service tells that at least `several` of all are
+    CAVs; None: as on others of the kind"""
+    several: float = SEVERAL
 
     @property
     def inner(self) -> dict[str, Driver]:
         """All of them, by the kind of road."""
-        return {kind: getattr(self, kind) for kind in KINDS_OF_ROAD}
+        held = {kind: getattr(self, kind) for kind in KINDS_OF_ROAD}
+        return {kind: driver for kind, driver in held.items() if driver is not None}
 
     @property
     def plain_numbers(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Whether those of closed roads take plain numbers: nobody else is given them."""
-        return self.crossing.plain_numbers and self.loop.plain_numbers
+        closed = (self.crossing, self.loop, self.shared or self.loop)
+        return all(driver.plain_numbers for driver in closed)
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
         """Return what the driver of this kind of road wants, and the new memory."""
-        kind = _kind(state)
+        kind = self._kind(state)
         wanted, after = self.inner[kind].act(state, memory[kind])
         return wanted, {**memory, kind: after}
 
     def time_headways(self, state: LocalState, memory: Memory) -> Array | None:
         """Return those of the driver of this kind of road."""
-        kind = _kind(state)
+        kind = self._kind(state)
         return self.inner[kind].time_headways(state, memory[kind])
 
     def describe(self) -> str:
@@ -59,15 +67,23 @@ class ByRoad(Wrapper):
 
     def recipe(self) -> Recipe:
         """Return what all of them are made from."""
-        return {"kind": "by-road", "drivers": {kind: held.recipe() for kind, held in self.inner.items()}}
+        drivers = {kind: held.recipe() for kind, held in self.inner.items()}
+        return {"kind": "by-road", "drivers": drivers, "several": self.several}
 
-
-def _kind(state: LocalState) -> str:
-    """Return on what kind of road the CAVs are."""
-    if state.lane_speeds is not None:
-        return "motorway"
-    if state.to_crossing is not None:
-        return "crossing"
-    length = state.loop_length
-    ends = length != length if isinstance(length, float) else bool(namespace(length).isnan(length).all())
-    return "elsewhere" if ends else "loop"
+    def _kind(self, state: LocalState) -> str:
+        """Return on what kind of road the CAVs are."""
+        if state.lane_speeds is not None:
+            return "motorway"
+        if state.to_crossing is not None:
+            return "crossing"
+        length, share = state.loop_length, state.cav_share
+        if isinstance(length, float):
+            ends = length != length
+        else:
+            ends = bool(namespace(length).isnan(length).all())
+        if ends:
+            return "elsewhere"
+        if self.shared is None or share is None:
+            return "loop"
+        told = share if isinstance(share, float) else float(share[0])
+        return "shared" if told >= self.several else "loop"

@@ -33,6 +33,7 @@ ACCELERATION_SCALE = 1.0
 LOOP_LENGTH_SCALE = 250.0
 ROUTE_POSITION_SCALE = 100.0
 TO_MERGE_SCALE = 1000.0
+CAV_SHARE_SCALE = 0.1
 
 
 class Seen(NamedTuple):
@@ -153,8 +154,8 @@ FEATURES: dict[str, Feature] = {
     "lane_speeds": _sections_ahead("lane_speeds", "in its lane"),
     "road_speeds": _sections_ahead("road_speeds", "on the road"),
     "cav_share": Feature(
-        lambda seen: as_column(seen.state.cav_share),
-        (Observed("share of CAVs", 1.0, ""),),
+        lambda seen: as_column(seen.state.cav_share / CAV_SHARE_SCALE),
+        (Observed("share of CAVs", CAV_SHARE_SCALE, ""),),
         told=("cav_share",),
     ),
     "beside": Feature(

@@ -59,6 +59,7 @@ class Loop(Scenario):
     """in words, with braces for the sizes"""
     about_limit: ClassVar[str]
     """what its limit is, in words"""
+    tells: ClassVar[tuple[str, ...]] = ("cav_share",)
     first_in_front: ClassVar[bool] = False
     """whether vehicle 0 leads the queue, and does not end it"""
 

@@ -1,5 +1,6 @@
 """One episode's road and traffic, as a scenario draws it: geometry, vehicles, demand."""
 
+from collections.abc import Collection
 from dataclasses import dataclass, field
 from typing import Literal, NamedTuple
 
@@ -137,6 +138,10 @@ class ClosedRoad(BuiltRoad):
     """where along the road it crosses another way: there SUMO drives commanded people itself [m]"""
     outline: NDArray[np.float64]
     """the road's centre line: rows (coordinate along the route, x, y) [m]"""
+
+    def share_told(self, asked: Collection[str]) -> float | None:
+        """Return the share of CAVs, as a service tells it, where it is among what a driver asks for."""
+        return len(self.cav_ids) / len(self.vehicle_ids) if "cav_share" in asked else None
 
 
 class Person(NamedTuple):

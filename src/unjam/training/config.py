@@ -1,7 +1,6 @@
 """Everything that decides what a training run does: one validated configuration, as TOML and flags."""
 
 import os
-from collections.abc import Sequence
 from dataclasses import asdict, field, replace
 from math import ceil
 from pathlib import Path
@@ -21,6 +20,7 @@ from unjam.parameters import STRICT, Count, CountOrNone, Positive, build, change
 from unjam.scenarios import make_scenario
 from unjam.scenarios.scenario import Scenario
 from unjam.training.presets import preset_values
+from unjam.training.sampling import Sampling, episodes_of_iteration, shares_by_weight
 from unjam.training.seeds import TRAINING_BELOW
 from unjam.trust import check_values
 from unjam.virtual.settings import VirtualSettings
@@ -93,7 +93,8 @@ class RunConfig(Agents):
     workers: Count = 2
     world: Literal["sumo", "batch"] = "sumo"
     """where episodes of training and validation are driven: in SUMO, or, on rings, all of an iteration at
-    once in what equals it but for rounding; it pays where iterations are large. SUMO judges in any case"""
+    once in what equals it but for rounding; it pays where iterations are large. Other roads of a mixture are
+    driven in SUMO, which judges in any case"""
     spread: bool = True
     """whether the episodes of an iteration, and of a validation, cover the range of what they draw (the
     ring's lengths) evenly"""
@@ -103,16 +104,18 @@ class RunConfig(Agents):
     evaluation: EvaluationSettings = field(default_factory=EvaluationSettings)
     tasks: tuple[TaskConfig, ...] = ()
     """roads that are trained on together; empty: the one above"""
+    sampling: Sampling = "weights"
+    """how many episodes each of several roads has: as its `weight` says; `regret`: from each validation to
+    the next, half of all steps go where the policy earns less than was seen there before"""
     preset: str = ""
     """which preset this started from, for the record"""
 
     @model_validator(mode="after")
     def _possible(self) -> "RunConfig":
         self.make_scenario()
-        for road in self.roads().values():
-            scenario = road.make_scenario()
-            if self.world == "batch" and (why := why_not(scenario)):
-                raise ValueError(f"world: batch is not allowed; allowed: sumo, for {why}")
+        whys = [why_not(road.make_scenario()) for road in self.roads().values()]
+        if self.world == "batch" and all(whys):
+            raise ValueError(f"world: batch is not allowed; allowed: sumo, for {whys[0]}")
         return self
 
     def roads(self) -> dict[str, "RunConfig"]:
@@ -178,16 +181,10 @@ class RunConfig(Agents):
         return Remembering(expert, step) if self.policy.remember else expert
 
 
-def episodes_of_iteration(tasks: Sequence[Task], steps: int) -> list[int]:
-    """Return how many episodes an iteration of so many actual steps has on each road, at least one."""
-    total = sum(task.weight for task in tasks)
-    return [max(1, ceil(round(task.weight / total * steps / task.scenario.horizon, 9))) for task in tasks]
-
-
 def steps_to_train(config: RunConfig) -> int:
     """Return how many actual steps a new training will make: whole iterations, unless episodes end early."""
     tasks = config.make_tasks()
-    counts = episodes_of_iteration(tasks, config.learner.batch_steps)
+    counts = episodes_of_iteration(tasks, config.learner.batch_steps, shares_by_weight(tasks))
     each = sum(count * task.scenario.horizon for count, task in zip(counts, tasks, strict=True))
     return ceil(config.steps / each) * each
 

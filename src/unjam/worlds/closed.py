@@ -44,11 +44,13 @@ def loop_state(
     near: Neighbours,
     loop_length: float,
     crossings: tuple[tuple[float, float], ...] = (),
+    cav_share: float | None = None,
 ) -> LocalState:
     """Return what the vehicles `near.own` perceive on a closed road; integers there give plain numbers.
 
     Speeds [m/s] and positions of front bumpers, not wrapped [m], are by place in road order: arrays of shape
-    (vehicles,) or (vehicles, moments), or lists. Where the road crosses itself is from and to [m].
+    (vehicles,) or (vehicles, moments), or lists. Where the road crosses itself is from and to [m]. The share
+    of CAVs is a service's to tell; None: it does not.
     """
     own, ahead, behind = near
     speed, position = speeds[own], positions[own]
@@ -61,6 +63,8 @@ def loop_state(
         position % loop_length,
         loop_length if type(position) is float else np.full(position.shape, loop_length),
     )
+    if cav_share is not None:
+        state = state._replace(cav_share=state.loop_length * 0.0 + cav_share)
     if not crossings:
         return state
     ways = [(start - position) % loop_length for start, _ in crossings]
@@ -104,6 +108,8 @@ class ClosedLog:
     crashed: bool = False
     fuel: Floats = field(default_factory=lambda: np.zeros((0, 0)))
     """[mg/s], shape (D, N); (0, 0) where it was not recorded"""
+    cav_share: float | None = None
+    """as CAVs were told, if they were"""
 
     @property
     def places(self) -> NDArray[np.intp]:
@@ -128,7 +134,7 @@ class ClosedLog:
         decisions = speeds.shape[1] - 1
         gaps = gap_on_loop(positions, np.roll(positions, -1, axis=0), road.loop_length, VEHICLE_LENGTH)
         near = loop_neighbours(self.places, len(self.start))
-        states = loop_state(speeds, positions, near, road.loop_length, road.crossings)
+        states = loop_state(speeds, positions, near, road.loop_length, road.crossings, self.cav_share)
         (applied, filtered), shield = self._applied(), self._shield(decisions)
         trajectories = tuple(
             trajectory(

@@ -1,9 +1,9 @@
 """Does a batch of rings do what SUMO's episodes of the same seeds do?"""
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -11,11 +11,13 @@ import torch
 from torch import Tensor
 
 from unjam.drivers import Constant, Driver
+from unjam.drivers.driver import Memory
 from unjam.drivers.local_state import LocalState
 from unjam.drivers.registry import named_driver
 from unjam.drivers.safety import Actuator, SafetyFilter
 from unjam.errors import InputError
 from unjam.measures.metrics import measure
+from unjam.physics.arrays import Array
 from unjam.scenarios import FigureEight, Ring
 from unjam.scenarios.population import Population, write_population
 from unjam.training.speed import neural_driver
@@ -76,6 +78,29 @@ RINGS: dict[str, tuple[Ring, str]] = {
     "calm people": (replace(SHORT, noise=0.0), "pi"),
     "people of another kind": (replace(SHORT, humans=QUICK_PEOPLE), "pi"),
 }
+
+
+@dataclass(frozen=True)
+class ByShare(Driver):
+    """Brakes by the share of CAVs that it is told."""
+
+    told: ClassVar[tuple[str, ...]] = ("cav_share",)
+
+    def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
+        return -state.cav_share, memory
+
+
+@pytest.mark.parametrize(("cavs", "warmup"), [(1, 0), (4, 130)])
+def test_the_share_of_cavs_is_told_to_whom_asks_for_it_alone(cavs: int, warmup: int) -> None:
+    ring = replace(SHORT, horizon=20, cavs=cavs, warmup=warmup)
+    (found,) = run_batch(tasks(ring, ByShare(), [3]))
+    actual = run_episode(ring, ByShare(), (3,))
+    for episode in (found, actual):
+        for trajectory in episode.trajectories:
+            assert trajectory.states.cav_share == pytest.approx(cavs / 22)
+            assert trajectory.applied == pytest.approx(-cavs / 22)
+    assert_alike(found, actual)
+    assert run_episode(ring, named_driver("pi", 0.1), (3,)).trajectories[0].states.cav_share is None
 
 
 @pytest.mark.parametrize("name", RINGS)

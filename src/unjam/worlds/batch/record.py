@@ -60,8 +60,9 @@ class RingLog:
         seeds: Sequence[Sequence[int]],
         decisions: Floats,
         driven: Driven,
+        cav_share: float | None,
     ) -> tuple[Episode, ...]:
-        """Return the record of each ring, which ends after so many decisions."""
+        """Return the record of each ring, which ends after so many decisions; the share is as it was told."""
         rings, cavs = len(roads), len(roads[0].cav_ids)
         decided = [tuple(map(as_numpy, decision)) for decision in driven.decisions]
         last = None if driven.last_observation is None else as_numpy(driven.last_observation)
@@ -69,7 +70,7 @@ class RingLog:
         ways = {name: _stacked(getattr(self, name), -1, rings) for name in ("moved", "speeds")}
         asked = {name: _stacked(getattr(self, name), cavs, rings) for name in ("wanted", "told", "commanded")}
         return tuple(
-            self._episode(scenario, road, seed, number, int(count), driven, {**ways, **asked})
+            self._episode(scenario, road, seed, number, int(count), driven, cav_share, {**ways, **asked})
             for number, (scenario, road, seed, count) in enumerate(
                 zip(scenarios, roads, seeds, decisions, strict=True)
             )
@@ -83,6 +84,7 @@ class RingLog:
         number: int,
         decisions: int,
         driven: Driven,
+        cav_share: float | None,
         steps: dict[str, Floats],
     ) -> Episode:
         made = decisions * scenario.steps_per_decision
@@ -90,7 +92,7 @@ class RingLog:
         own: dict[str, Any] = {
             name: values[: ends.get(name, made), :, number] for name, values in steps.items()
         }
-        log = ClosedLog(scenario, road, self.start[:, number], **own)
+        log = ClosedLog(scenario, road, self.start[:, number], **own, cav_share=cav_share)
         moments = log.moments()
         before = moments[1][:, -1]
         # Not wrapped: who touches the car ahead is a little before or beyond it.

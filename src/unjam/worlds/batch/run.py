@@ -39,6 +39,7 @@ def begin(
         explore: whether what was learned adds its exploration noise.
         memory: what the driver remembers already; None: nothing but what the world began with.
     """
+    world.asked = driver.asks
     driving = Drive(world, driver, explore, memory)
     driving.memory = mapped(numbers, driving.memory)
     if driver.hold > 1 and AGE in driving.memory:

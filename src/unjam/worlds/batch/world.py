@@ -5,7 +5,7 @@ row of the vehicles' speeds comes again at the end, so that who is ahead is a sl
 ring of the first CAV, then of the second, and so on.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import fields
 from functools import reduce
 from typing import Any, cast
@@ -65,6 +65,8 @@ class RingBatch:
     """
 
     single, kept = False, None
+    asked: Collection[str] = ()
+    """fields of a `LocalState` that the driver looks at: of those that are told, only these are"""
 
     def __init__(
         self,
@@ -178,12 +180,14 @@ class RingBatch:
     def perceive(self) -> LocalState:
         """Return what the CAVs perceive now: arrays of shape (CAVs * W,)."""
         speed, gap = self._speed, self._gap
+        share = self.roads[0].share_told(self.asked)
         return LocalState(
             *self._followed(),
             self._rows_at(speed, self._behind),
             self._rows_at(gap, self._behind),
             self._rows_at(self._position, self._places) % self._loops,
             self._loops,
+            cav_share=None if share is None else self._loops * 0.0 + share,
         )
 
     def _followed(self) -> Ahead:
@@ -305,7 +309,9 @@ class RingBatch:
             mean_speed=as_numpy(self._driven) / made,
             headway=as_numpy(headway).min(0),
             braking=as_numpy(braking).max(0),
-            episodes=self._log.episodes(self._scenarios, self.roads, self._seeds, made, driven)
+            episodes=self._log.episodes(
+                self._scenarios, self.roads, self._seeds, made, driven, self.roads[0].share_told(self.asked)
+            )
             if self._keep
             else (),
         )

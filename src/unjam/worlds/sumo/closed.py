@@ -44,7 +44,7 @@ class ClosedTraffic(Traffic[ClosedRoad]):
         """of the CAVs, in road order"""
         self._near = loop_neighbours(np.array(self._places), vehicles)
         self._near_single = loop_neighbours(self._places[0], vehicles)
-        self._loop = road.loop_length, road.crossings
+        self._loop: Any = road.loop_length, road.crossings
         self._commanded = scenario.human_control == "commanded"
         self._drivers = self._drivers_of(road.vehicle_ids)
         needed = range(vehicles) if self._commanded else np.concatenate(self._near).tolist()
@@ -82,6 +82,7 @@ class ClosedTraffic(Traffic[ClosedRoad]):
             (CAVs, moments), oldest first; None without a warm-up that may be remembered.
         """
         scenario, history = self.scenario, None
+        self._loop = self.road.loop_length, self.road.crossings, self.road.share_told(self.asked)
         self._warm_up(self._simulate, on_progress)
         if scenario.warmup and scenario.recall_warmup:
             each = scenario.steps_per_decision
@@ -227,6 +228,7 @@ class ClosedTraffic(Traffic[ClosedRoad]):
             commanded=np.array(self._log_commanded).reshape(-1, cavs),
             crashed=self.crashed,
             fuel=np.array(self.log_fuel) if self.full else np.zeros((0, 0)),
+            cav_share=self.road.share_told(self.asked),
         )
 
     def speeds_and_positions(self) -> tuple[Floats, Floats]:

@@ -1,0 +1,50 @@
+"""How the episodes of an iteration are shared among the roads of a training."""
+
+from collections.abc import Sequence
+from math import ceil
+from typing import Literal
+
+from unjam.worlds.episode import Task
+
+Sampling = Literal["weights", "regret"]
+FOLLOWING = 0.5
+"""part of the actual steps that regret shares out; weights share the rest, so that no road is forgotten"""
+
+
+def shares_by_weight(tasks: Sequence[Task]) -> list[float]:
+    """Return each task's share of the actual steps, as its weight says."""
+    total = sum(task.weight for task in tasks)
+    return [task.weight / total for task in tasks]
+
+
+def shares_by_regret(
+    by_weight: Sequence[float], reached: Sequence[float], now: Sequence[float]
+) -> list[float]:
+    """Return each task's share where half of all follows what the policy lacks.
+
+    What it lacks on a road is by how much its return in validation is below the best that was seen there, by
+    itself before or by its expert: there is something to gain that is known to be possible. A level-based
+    sampling in the manner of prioritised level replay (Jiang et al. 2021, arXiv:2010.03934), with a regret
+    that is measured instead of guessed from the critic.
+
+    Args:
+        by_weight: shares without regard to it; they sum to one.
+        reached: best return of each task so far.
+        now: return of each task, as the policy is now; the returns of all tasks must be of the same size.
+    """
+    lacks = [share * max(best - here, 0.0) for share, best, here in zip(by_weight, reached, now, strict=True)]
+    total = sum(lacks)
+    if total == 0.0:
+        return list(by_weight)
+    return [
+        (1.0 - FOLLOWING) * share + FOLLOWING * lack / total
+        for share, lack in zip(by_weight, lacks, strict=True)
+    ]
+
+
+def episodes_of_iteration(tasks: Sequence[Task], steps: int, shares: Sequence[float]) -> list[int]:
+    """Return how many episodes an iteration of so many actual steps has on each road, at least one."""
+    return [
+        max(1, ceil(round(share * steps / task.scenario.horizon, 9)))
+        for task, share in zip(tasks, shares, strict=True)
+    ]

@@ -1,0 +1,55 @@
+"""Do the episodes of an iteration go where a policy falls short, and is no road forgotten?"""
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from unjam.drivers import PISaturation
+from unjam.scenarios import Ring
+from unjam.training.sampling import FOLLOWING, episodes_of_iteration, shares_by_regret, shares_by_weight
+from unjam.worlds.episode import Task
+
+RING = Ring(horizon=100)
+RETURNS = st.floats(-1e4, 1e4, allow_nan=False)
+
+
+def tasks(*weights: float) -> list[Task]:
+    return [Task(RING, PISaturation(), weight=weight) for weight in weights]
+
+
+def test_shares_are_those_of_the_weights() -> None:
+    assert shares_by_weight(tasks(1.0, 3.0)) == [0.25, 0.75]
+
+
+def test_where_nothing_is_lacking_weights_decide() -> None:
+    assert shares_by_regret([0.25, 0.75], [10.0, 20.0], [10.0, 25.0]) == [0.25, 0.75]
+
+
+def test_half_goes_to_the_only_road_on_which_the_policy_falls_short() -> None:
+    assert shares_by_regret([0.25, 0.25, 0.5], [10.0, 5.0, 3.0], [10.0, 1.0, 3.0]) == [
+        0.125,
+        0.125 + FOLLOWING,
+        0.25,
+    ]
+
+
+def test_a_road_that_weighs_more_is_followed_more() -> None:
+    one, other = shares_by_regret([0.2, 0.8], [5.0, 5.0], [1.0, 1.0])
+    assert (one, other) == pytest.approx((0.2, 0.8))
+
+
+@given(st.lists(st.tuples(st.floats(0.01, 10.0), RETURNS, RETURNS), min_size=1, max_size=8))
+def test_shares_sum_to_one_and_none_falls_below_what_weights_leave_it(
+    roads: list[tuple[float, float, float]],
+) -> None:
+    weights, reached, now = zip(*roads, strict=True)
+    by_weight = shares_by_weight(tasks(*weights))
+    found = shares_by_regret(by_weight, reached, now)
+    assert sum(found) == pytest.approx(1.0)
+    assert all(
+        share >= (1.0 - FOLLOWING) * least * (1 - 1e-9) for share, least in zip(found, by_weight, strict=True)
+    )
+
+
+def test_every_road_has_an_episode_however_small_its_share() -> None:
+    assert episodes_of_iteration(tasks(1.0, 1.0), 1000, [0.001, 0.999]) == [1, 10]
