@@ -112,7 +112,6 @@ class RunConfig(Agents):
 
     @model_validator(mode="after")
     def _possible(self) -> "RunConfig":
-        self.make_scenario()
         whys = [why_not(road.make_scenario()) for road in self.roads().values()]
         if self.world == "batch" and all(whys):
             raise ValueError(f"world: batch is not allowed; allowed: sumo, for {whys[0]}")
@@ -130,14 +129,17 @@ class RunConfig(Agents):
             while name in found:
                 number += 1
                 name = f"{base}-{number}"
-            found[name] = replace(
+            road = replace(
                 self,
                 scenario=scenario,
                 road=changed(self.road, task.road),
                 expert=task.expert or self.expert,
                 reward=task.reward or self.reward,
                 tasks=(),
+                world="sumo",
             )
+            batched = self.world == "batch" and not why_not(road.make_scenario())
+            found[name] = replace(road, world="batch") if batched else road
         return found
 
     def make_tasks(self) -> list[Task]:
