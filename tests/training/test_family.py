@@ -3,7 +3,7 @@
 import pytest
 
 from unjam.scenarios.ring import Ring
-from unjam.training.family import FAMILY, GROUPS, is_family, roads_of
+from unjam.training.family import FAMILY, GROUPS, roads_of
 
 SEEN, HELD_OUT = roads_of("everywhere", "seen"), roads_of("everywhere", "combination", "axis")
 
@@ -25,7 +25,10 @@ def test_each_held_out_axis_lies_beyond_what_is_seen() -> None:
 
 @pytest.mark.parametrize("group", GROUPS)
 def test_every_group_has_roads_of_both_kinds(group: str) -> None:
-    assert is_family(group)
     assert roads_of(group, "seen")
     assert roads_of(group, "combination", "axis")
-    assert not is_family("ring")
+
+
+def test_rings_are_shared_where_a_twentieth_of_all_are_cavs() -> None:
+    assert list(roads_of("shared-rings", "seen")) == ["ring-33-growing-3-cavs", "ring-66-grown-4-cavs"]
+    assert list(roads_of("shared-rings", "combination", "axis")) == ["ring-44-grown-5-cavs"]

@@ -64,10 +64,10 @@ def tune(
 
       unjam tune figure-eight --expert pacer --vary gathering_speed=1..3 --steps 300000
 
-      unjam tune rings --expert pi                   (a family: also figure-eights, motorways, everywhere)
+      unjam tune rings --expert pi                   (a family: also shared-rings, figure-eights, motorways)
     """
     from unjam.scenarios import make_scenario
-    from unjam.training.family import FAMILY, is_family, roads_of
+    from unjam.training.family import FAMILY, GROUPS, roads_of
     from unjam.training.folder import new_and_owned
     from unjam.training.search import space_of
     from unjam.training.tried import ASKED
@@ -80,7 +80,7 @@ def tune(
     if seed >= SEEDS_BELOW:
         raise wrong("seed", seed, f"less than {SEEDS_BELOW}")
     changes = road | assignments(settings)
-    if is_family(scenario):
+    if scenario in GROUPS:
         if changes or reward:
             raise InputError(f"scenario: with {scenario} neither changes nor a reward are allowed")
         roads = roads_of(scenario, "seen")
@@ -107,5 +107,5 @@ def tune(
     console.print(
         f"{best.driver}: {best.score:.4g} on tuning seeds; {default.driver}: {before}", soft_wrap=True
     )
-    on = FAMILY[next(iter(roads))].scenario if is_family(scenario) else scenario
+    on = FAMILY[next(iter(roads))].scenario if scenario in GROUPS else scenario
     console.print(f"drive with it: unjam drive {on} --driver {found.file} --held-out", soft_wrap=True)

@@ -77,11 +77,8 @@ class ByRoad(Wrapper):
         if state.to_crossing is not None:
             return "crossing"
         length, share = state.loop_length, state.cav_share
-        if isinstance(length, float):
-            ends = length != length
-        else:
-            ends = bool(namespace(length).isnan(length).all())
-        if ends:
+        ends = length != length if isinstance(length, float) else namespace(length).isnan(length).all()
+        if bool(ends):
             return "elsewhere"
         if self.shared is None or share is None:
             return "loop"

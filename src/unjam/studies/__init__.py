@@ -1,5 +1,6 @@
 """The studies of `unjam reproduce`: the paper's tables and figures."""
 
+from unjam.studies.adaptation import ADAPTATION
 from unjam.studies.comparison import FIGURE_5, comparison_of
 from unjam.studies.drivable import DRIVABLE_EIGHT, DRIVABLE_STUDY
 from unjam.studies.envelope import ENVELOPE
@@ -61,6 +62,7 @@ STUDIES: dict[str, Study] = {
     "drivable-eight": DRIVABLE_EIGHT,
     "envelope": ENVELOPE,
     "everywhere": EVERYWHERE_STUDY,
+    "adaptation": ADAPTATION,
     "rings": on_rings(
         "what one residual, trained on all rings of the family together, gains on each", {"rings": 10}
     ),

@@ -24,7 +24,7 @@ from unjam.measures.table import PEOPLE
 from unjam.reports.figures import INK, new_figure
 from unjam.scenarios.scenario import Scenario
 from unjam.studies.study import Study, StudyFolder
-from unjam.training.family import FAMILY, GROUPS
+from unjam.training.family import FAMILY, KINDS
 from unjam.training.seeds import held_out_seeds, tuning_seeds
 from unjam.worlds.record import Episode
 from unjam.worlds.workers import EpisodeTask, Workers
@@ -82,7 +82,7 @@ def _write(studies: StudyFolder, seeds: int, folder: Path, workers: int) -> None
     with Workers(workers) as pool:
         for number, name, road, scenario in sorted(made, key=lambda each: not each[3].closed):  # quick first
             file = folder / f"{number:02d}.json"
-            group = next(group for group, kinds in GROUPS.items() if road.scenario in kinds)
+            group = KINDS[road.scenario]
             found: dict[str, Any] = json.loads(file.read_text()) if file.is_file() else {}
             if not found:
                 tried = {driver: driver for driver in (PEOPLE, *TUNED[group])}

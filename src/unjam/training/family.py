@@ -8,6 +8,7 @@ anything was trained or tuned on them.
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
+from unjam.drivers.by_road import SEVERAL
 from unjam.scenarios import make_scenario
 from unjam.scenarios.scenario import Scenario
 
@@ -84,22 +85,21 @@ FAMILY: dict[str, FamilyRoad] = {
 """every road by name"""
 
 
-GROUPS = {"rings": ("ring",), "figure-eights": ("figure-eight",), "motorways": ("on-ramp", "on-ramp-1")}
-"""roads that one law can be written for, by their scenarios"""
-ALL_ROADS = "everywhere"
-"""name of the whole family"""
+KINDS = {"ring": "rings", "figure-eight": "figure-eights", "on-ramp": "motorways", "on-ramp-1": "motorways"}
+"""for each scenario the group of roads that one law can be written for"""
+SHARED_RINGS, ALL_ROADS = "shared-rings", "everywhere"
+"""names of the rings that several CAVs share, and of the whole family"""
+GROUPS = (*dict.fromkeys(KINDS.values()), SHARED_RINGS, ALL_ROADS)
+"""names of several roads"""
 
 
-def is_family(name: str) -> bool:
-    """Return whether a name is that of several roads."""
-    return name == ALL_ROADS or name in GROUPS
+def _is_in(road: FamilyRoad, group: str) -> bool:
+    if group == SHARED_RINGS:
+        changes = road.changes
+        return road.scenario == "ring" and changes["cavs"] >= SEVERAL * changes["vehicles"]
+    return group in (KINDS[road.scenario], ALL_ROADS)
 
 
 def roads_of(group: str, *parts: Part) -> dict[str, Scenario]:
-    """Return the roads of some parts of the family, by name; `group` is a key of GROUPS, or `everywhere`."""
-    scenarios = [each for name, kinds in GROUPS.items() for each in kinds if group in (name, ALL_ROADS)]
-    return {
-        name: road.make()
-        for name, road in FAMILY.items()
-        if road.part in parts and road.scenario in scenarios
-    }
+    """Return the roads of some parts of the family, by name; `group` is one of `GROUPS`."""
+    return {name: road.make() for name, road in FAMILY.items() if road.part in parts and _is_in(road, group)}
