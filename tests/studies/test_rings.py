@@ -6,7 +6,9 @@ from typing import Any
 
 import pytest
 
-from unjam.studies.rings import BESIDE, BEYOND, RINGS, _on_ring, table
+from unjam.drivers.by_road import SEVERAL
+from unjam.studies.everywhere import JUDGING
+from unjam.studies.rings import BESIDE, BEYOND, FRESH, RINGS, SHARED, _on_ring, table
 from unjam.studies.study import PlannedRun, StudyFolder
 from unjam.training.family import FAMILY
 from unjam.training.presets import RINGS_TUNED
@@ -29,7 +31,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 def test_a_row_is_the_mean_of_the_trainings_and_of_what_they_are_beyond_the_expert(folder: Path) -> None:
-    shown = table(["residual"], ("seen",), folder).set_index("road")
+    shown = table(["residual"], ("seen",), BESIDE, folder).set_index("road")
     assert list(shown.index) == ["ring-22-grown", "ring-44-grown", "mean", "worst", "not drivable"]
     assert shown.loc["ring-22-grown", RINGS_TUNED].startswith("+1.00")
     # Two of three are the expert, and one gains next to nothing: 0.08 and 0.05 of what it gains.
@@ -42,8 +44,17 @@ def test_a_row_is_the_mean_of_the_trainings_and_of_what_they_are_beyond_the_expe
 
 
 def test_roads_of_another_part_have_a_table_of_their_own(folder: Path) -> None:
-    rows = list(table(["residual"], ("axis",), folder)["road"])
+    rows = list(table(["residual"], ("axis",), BESIDE, folder)["road"])
     assert rows == ["ring-22-dense", "mean", "worst", "not drivable"]
+
+
+def test_shared_rings_are_judged_on_seeds_and_rings_that_chose_nothing() -> None:
+    assert not set(FRESH) & set(JUDGING)
+    new = [name for name in SHARED if name not in FAMILY]
+    assert len(new) == 6
+    for name, road in SHARED.items():
+        assert road.part == (FAMILY[name].part if name in FAMILY else "axis")
+        assert road.changes["cavs"] >= SEVERAL * road.changes["vehicles"]
 
 
 def test_a_training_on_several_roads_is_finished_when_all_are_judged(tmp_path: Path) -> None:
@@ -62,7 +73,7 @@ def test_a_ring_is_driven_by_all_on_the_same_seeds(monkeypatch: pytest.MonkeyPat
 
     monkeypatch.setattr("unjam.studies.rings.driven", driven)
     monkeypatch.setattr("unjam.studies.rings.best_of", lambda rows: "pi")
-    found = _on_ring("ring-22-grown", {"residual 0": "runs/0"})
+    found = _on_ring("ring-22-grown", FAMILY["ring-22-grown"], BESIDE | {"residual 0": "runs/0"}, JUDGING)
     (chose, tuning), (judged, judging) = asked
     assert {"human", "pi", RINGS_TUNED} <= judged
     assert "runs/0" in judged - chose

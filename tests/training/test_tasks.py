@@ -71,10 +71,6 @@ def test_a_mixture_survives_being_written(tmp_path: Path) -> None:
             {"expert": "follower-stopper"},
             "tasks: on ring-2 the network would see something else than on ring",
         ),
-        (
-            {"road": {"action_limit": 2.0}},
-            "tasks: an action limit of 2 m/s2 on ring-2 is not allowed; allowed: 1",
-        ),
         ({"expert": "magic"}, "driver: 'magic'"),
         ({"reward": "magic"}, "reward: 'magic'"),
     ],
@@ -227,3 +223,16 @@ def test_a_training_that_was_stopped_goes_on_sampling_where_it_did(tmp_path: Pat
     one, other = (progress(place) for place in places)
     assert one == other
     assert all(row["tasks"]["short"]["episodes"] >= 1 for row in one)
+
+
+def test_a_network_acts_within_the_narrowest_limits_of_its_roads(tmp_path: Path) -> None:
+    config = mixture(
+        tasks=[{"road": {"action_limit": 2.0}}, {"road": {"action_limit": 0.5}, "name": "gentle"}]
+    )
+    with Workers(1) as workers:
+        trainer = Trainer(tmp_path, config, workers)
+        strong, gentle = trainer.drivers(trainer.training.learner.network())
+    assert isinstance(strong, ResidualDriver)
+    assert isinstance(gentle, ResidualDriver)
+    assert (strong.action_limit, gentle.action_limit) == (2.0, 0.5)
+    assert strong.network.authority == gentle.network.authority == 0.5

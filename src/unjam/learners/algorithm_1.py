@@ -102,7 +102,8 @@ def begin_training(
     inputs = observation_size(policy.observe, tasks[0].expert)
     drawn = np.zeros((1, len(tasks[0].scenario.drawn_ranges)))
     critic_inputs = seen_by_critic(tasks, policy, 0, drawn).shape[1]
-    spec = AgentSpec(inputs, critic_inputs, tasks[0].scenario.action_limit, policy, seed)
+    limit = min(task.scenario.action_limit for task in tasks)
+    spec = AgentSpec(inputs, critic_inputs, limit, policy, seed)
     return Training(tasks, policy, seed, make_learner(learner, spec), imaginations)
 
 

@@ -5,8 +5,9 @@ decide than those that judge.
 """
 
 import json
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from unjam.controller import make_driver
+from unjam.controller import SHIPPED, make_driver, shipped_file
 from unjam.files import to_json, write_whole
 from unjam.measures.drivable import DRIVABLE, drivable_in_all
 from unjam.measures.gain import MOST, WORST, Rows, gain, gain_by_seed, worth
@@ -82,17 +83,43 @@ def _write(studies: StudyFolder, seeds: int, folder: Path, workers: int) -> None
     with Workers(workers) as pool:
         for number, name, road, scenario in sorted(made, key=lambda each: not each[3].closed):  # quick first
             file = folder / f"{number:02d}.json"
-            group = KINDS[road.scenario]
-            found: dict[str, Any] = json.loads(file.read_text()) if file.is_file() else {}
-            if not found:
-                tried = {driver: driver for driver in (PEOPLE, *TUNED[group])}
-                rows = driven(scenario, tried, CHOOSING, pool.run)
-                found = {"road": name, "part": road.part, "best": best_of(rows), "rows": {}}
-            asked = {PEOPLE: PEOPLE, found["best"]: found["best"], **JUDGED}
-            missing = {label: driver for label, driver in asked.items() if label not in found["rows"]}
-            if missing:  # also drivers that came later
-                found["rows"] |= driven(scenario, missing, JUDGING, pool.run)
-                write_whole(file, to_json(found))
+            found: dict[str, Any] = {"road": name, "part": road.part, "best": PEOPLE}
+            found |= {"tried": {}, "drove": {}, "rows": {}}
+            if file.is_file():
+                found |= json.loads(file.read_text())
+                found["tried"] = found["tried"] or dict.fromkeys(TUNED[KINDS[road.scenario]], "")
+                found["tried"] = {driver: _version(driver) for driver in found["tried"]}
+                found["drove"] = {label: _version(str(JUDGED.get(label, label))) for label in found["rows"]}
+            _go_on(scenario, TUNED[KINDS[road.scenario]], found, pool.run)
+            write_whole(file, to_json(found))
+
+
+def _go_on(scenario: Scenario, tuned: Sequence[str], found: dict[str, Any], run: Run) -> None:
+    """Drive what is not known yet of a road, and add it to what was found.
+
+    Experts and drivers that came later, or whose shipped file is another one now, are not known.
+    """
+    new = [driver for driver in tuned if found["tried"].get(driver) != _version(driver)]
+    if new:
+        candidates = dict.fromkeys((PEOPLE, found["best"], *new))
+        rows = driven(scenario, {driver: driver for driver in candidates}, CHOOSING, run)
+        found["best"] = best_of(rows)
+        found["tried"] |= {driver: _version(driver) for driver in new}
+    asked = {PEOPLE: PEOPLE, found["best"]: found["best"], **JUDGED}
+    missing = {
+        label: driver
+        for label, driver in asked.items()
+        if label not in found["rows"] or found["drove"][label] != _version(driver)
+    }
+    if missing:
+        found["rows"] |= driven(scenario, missing, JUDGING, run)
+        found["drove"] |= {label: _version(driver) for label, driver in missing.items()}
+
+
+def _version(driver: str) -> str:
+    """Return which file a shipped controller is; nothing for others, whose name says what they are."""
+    name = driver.removeprefix(SHIPPED)
+    return "" if name == driver else sha256(shipped_file(name).read_bytes()).hexdigest()[:12]
 
 
 def best_of(rows: dict[str, Rows]) -> str:

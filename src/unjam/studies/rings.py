@@ -4,7 +4,7 @@ Beside the expert that was tuned for all of them at once, and the best tuned exp
 in batches, which are SUMO's but for rounding.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -27,8 +27,9 @@ from unjam.studies.everywhere import (
     gains_of,
 )
 from unjam.studies.study import VARIANTS, PlannedRun, Study, StudyFolder, measure_parts
-from unjam.training.family import FAMILY
+from unjam.training.family import FAMILY, GROWN, HURRIED, SHARED_RINGS, FamilyRoad, is_in, ring_changes
 from unjam.training.presets import RINGS_TUNED
+from unjam.training.seeds import held_out_seeds
 from unjam.worlds.batch.run import run_batches
 
 ROAD = "rings"
@@ -38,16 +39,41 @@ BESIDE = {
     **{label: JUDGED[label] for label in ("PI, tuned on the rings", "unjam:ring-best")},
 }
 """who is driven beside those that are trained, by label"""
-RINGS = [name for name, road in FAMILY.items() if road.scenario == "ring"]
+RINGS = {name: road for name, road in FAMILY.items() if is_in(road, ROAD)}
+LATE = {"lag": 0.3, "delay": 0.2}
+SHARED = {
+    **{name: road for name, road in FAMILY.items() if is_in(road, SHARED_RINGS)},
+    "ring-88-grown-6-cavs": FamilyRoad("ring", ring_changes(88, 6, GROWN), "axis"),
+    "ring-44-hurried-3-cavs": FamilyRoad("ring", ring_changes(44, 3, GROWN, humans=HURRIED), "axis"),
+    "ring-44-late-4-cavs": FamilyRoad("ring", ring_changes(44, 4, GROWN, actuator=LATE), "axis"),
+    "ring-55-dense-4-cavs": FamilyRoad("ring", ring_changes(55, 4, GROWN, (9.1, 9.8)), "axis"),
+    "ring-66-wide-4-cavs": FamilyRoad("ring", ring_changes(66, 4, GROWN, (13.0, 16.0)), "axis"),
+    "ring-40-standing-2-cavs": FamilyRoad("ring", ring_changes(40, 2, 0), "axis"),
+}
+"""rings that several CAVs share: those of the family, and more that nobody has trained or tuned on"""
+FRESH = held_out_seeds(20, 1000)
+"""seeds on which nobody was driven when it was decided where a residual may act"""
+ON_SHARED: dict[str, str] = {}
+"""who was tuned for shared rings alone, by label"""
 BEYOND = f"beyond {RINGS_TUNED}"
 
 
-def on_rings(title: str, variants: dict[str, int]) -> Study:
-    """Return the study of some variants, each with the most trainings that it wants."""
+def on_rings(
+    title: str,
+    variants: dict[str, int],
+    group: str = ROAD,
+    rings: Mapping[str, FamilyRoad] = RINGS,
+    beside: Mapping[str, str] = BESIDE,
+    seeds_that_judge: Sequence[tuple[int, ...]] = JUDGING,
+) -> Study:
+    """Return the study of some variants, each with the most trainings that it wants.
+
+    They are trained on a group of the family, and judged on `rings` beside drivers by label.
+    """
 
     def runs(seeds: int) -> list[PlannedRun]:
         return [
-            PlannedRun(ROAD, name, seed)
+            PlannedRun(group, name, seed)
             for name, most in variants.items()
             for seed in range(min(seeds, most))
         ]
@@ -57,35 +83,43 @@ def on_rings(title: str, variants: dict[str, int]) -> Study:
             f"{VARIANTS[run.variant].label} {run.seed}": str(studies.controller_of(run))
             for run in runs(seeds)
         }
-        parts = {f"{number:02d}": (_on_ring, (name, trained)) for number, name in enumerate(RINGS)}
+        drivers = {**beside, **trained}
+        parts = {
+            f"{number:02d}": (_on_ring, (name, road, drivers, list(seeds_that_judge)))
+            for number, (name, road) in enumerate(rings.items())
+        }
         measure_parts(folder, parts, workers)
 
     labels = [VARIANTS[name].label for name in variants]
     tables: dict[str, Callable[[Path], pd.DataFrame]] = {
-        "seen": partial(table, labels, ("seen",)),
-        "held out": partial(table, labels, HELD_OUT),
+        "seen": partial(table, labels, ("seen",), beside),
+        "held out": partial(table, labels, HELD_OUT, beside),
     }
     return Study(title, runs, write, minutes=25.0, goes_on=True, tables=tables)
 
 
-def _on_ring(name: str, trained: dict[str, str]) -> dict[str, Any]:
-    """Return what everybody did on a ring of the family on the seeds that judge; others choose its best."""
-    scenario = FAMILY[name].make()
+def _on_ring(
+    name: str, road: FamilyRoad, judged: dict[str, str], seeds: list[tuple[int, ...]]
+) -> dict[str, Any]:
+    """Return what everybody did on a ring on the seeds that judge; others choose its best."""
+    scenario = road.make()
     tried = {driver: driver for driver in (PEOPLE, *TUNED[ROAD])}
     best = best_of(driven(scenario, tried, CHOOSING, run_batches))
-    drivers = {PEOPLE: PEOPLE, best: best, **BESIDE, **trained}
-    rows = driven(scenario, drivers, JUDGING, run_batches)
-    return {"road": name, "part": FAMILY[name].part, "best": best, "rows": rows}
+    drivers = {PEOPLE: PEOPLE, best: best, **judged}
+    rows = driven(scenario, drivers, seeds, run_batches)
+    return {"road": name, "part": road.part, "best": best, "rows": rows}
 
 
-def table(labels: Sequence[str], parts: tuple[str, ...], folder: Path) -> pd.DataFrame:
+def table(
+    labels: Sequence[str], parts: tuple[str, ...], beside: Mapping[str, str], folder: Path
+) -> pd.DataFrame:
     """Return what each gains on each ring, and trainings beyond the expert that was tuned for all rings.
 
     Of several trainings the interval knows that they share the seeds.
     """
     roads = {name: road for name, road in gains_of(folder).items() if road["part"] in parts}
     drivers = next(iter(roads.values()))["gains"]
-    groups = {label: [who for who in drivers if _named(who, label)] for label in (*BESIDE, *labels)}
+    groups = {label: [who for who in drivers if _named(who, label)] for label in (*beside, *labels)}
 
     def grouped(name: str) -> dict[str, Floats]:
         """Return a number of each label's drivers, shape (roads, drivers, seeds)."""

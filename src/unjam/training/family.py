@@ -42,7 +42,7 @@ class FamilyRoad:
         return make_scenario(self.scenario, self.changes)
 
 
-def _ring(
+def ring_changes(
     vehicles: int, cavs: int, warmup: int, spacing: tuple[float, float] = (10.0, 12.27), **more: Any
 ) -> dict[str, Any]:
     """Return a ring's parameters; `spacing` is the road for each vehicle [m], the paper's by default."""
@@ -51,31 +51,31 @@ def _ring(
 
 
 FAMILY: dict[str, FamilyRoad] = {
-    "ring-22-standing": FamilyRoad("ring", _ring(22, 1, 0)),
-    "ring-22-growing": FamilyRoad("ring", _ring(22, 1, GROWING)),
-    "ring-22-grown": FamilyRoad("ring", _ring(22, 1, GROWN)),
-    "ring-33-growing-3-cavs": FamilyRoad("ring", _ring(33, 3, GROWING)),
-    "ring-44-grown": FamilyRoad("ring", _ring(44, 1, GROWN)),
-    "ring-44-growing-2-cavs": FamilyRoad("ring", _ring(44, 2, GROWING)),
-    "ring-66-grown-4-cavs": FamilyRoad("ring", _ring(66, 4, GROWN)),
-    "ring-22-wide": FamilyRoad("ring", _ring(22, 1, GROWN, (13.0, 16.0))),
-    "ring-22-hurried": FamilyRoad("ring", _ring(22, 1, GROWN, humans=HURRIED)),
-    "ring-22-late": FamilyRoad("ring", _ring(22, 1, GROWING, actuator={"lag": 0.3, "delay": 0.2})),
+    "ring-22-standing": FamilyRoad("ring", ring_changes(22, 1, 0)),
+    "ring-22-growing": FamilyRoad("ring", ring_changes(22, 1, GROWING)),
+    "ring-22-grown": FamilyRoad("ring", ring_changes(22, 1, GROWN)),
+    "ring-33-growing-3-cavs": FamilyRoad("ring", ring_changes(33, 3, GROWING)),
+    "ring-44-grown": FamilyRoad("ring", ring_changes(44, 1, GROWN)),
+    "ring-44-growing-2-cavs": FamilyRoad("ring", ring_changes(44, 2, GROWING)),
+    "ring-66-grown-4-cavs": FamilyRoad("ring", ring_changes(66, 4, GROWN)),
+    "ring-22-wide": FamilyRoad("ring", ring_changes(22, 1, GROWN, (13.0, 16.0))),
+    "ring-22-hurried": FamilyRoad("ring", ring_changes(22, 1, GROWN, humans=HURRIED)),
+    "ring-22-late": FamilyRoad("ring", ring_changes(22, 1, GROWING, actuator={"lag": 0.3, "delay": 0.2})),
     "figure-eight-14": FamilyRoad("figure-eight"),
     "figure-eight-12": FamilyRoad("figure-eight", {"vehicles": 12}),
     "on-ramp-5": FamilyRoad("on-ramp", {"cav_share": 0.05}),
     "on-ramp-20": FamilyRoad("on-ramp", {"cav_share": 0.2}),
     "on-ramp-10-less-demand": FamilyRoad("on-ramp", {"cav_share": 0.1, "inflow": 2900.0}),
-    "ring-33-grown": FamilyRoad("ring", _ring(33, 1, GROWN), "combination"),
-    "ring-66-growing-2-cavs": FamilyRoad("ring", _ring(66, 2, GROWING), "combination"),
+    "ring-33-grown": FamilyRoad("ring", ring_changes(33, 1, GROWN), "combination"),
+    "ring-66-growing-2-cavs": FamilyRoad("ring", ring_changes(66, 2, GROWING), "combination"),
     "ring-44-late-hurried": FamilyRoad(
-        "ring", _ring(44, 2, GROWN, humans=HURRIED, actuator={"lag": 0.3, "delay": 0.2}), "combination"
+        "ring", ring_changes(44, 2, GROWN, humans=HURRIED, actuator={"lag": 0.3, "delay": 0.2}), "combination"
     ),
     "on-ramp-10": FamilyRoad("on-ramp", {"cav_share": 0.1}, "combination"),
-    "ring-22-dense": FamilyRoad("ring", _ring(22, 1, GROWN, (9.1, 9.8)), "axis"),
-    "ring-88-grown": FamilyRoad("ring", _ring(88, 1, GROWN), "axis"),
-    "ring-44-grown-5-cavs": FamilyRoad("ring", _ring(44, 5, GROWN), "axis"),
-    "ring-22-measured": FamilyRoad("ring", _ring(22, 1, GROWN, humans=MEASURED), "axis"),
+    "ring-22-dense": FamilyRoad("ring", ring_changes(22, 1, GROWN, (9.1, 9.8)), "axis"),
+    "ring-88-grown": FamilyRoad("ring", ring_changes(88, 1, GROWN), "axis"),
+    "ring-44-grown-5-cavs": FamilyRoad("ring", ring_changes(44, 5, GROWN), "axis"),
+    "ring-22-measured": FamilyRoad("ring", ring_changes(22, 1, GROWN, humans=MEASURED), "axis"),
     "figure-eight-wide": FamilyRoad("figure-eight", {"radius": (36, 38)}, "axis"),
     "on-ramp-10-more-demand": FamilyRoad(
         "on-ramp", {"cav_share": 0.1, "inflow": 3400.0, "ramp_flow": 600.0}, "axis"
@@ -93,7 +93,8 @@ GROUPS = (*dict.fromkeys(KINDS.values()), SHARED_RINGS, ALL_ROADS)
 """names of several roads"""
 
 
-def _is_in(road: FamilyRoad, group: str) -> bool:
+def is_in(road: FamilyRoad, group: str) -> bool:
+    """Return whether a road belongs to a group, one of `GROUPS`."""
     if group == SHARED_RINGS:
         changes = road.changes
         return road.scenario == "ring" and changes["cavs"] >= SEVERAL * changes["vehicles"]
@@ -102,4 +103,4 @@ def _is_in(road: FamilyRoad, group: str) -> bool:
 
 def roads_of(group: str, *parts: Part) -> dict[str, Scenario]:
     """Return the roads of some parts of the family, by name; `group` is one of `GROUPS`."""
-    return {name: road.make() for name, road in FAMILY.items() if road.part in parts and _is_in(road, group)}
+    return {name: road.make() for name, road in FAMILY.items() if road.part in parts and is_in(road, group)}

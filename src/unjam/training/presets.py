@@ -1,11 +1,12 @@
 """Named starting points of a training run: what differs from the defaults, and why."""
 
-from typing import Any, cast
+from typing import Any
 
 from unjam.errors import wrong, wrong_name
 from unjam.parameters import changed
-from unjam.scenarios.ring import Ring
-from unjam.training.family import FAMILY, roads_of
+from unjam.scenarios.ring import Loop
+from unjam.scenarios.scenario import Scenario
+from unjam.training.family import ALL_ROADS, FAMILY, SHARED_RINGS, roads_of
 
 PRESETS: dict[str, dict[str, Any]] = {
     # What the paper says, where it says something: Tables B2 to B5, section 4.1.
@@ -64,11 +65,13 @@ BRAKING_COST = 0.0075
 """weight of the acceleration's term where the speed's is such that the limit earns 1"""
 
 
-def _task(name: str, ring: Ring) -> dict[str, Any]:
-    """Return a ring of the family as a task; returns are alike: a share of what its people could drive."""
-    limits = [ring.limit(size) for size in ring.length]
-    speed = round(5.0 * len(limits) / sum(limits), 4)
-    reward = f"released:speed={speed},acceleration={BRAKING_COST}"
+def _task(name: str, road: Scenario) -> dict[str, Any]:
+    """Return a road of the family as a task; on loops one earns the share of what people could drive."""
+    reward = ""
+    if isinstance(road, Loop):
+        limits = [road.limit(size) for size in road.drawn_ranges[road.size]]
+        speed = round(5.0 * len(limits) / sum(limits), 4)
+        reward = f"released:speed={speed},acceleration={BRAKING_COST}"
     return {"scenario": FAMILY[name].scenario, "road": FAMILY[name].changes, "reward": reward, "name": name}
 
 
@@ -84,7 +87,35 @@ PRESETS["rings"] = {
     "ppo": {"batch_steps": 120_000, "gamma": 0.996},
     "virtual": {"virtual_ratio": 0.0},
     "evaluation": {"every": 10, "validation_episodes": 8, "episodes": 10, "baselines": ["human", "pi"]},
-    "tasks": [_task(name, cast(Ring, ring)) for name, ring in roads_of("rings", "seen").items()],
+    "tasks": [_task(name, ring) for name, ring in roads_of("rings", "seen").items()],
+}
+
+# Where several CAVs share a ring: a residual on all rings helps them and harms one that is alone. Twice as
+# large iterations learn in six of them what others unlearn: results/tried/shared-rings-settings.json.
+PRESETS["shared-rings"] = changed(
+    PRESETS["rings"],
+    {
+        "steps": 3_600_000,
+        "trpo": {"batch_steps": 240_000},
+        "ppo": {"batch_steps": 240_000},
+        "evaluation": {"every": 2, "validation_episodes": 16},
+        "tasks": [_task(name, ring) for name, ring in roads_of(SHARED_RINGS, "seen").items()],
+    },
+)
+
+# One residual for all roads of the family that may be seen, on the law for each: what such roads have in
+# common is what the CAV sees next to it, and how many others there are.
+PRESETS["everywhere"] = {
+    "expert": "unjam:best",
+    "steps": 1_500_000,
+    "world": "batch",
+    "sampling": "regret",
+    "policy": {"observe": ["local", "expert_acceleration", "cav_share"]},
+    "trpo": {"batch_steps": 75_000, "gamma": 0.996, "target_kl": 0.01},
+    "ppo": {"batch_steps": 75_000, "gamma": 0.996},
+    "virtual": {"virtual_ratio": 0.0},
+    "evaluation": {"every": 4, "validation_episodes": 6, "episodes": 10, "baselines": ["human"]},
+    "tasks": [_task(name, road) for name, road in roads_of(ALL_ROADS, "seen").items()],
 }
 
 GATHERING_PACER = "pacer:varying=true,gathering_speed=1.934,gathering_gap=0.445,regathering_gap=0.6469"
