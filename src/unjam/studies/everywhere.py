@@ -87,9 +87,6 @@ def _write(studies: StudyFolder, seeds: int, folder: Path, workers: int) -> None
             found |= {"tried": {}, "drove": {}, "rows": {}}
             if file.is_file():
                 found |= json.loads(file.read_text())
-                found["tried"] = found["tried"] or dict.fromkeys(TUNED[KINDS[road.scenario]], "")
-                found["tried"] = {driver: _version(driver) for driver in found["tried"]}
-                found["drove"] = {label: _version(str(JUDGED.get(label, label))) for label in found["rows"]}
             _go_on(scenario, TUNED[KINDS[road.scenario]], found, pool.run)
             write_whole(file, to_json(found))
 
