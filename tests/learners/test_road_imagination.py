@@ -7,9 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from unjam.drivers import PISaturation
+from unjam.drivers import IDM, PISaturation
 from unjam.drivers.network import Network
 from unjam.drivers.observation import observation_size
+from unjam.drivers.safety import SafetyFilter
+from unjam.drivers.sensors import Sensors
 from unjam.learners.imagination import full_policy
 from unjam.learners.road_imagination import RoadImagination
 from unjam.learners.settings import PolicySettings
@@ -24,6 +26,9 @@ from unjam.worlds.workers import EpisodeTask
 
 DECISIONS = 100
 RING = Ring(length=(220, 240), vehicles=20, cavs=2, horizon=400, warmup=0)
+WRONG = replace(
+    RING, sensors=Sensors(0.5, 0.5, dropout=0.1), safety=SafetyFilter(gap_error=0.5, speed_error=0.5)
+)
 POLICY = PolicySettings(hidden=(8,))
 VIRTUAL = VirtualSettings(model="road", k_max=DECISIONS, virtual_ratio=1.0)
 
@@ -78,8 +83,9 @@ def test_the_policy_goes_on_with_what_it_remembered() -> None:
     assert same > 0.5 * len(found.starts)
 
 
-def test_with_noise_returns_are_those_of_the_road() -> None:
-    imagination, _ = imagined(RING, network_of(0.05))
+@pytest.mark.parametrize("ring", [RING, WRONG], ids=["exact sensors", "wrong sensors"])
+def test_with_noise_returns_are_those_of_the_road(ring: Ring) -> None:
+    imagination, _ = imagined(ring, network_of(0.05))
     found = imagination.imagine(network_of(0.05), 1, 0, 1, lambda drawn: drawn)
     assert found is not None
     assert len(found.rewards) == 2 * 4 * 400 / 10
@@ -88,6 +94,13 @@ def test_with_noise_returns_are_those_of_the_road() -> None:
     assert facts["return_virtual"] == pytest.approx(facts["return_actual"], rel=0.1)
     assert facts["k_star"] == DECISIONS
     assert imagination.steps == 4 * 400
+
+
+def test_each_imagined_road_misreads_in_its_own_way() -> None:
+    imagination, _ = imagined(replace(WRONG, noise=0.0), network_of(0.0))
+    twice, people = np.array([[0, 0], [0, 0]]), known_speed("idm", RING)
+    one, other = imagination.driven(IDM(), {}, twice, DECISIONS, people, (1,))
+    assert np.abs(one.speeds - other.speeds).max() > 0.01
 
 
 def test_a_model_that_is_not_trusted_imagines_nothing() -> None:

@@ -127,7 +127,7 @@ class RoadImagination(Imagination[RoadModel]):
             choices: the moments, rows (recording, decision).
             decisions: of each road.
             people: how they drive.
-            seed: of all noise.
+            seed: of all noise, and of what sensors misread.
         """
         ring = cast(Ring, self.scenario)
         by_episode = {kept.episode: kept for kept in self.moments}
@@ -138,7 +138,7 @@ class RoadImagination(Imagination[RoadModel]):
         common = replace(ring, horizon=decisions, warmup=0, noise=noise, population="")
         world = RingBatch(
             [replace(common, length=(round(each.length),) * 2) for each in kept],
-            [(0,)] * len(kept),
+            [(*seed, number) for number in range(len(kept))],  # of sensors alone: all else is given
             reward=self._task.reward,
             draw=np.random.default_rng(list(seed)).standard_normal,
             people=people,

@@ -157,7 +157,8 @@ def remembered(expert: Driver, recordings: Sequence[Recording], choices: NDArray
     """Return what the expert remembered before each of the decisions `choices`, rows (recording, decision).
 
     It is driven once more over the recorded states, from the memory with which the recording began: that is
-    exact for every driver, since a driver's memory depends on what it has seen alone.
+    exact for every driver, since a driver's memory depends on what it has seen alone. Where sensors err,
+    it is what exact ones would have left: what was misread is not recorded.
 
     Returns:
         NumPy arrays with a row for each choice.

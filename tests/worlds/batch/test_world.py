@@ -11,10 +11,12 @@ import torch
 from torch import Tensor
 
 from unjam.drivers import Constant, Driver
+from unjam.drivers.command import Command
 from unjam.drivers.driver import Memory
 from unjam.drivers.local_state import LocalState
 from unjam.drivers.registry import named_driver
 from unjam.drivers.safety import Actuator, SafetyFilter
+from unjam.drivers.sensors import Sensors
 from unjam.errors import InputError
 from unjam.measures.metrics import measure
 from unjam.physics.arrays import Array
@@ -31,6 +33,10 @@ from unjam.worlds.workers import EpisodeTask
 
 SHORT = Ring(horizon=300)
 NO_FILTER = SafetyFilter(active=False)
+WRONG: dict[str, Any] = {
+    "sensors": Sensors(gap_error=0.5, speed_error=0.4, dropout=0.2),
+    "safety": SafetyFilter(gap_error=0.5, speed_error=0.5),
+}
 QUICK_PEOPLE = replace(SHORT.humans, exponent=3.0, time_headway=1.4, desired_speed=12.0)
 
 
@@ -68,6 +74,11 @@ RINGS: dict[str, tuple[Ring, str]] = {
     "a coarser step": (replace(SHORT, simulation_step=0.3), "pi"),
     "the paper's PI": (SHORT, "pi:time_constant=0"),
     "late cars": (replace(SHORT, actuator=Actuator(delay=0.2, lag=0.3)), "pi"),
+    "wrong sensors": (replace(SHORT, warmup=130, **WRONG), "idm"),
+    "wrong sensors of three late CAVs": (
+        replace(SHORT, cavs=3, steps_per_decision=3, actuator=Actuator(delay=0.2, lag=0.3), **WRONG),
+        "idm",
+    ),
     "raw": (replace(SHORT, actuation="raw", safety=NO_FILTER), "pi"),
     "wild people": (replace(SHORT, noise=10.0), "pi"),
     "people who brake as hard as they can": (replace(SHORT, noise=20.0), "human"),
@@ -119,8 +130,11 @@ def test_it_stays_so_for_five_minutes(simulation: Simulation) -> None:
 
 
 @pytest.mark.parametrize("hold", [1, 10])
-def test_a_network_sees_explores_and_is_recorded_as_in_sumo(hold: int, simulation: Simulation) -> None:
-    ring, driver = Ring(cavs=2, warmup=120, horizon=100), neural_driver(hold)
+@pytest.mark.parametrize("wrong", [{}, WRONG], ids=["exact sensors", "wrong sensors"])
+def test_a_network_sees_explores_and_is_recorded_as_in_sumo(
+    hold: int, wrong: dict[str, Any], simulation: Simulation
+) -> None:
+    ring, driver = Ring(cavs=2, warmup=120, horizon=100, **wrong), neural_driver(hold)
     for found, seed in zip(run_batch(tasks(ring, driver, (1, 2), True)), (1, 2), strict=True):
         actual = run_episode(ring, driver, seed, explore=True, simulation=simulation)
         assert_alike(found, actual)
@@ -181,8 +195,9 @@ def singles(values: Floats) -> Tensor:
     return torch.as_tensor(values, dtype=torch.float32)
 
 
-def test_tensors_do_what_arrays_do() -> None:
-    asked = tasks(Ring(horizon=200, cavs=2, warmup=100), neural_driver(10), range(3))
+@pytest.mark.parametrize("wrong", [{}, WRONG], ids=["exact sensors", "wrong sensors"])
+def test_tensors_do_what_arrays_do(wrong: dict[str, Any]) -> None:
+    asked = tasks(Ring(horizon=200, cavs=2, warmup=100, **wrong), neural_driver(10), range(3))
     for one, other in zip(run_batch(asked), run_batch(asked, doubles), strict=True):
         assert_alike(one, other)
 
@@ -192,6 +207,17 @@ def test_single_precision_is_near() -> None:
     for one, other in zip(run_batch(asked), run_batch(asked, singles), strict=True):
         assert np.abs(one.speeds - other.speeds).max() < 1e-3
         assert other.reward.sum() == pytest.approx(one.reward.sum(), rel=1e-4)
+
+
+def test_sensors_read_once_in_a_decision() -> None:
+    world, exact = (RingBatch([replace(SHORT, **each)] * 2, [(1,), (2,)]) for each in (WRONG, {}))
+    first = world.perceive()
+    assert world.perceive() is first
+    off = np.abs(first.leader_gap - exact.perceive().leader_gap)
+    assert 0.0 < off.min() <= off.max() <= 0.5
+    world.start(True)
+    world.advance(Command(np.zeros(2)))
+    assert world.perceive() is not first
 
 
 def test_sums_are_those_of_the_episodes() -> None:

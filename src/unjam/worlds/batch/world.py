@@ -27,6 +27,7 @@ from unjam.worlds.batch.lanes import CONTACT, Leader, end_of_lane, leaders, touc
 from unjam.worlds.batch.noise import Noise, Numbers, QuickNoise, SeededNoise
 from unjam.worlds.batch.people import People, people_speed, without_gap
 from unjam.worlds.batch.record import RingLog, Rings, as_numpy
+from unjam.worlds.batch.sensors import RingReadings
 from unjam.worlds.closed import HISTORY
 from unjam.worlds.reward import Outcome, make_reward, time_headway
 from unjam.worlds.world import Driven, OnProgress
@@ -44,8 +45,6 @@ def why_not(scenario: Scenario) -> str:
     exact = scenario.actuation == "raw" or (scenario.actuation == "shielded" and scenario.safety.active)
     if not exact:
         return "actuation: SUMO's own check decides what CAVs do; allowed: raw, or a safety filter that acts"
-    if not scenario.sensors.exact:
-        return "sensors: they err, which only SUMO's episodes know"
     if scenario.simulation_step > LONGEST_STEP:
         return f"simulation_step: {scenario.simulation_step:g} s; allowed: <= {LONGEST_STEP:g} s"
     return ""
@@ -121,6 +120,7 @@ class RingBatch:
         self._cars = Cars(scenario.safety, scenario.actuator, scenario.simulation_step)
         self._brakes = scenario.cav_brakes * scenario.simulation_step
         seeded = [others for _, others in drawn]
+        self._readings = RingReadings(scenario, roads[0].cav_ids, seeded, numbers)
         self._noise: Noise = (
             SeededNoise(seeded, vehicles, (scenario.horizon, cavs), numbers)
             if draw is None
@@ -159,7 +159,7 @@ class RingBatch:
         for step in range(scenario.warmup):
             left = scenario.warmup - step
             if left % each == 0 and left // each <= longest:
-                seen.append(self.perceive().each(as_numpy))
+                seen.append(self._state().each(as_numpy))
             self._simulate(None)
         if bool(self._crashed.any()):
             raise EpisodeError("collision in the all-human warm-up of a ring")
@@ -179,6 +179,10 @@ class RingBatch:
 
     def perceive(self) -> LocalState:
         """Return what the CAVs perceive now: arrays of shape (CAVs * W,)."""
+        return self._readings.of_drivers(self.decisions, self._state())
+
+    def _state(self) -> LocalState:
+        """Return what exact sensors of the CAVs would read now."""
         speed, gap = self._speed, self._gap
         share = self.roads[0].share_told(self.asked)
         return LocalState(
@@ -191,7 +195,7 @@ class RingBatch:
         )
 
     def _followed(self) -> Ahead:
-        """Return what the CAVs' filters know."""
+        """Return what exact sensors would tell the CAVs' filters."""
         speed, own = self._speed, self._places
         return Ahead(
             self._rows_at(speed, own), self._rows_at(speed, self._ahead), self._rows_at(self._gap, own)
@@ -258,7 +262,7 @@ class RingBatch:
         moved = self._people_speed(speed[:-1], Leader(speed[1:], self._gap))
         cavs, told = self._followed(), None
         if wanted is not None:
-            told, done = self._cars.carry_out("all", wanted, cavs)
+            told, done = self._cars.carry_out("all", wanted, self._readings.of_filters(cavs))
             commanded = next_speed(cavs.speed, done, step)
             obeyed = at_most(at_least(commanded, cavs.speed - self._brakes), self.scenario.top_speed)
             moved[own] = obeyed.reshape(self._shape)
