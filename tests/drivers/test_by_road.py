@@ -56,9 +56,6 @@ def test_where_nobody_is_for_shared_roads_they_are_as_others() -> None:
     wanted, _ = four.act(near(cav_share=np.full(3, 0.2)), four.initial_memory(3))
     assert np.all(wanted == 0.1 * KINDS_OF_ROAD.index("loop"))
     assert driver_from_recipe(*recipe_of(four)) == four
-    recipe, arrays = recipe_of(four)
-    del recipe["several"]  # as files of before have it
-    assert driver_from_recipe(recipe, arrays) == four
 
 
 def test_it_is_made_again_from_its_recipe_and_from_its_file(tmp_path: Path) -> None:

@@ -207,10 +207,10 @@ def test_more_is_driven_where_a_validation_shows_that_the_policy_falls_short(tmp
         trainer = Trainer(tmp_path / "run", config, workers)
         network = trainer.training.learner.network()
         assert [len(driven) for driven in trainer.collect(network, 1)] == [3, 3]
-        trainer._reached = [0.0, 1e6]  # the short one can be driven better than it is
-        trainer._follow([0.0, 0.0])
+        trainer._sampler.reached = [0.0, 1e6]  # the short one can be driven better than it is
+        trainer._sampler.follow([0.0, 0.0])
         assert [len(driven) for driven in trainer.collect(network, 2)] == [2, 5]
-        assert trainer._reached == [0.0, 1e6]
+        assert trainer._sampler.reached == [0.0, 1e6]
 
 
 def test_a_training_that_was_stopped_goes_on_sampling_where_it_did(tmp_path: Path) -> None:

@@ -34,9 +34,8 @@ class ByRoad(Wrapper):
     elsewhere: Driver
     """on roads with ends of which nothing is told"""
     shared: Driver | None = None
-    """on closed roads that do not cross themselves, where a service tells that at least `several` of all are
+    """on closed roads that do not cross themselves, where a service tells that at least `SEVERAL` of all are
     CAVs; None: as on others of the kind"""
-    several: float = SEVERAL
 
     @property
     def inner(self) -> dict[str, Driver]:
@@ -68,7 +67,7 @@ class ByRoad(Wrapper):
     def recipe(self) -> Recipe:
         """Return what all of them are made from."""
         drivers = {kind: held.recipe() for kind, held in self.inner.items()}
-        return {"kind": "by-road", "drivers": drivers, "several": self.several}
+        return {"kind": "by-road", "drivers": drivers}
 
     def _kind(self, state: LocalState) -> str:
         """Return on what kind of road the CAVs are."""
@@ -83,4 +82,4 @@ class ByRoad(Wrapper):
         if self.shared is None or share is None:
             return "loop"
         told = share if isinstance(share, float) else float(share[0])
-        return "shared" if told >= self.several else "loop"
+        return "shared" if told >= SEVERAL else "loop"

@@ -10,7 +10,7 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from unjam.drivers.adaptive_acc import AdaptiveACC
-from unjam.drivers.by_road import KINDS_OF_ROAD, SEVERAL, ByRoad
+from unjam.drivers.by_road import KINDS_OF_ROAD, ByRoad
 from unjam.drivers.car_following import ACC, BCM, IDM, LACC, OVM, Constant, Human
 from unjam.drivers.driver import Driver, Recipe
 from unjam.drivers.follower_stopper import FollowerStopper
@@ -166,7 +166,6 @@ RECIPES: dict[str, Callable[[Recipe, Arrays, Held], Driver]] = {
     "filtered": _filtered,
     "by-road": lambda recipe, arrays, held: ByRoad(
         **{kind: held(recipe["drivers"][kind], kind) for kind in KINDS_OF_ROAD if kind in recipe["drivers"]},
-        several=recipe.get("several", SEVERAL),
     ),
     "remembering": lambda recipe, arrays, held: Remembering(
         held(recipe["driver"], INNER), float(recipe["time_step"])

@@ -11,6 +11,38 @@ FOLLOWING = 0.5
 """part of the actual steps that regret shares out; weights share the rest, so that no road is forgotten"""
 
 
+class Sampler:
+    """How many episodes each task has now; with `regret`, each validation changes it."""
+
+    def __init__(self, tasks: Sequence[Task], kind: Sampling, reached: Sequence[float]) -> None:
+        """Begin with what weights say; `reached` is the best return of each task so far."""
+        self._tasks, self._kind, self.reached = tasks, kind, list(reached)
+        self._shares = self._by_weight = shares_by_weight(tasks)
+
+    def follow(self, found: Sequence[float]) -> None:
+        """Note what a validation has found, task by task."""
+        self.reached = [max(pair) for pair in zip(self.reached, found, strict=True)]
+        if self._kind == "regret":
+            self._shares = shares_by_regret(self._by_weight, self.reached, found)
+
+    def episodes(self, steps: int) -> list[int]:
+        """Return how many episodes each task has in an iteration of so many actual steps."""
+        return episodes_of_iteration(self._tasks, steps, self._shares)
+
+    def state(self) -> dict[str, list[float]]:
+        """Return all that is needed to go on."""
+        return {"reached": self.reached, "shares": self._shares}
+
+    def restore(self, state: dict[str, list[float]] | None) -> None:
+        """Go on from what `state` returned; None: from a checkpoint that knew weights alone."""
+        if state is not None:
+            self.reached, self._shares = state["reached"], state["shares"]
+
+    def mean(self, values: Sequence[float]) -> float:
+        """Return the mean of what each task has, by weight."""
+        return sum(share * value for share, value in zip(self._by_weight, values, strict=True))
+
+
 def shares_by_weight(tasks: Sequence[Task]) -> list[float]:
     """Return each task's share of the actual steps, as its weight says."""
     total = sum(task.weight for task in tasks)

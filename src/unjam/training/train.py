@@ -43,11 +43,9 @@ from unjam.training.folder import (
     start_folder,
 )
 from unjam.training.model_facts import write_model_facts
-from unjam.training.sampling import episodes_of_iteration, shares_by_regret, shares_by_weight
+from unjam.training.sampling import Sampler
 from unjam.training.seeds import VALIDATE
-from unjam.worlds.batch.run import run_batches
-from unjam.worlds.batch.world import why_not
-from unjam.worlds.record import Episode
+from unjam.worlds.batch.run import run_where_possible
 from unjam.worlds.workers import EpisodeTask, Workers
 
 MEANS = (
@@ -182,18 +180,13 @@ class Trainer:
         self, folder: Path, config: RunConfig, workers: Workers, on_iteration: OnIteration | None = None
     ) -> None:
         """Prepare a run, from its newest checkpoint if it has one."""
-        self.folder = folder
-        self.config = config
-        self.workers = workers
+        self.folder, self.config, self.workers = folder, config, workers
         self.tasks = config.make_tasks()
         self.folders = [folder / task.name for task in self.tasks]
         self.training = begin_training(self.tasks, config.policy, config.learner, config.virtual, config.seed)
         self._on_iteration = on_iteration or (lambda row: None)
-        self._shares = shares_by_weight(self.tasks)
-        self._sampled = self._shares
-        self._validation_best = -np.inf
-        self._expert_returns = [float("nan")] * len(self.tasks)
-        self._reached = self._expert_returns
+        self._validation_best, self._expert_returns = -np.inf, [float("nan")] * len(self.tasks)
+        self._sampler = Sampler(self.tasks, config.sampling, self._expert_returns)
         self._controllers = KeptControllers(self.folders)
         self._belongs = belonging(config)
         checkpoint = last_state(folder, {folder, *self.folders}, self._belongs)
@@ -203,8 +196,7 @@ class Trainer:
             self.training.restore(state, tensors)
             self._validation_best = state["validation_best"]
             self._expert_returns = state["expert_returns"]
-            self._reached = state.get("reached", self._expert_returns)  # runs of before had one sampling
-            self._sampled = state.get("sampled", self._shares)
+            self._sampler.restore(state.get("sampler"))
             note_lineage(folder, state["iteration"])
 
     def train(self) -> None:
@@ -214,9 +206,10 @@ class Trainer:
                 make_folder(place)
                 write_whole(place / "config.toml", to_toml(road))
         if self.training.iteration == 0:
-            self._reached = self._expert_returns = self.returns_of([task.expert for task in self.tasks])
+            self._expert_returns = self.returns_of([task.expert for task in self.tasks])
+            self._sampler.reached = self._expert_returns
             self._keep_controllers(self.training.learner.network(), best=True)
-            self._validation_best = self._mean(self._expert_returns)
+            self._validation_best = self._sampler.mean(self._expert_returns)
         algorithm_1(self.training, self.config.steps, self.collect, self.validate, self.write)
 
     def drivers(self, network: Network) -> list[Driver]:
@@ -225,7 +218,7 @@ class Trainer:
 
     def collect(self, network: Network, iteration: int) -> Collected:
         """Return the episodes of an iteration, at least one of each road, as many as its weight asks for."""
-        counts = episodes_of_iteration(self.tasks, self.config.learner.batch_steps, self._sampled)
+        counts = self._sampler.episodes(self.config.learner.batch_steps)
         return self._drive(self.drivers(network), counts, (self.config.seed, iteration), explore=True)
 
     def validate(self, iteration: Iteration, ended: bool = False) -> Validated:
@@ -236,22 +229,16 @@ class Trainer:
         scheduled = every > 0 and iteration.number % every == 0
         if scheduled or (every and last):
             found = self.returns_of(self.drivers(network))
-            if self._mean(found) > self._validation_best:
+            if self._sampler.mean(found) > self._validation_best:
                 self._keep_controllers(network, scheduled)
                 if scheduled:  # a longer run would not have looked here, and may go on from this checkpoint
-                    self._validation_best = self._mean(found)
+                    self._validation_best = self._sampler.mean(found)
             if scheduled:
-                self._follow(found)
+                self._sampler.follow(found)
         elif last:
             self._keep_controllers(network, best=False)
         iteration.seconds["validation"] = time.perf_counter() - started
         return found
-
-    def _follow(self, found: Sequence[float]) -> None:
-        """Note what was reached on each road, and sample the next iterations accordingly."""
-        self._reached = [max(pair) for pair in zip(self._reached, found, strict=True)]
-        if self.config.sampling == "regret":
-            self._sampled = shares_by_regret(self._shares, self._reached, found)
 
     def write(self, iteration: Iteration, validated: Validated) -> bool:
         """Write a row of progress, of the whole run and of each road, and a checkpoint.
@@ -267,15 +254,12 @@ class Trainer:
             names = [*RETURNS, *MEANS] if validated else [*RETURNS[:-1], *MEANS]
             whole = {
                 **rows[0],
-                **{name: self._mean([row[name] for row in rows]) for name in names},
+                **{name: self._sampler.mean([row[name] for row in rows]) for name in names},
                 **{"k_star": None, "eps_m": None, "virtual": {}},
                 "collisions": sum(row["collisions"] for row in rows),
                 "tasks": {
-                    task.name: {
-                        **{name: row[name] for name in (*RETURNS, "k_star", "eps_m")},
-                        "episodes": len(driven),
-                    }
-                    for task, row, driven in zip(self.tasks, rows, iteration.episodes, strict=True)
+                    task.name: {name: row[name] for name in (*RETURNS, "episodes", "k_star", "eps_m")}
+                    for task, row in zip(self.tasks, rows, strict=True)
                 },
             }
         append_line(self.folder / PROGRESS, to_json(whole))
@@ -285,8 +269,7 @@ class Trainer:
             "belongs": self._belongs,
             "validation_best": self._validation_best,
             "expert_returns": self._expert_returns,
-            "reached": self._reached,
-            "sampled": self._sampled,
+            "sampler": self._sampler.state(),
         }
         save_checkpoint(self.folder / "checkpoint", state, {**tensors, **self._controllers.tensors()})
         stopped, progress = self._on_iteration(whole) is False, read_progress(self.folder)
@@ -310,24 +293,11 @@ class Trainer:
             for part in range(count):
                 scenario = task.scenario.part(part, count) if self.config.spread else task.scenario
                 wanted.append(EpisodeTask(scenario, driver, (*seed, len(wanted)), task.reward, explore))
-        episodes = self._driven(wanted)
+        run = self.workers.run
+        episodes = run_where_possible(wanted, run) if self.config.world == "batch" else run(wanted)
         raise_failure([measure(episode) for episode in episodes if not episode.ok])
         ends = np.cumsum(counts)
         return [episodes[end - count : end] for end, count in zip(ends, counts, strict=True)]
-
-    def _driven(self, wanted: Sequence[EpisodeTask]) -> list[Episode]:
-        """Return the episodes of tasks, in their order: in batches, where that is wanted and possible."""
-        if self.config.world == "sumo":
-            return self.workers.run(wanted)
-        batched = [not why_not(task.scenario) for task in wanted]
-        quick = iter(run_batches([task for task, at_once in zip(wanted, batched, strict=True) if at_once]))
-        others = [task for task, at_once in zip(wanted, batched, strict=True) if not at_once]
-        slow = iter(self.workers.run(others) if others else ())
-        return [next(quick if at_once else slow) for at_once in batched]
-
-    def _mean(self, by_task: Sequence[float]) -> float:
-        """Return the mean over the roads by weight."""
-        return sum(share * value for share, value in zip(self._shares, by_task, strict=True))
 
     def _row(self, iteration: Iteration, validated: Validated, index: int) -> dict[str, Any]:
         """Return the row of progress of one road."""
@@ -337,6 +307,7 @@ class Trainer:
         return {
             "iteration": iteration.number,
             "actual_steps": iteration.actual_steps,
+            "episodes": len(measured),
             "virtual_steps": iteration.virtual_steps,
             "k_star": virtual.get("k_star"),
             "eps_m": virtual.get("eps_m"),

@@ -1,6 +1,6 @@
 """Episodes of many rings at once, instead of one after the other in SUMO."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import cast
 
 import numpy as np
@@ -12,7 +12,7 @@ from unjam.scenarios.ring import Ring
 from unjam.tree import mapped
 from unjam.worlds.batch.noise import Numbers
 from unjam.worlds.batch.record import Rings
-from unjam.worlds.batch.world import RingBatch, alike
+from unjam.worlds.batch.world import RingBatch, alike, why_not
 from unjam.worlds.drive import Drive, driven_to_the_end
 from unjam.worlds.episode import rewarded
 from unjam.worlds.record import Episode
@@ -80,6 +80,17 @@ def run_batches(tasks: Sequence[EpisodeTask]) -> list[Episode]:
     for batch in batches:
         found |= zip(batch, run_batch(list(batch.values())), strict=True)
     return [found[index] for index in range(len(tasks))]
+
+
+def run_where_possible(
+    tasks: Sequence[EpisodeTask], run: Callable[[Sequence[EpisodeTask]], list[Episode]]
+) -> list[Episode]:
+    """Return the episodes of tasks, in their order: in batches where that can be, else what `run` answers."""
+    batched = [not why_not(task.scenario) for task in tasks]
+    quick = iter(run_batches([task for task, at_once in zip(tasks, batched, strict=True) if at_once]))
+    others = [task for task, at_once in zip(tasks, batched, strict=True) if not at_once]
+    slow = iter(run(others) if others else ())
+    return [next(quick if at_once else slow) for at_once in batched]
 
 
 def _driven(task: EpisodeTask) -> tuple[Driver, str, bool]:
