@@ -6,10 +6,11 @@ from unjam.controller import SHIPPED_FOLDER, controller_bytes, make_driver
 from unjam.drivers.by_road import ByRoad
 
 HELD = {
-    "motorway": ("jam-ahead", 1.0),
+    "motorway": ("unjam:on-ramp-tuned", 1.0),
     "crossing": ("unjam:figure-eight-best", 0.1),
     "loop": ("unjam:rings-tuned", 0.1),
     "elsewhere": ("idm", 0.1),
+    "shared": ("unjam:shared-rings-tuned", 0.1),
 }
 """drivers by kind of road, and the time between two of their decisions there [s]"""
 

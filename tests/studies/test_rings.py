@@ -8,7 +8,7 @@ import pytest
 
 from unjam.drivers.by_road import SEVERAL
 from unjam.studies.everywhere import JUDGING
-from unjam.studies.rings import BESIDE, BEYOND, FRESH, RINGS, SHARED, _on_ring, table
+from unjam.studies.rings import BESIDE, FRESH, RINGS, SHARED, _on_ring, table
 from unjam.studies.study import PlannedRun, StudyFolder
 from unjam.training.family import FAMILY
 from unjam.training.presets import RINGS_TUNED
@@ -36,8 +36,8 @@ def test_a_row_is_the_mean_of_the_trainings_and_of_what_they_are_beyond_the_expe
     assert shown.loc["ring-22-grown", RINGS_TUNED].startswith("+1.00")
     # Two of three are the expert, and one gains next to nothing: 0.08 and 0.05 of what it gains.
     assert shown.loc["ring-22-grown", "residual"].startswith("+0.69")
-    assert shown.loc["mean", f"residual, {BEYOND}"].startswith("-0.31")
-    faster = shown.loc["ring-22-grown", f"residual, mean speed {BEYOND} [m/s]"]
+    assert shown.loc["mean", f"residual, beyond {RINGS_TUNED}"].startswith("-0.31")
+    faster = shown.loc["ring-22-grown", f"residual, mean speed beyond {RINGS_TUNED} [m/s]"]
     assert faster.startswith("-0."), "the whole episode, beside a driver that dissolves the wave"
     assert shown.loc["worst", "residual"] == "+0.68"
     assert shown.loc["not drivable", "residual"] == "0 of 6"

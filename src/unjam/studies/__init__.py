@@ -7,7 +7,7 @@ from unjam.studies.envelope import ENVELOPE
 from unjam.studies.everywhere import EVERYWHERE_STUDY
 from unjam.studies.figure_6 import FIGURE_6
 from unjam.studies.imagined import imagined
-from unjam.studies.rings import BESIDE, FRESH, ON_SHARED, SHARED, on_rings
+from unjam.studies.rings import BESIDE_SHARED, FRESH, SHARED, on_rings
 from unjam.studies.robustness import FIGURE_10, ROBUSTNESS
 from unjam.studies.study import PAPERS_ROADS, Study
 from unjam.studies.theory import FIGURE_8, THEORY
@@ -69,7 +69,7 @@ STUDIES: dict[str, Study] = {
     "shared-rings": on_rings(
         "what is tuned and what is learned where several CAVs share a ring, seen and new",
         {"shared-rings": 10},
-        *("shared-rings", SHARED, BESIDE | ON_SHARED, FRESH),
+        *("shared-rings", SHARED, BESIDE_SHARED, FRESH),
     ),
     "rings-alone": on_rings(
         "what TRPO and PPO gain on the rings of the family without an expert",

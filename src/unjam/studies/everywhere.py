@@ -39,7 +39,7 @@ Run = Callable[[list[EpisodeTask]], Iterable[Episode]]
 TUNED: dict[str, tuple[str, ...]] = {
     "rings": (
         *("pi", "unjam:ring-tuned", "unjam:ring-gap-tuned", "unjam:ring-jammed-tuned", "unjam:rings-tuned"),
-        "follower-stopper",
+        *("unjam:shared-rings-tuned", "follower-stopper"),
     ),
     "figure-eights": ("unjam:figure-eight-tuned", "pacer:varying=true"),
     "motorways": ("jam-ahead", "unjam:on-ramp-tuned", "cruise", "adaptive-acc"),

@@ -28,7 +28,7 @@ from unjam.studies.everywhere import (
 )
 from unjam.studies.study import VARIANTS, PlannedRun, Study, StudyFolder, measure_parts
 from unjam.training.family import FAMILY, GROWN, HURRIED, SHARED_RINGS, FamilyRoad, is_in, ring_changes
-from unjam.training.presets import RINGS_TUNED
+from unjam.training.presets import RINGS_TUNED, SHARED_RINGS_TUNED
 from unjam.training.seeds import held_out_seeds
 from unjam.worlds.batch.run import run_batches
 
@@ -39,6 +39,7 @@ BESIDE = {
     **{label: JUDGED[label] for label in ("PI, tuned on the rings", "unjam:ring-best")},
 }
 """who is driven beside those that are trained, by label"""
+BESIDE_SHARED = {SHARED_RINGS_TUNED: SHARED_RINGS_TUNED} | BESIDE
 RINGS = {name: road for name, road in FAMILY.items() if is_in(road, ROAD)}
 LATE = {"lag": 0.3, "delay": 0.2}
 SHARED = {
@@ -53,9 +54,6 @@ SHARED = {
 """rings that several CAVs share: those of the family, and more that nobody has trained or tuned on"""
 FRESH = held_out_seeds(20, 1000)
 """seeds on which nobody was driven when it was decided where a residual may act"""
-ON_SHARED: dict[str, str] = {}
-"""who was tuned for shared rings alone, by label"""
-BEYOND = f"beyond {RINGS_TUNED}"
 
 
 def on_rings(
@@ -68,7 +66,8 @@ def on_rings(
 ) -> Study:
     """Return the study of some variants, each with the most trainings that it wants.
 
-    They are trained on a group of the family, and judged on `rings` beside drivers by label.
+    They are trained on a group of the family, and judged on `rings` beside drivers by label; the first of
+    these is the one that was tuned for the same roads, which trainings are compared with.
     """
 
     def runs(seeds: int) -> list[PlannedRun]:
@@ -113,12 +112,13 @@ def _on_ring(
 def table(
     labels: Sequence[str], parts: tuple[str, ...], beside: Mapping[str, str], folder: Path
 ) -> pd.DataFrame:
-    """Return what each gains on each ring, and trainings beyond the expert that was tuned for all rings.
+    """Return what each gains on each ring, and trainings beyond the expert that was tuned for such rings.
 
     Of several trainings the interval knows that they share the seeds.
     """
     roads = {name: road for name, road in gains_of(folder).items() if road["part"] in parts}
     drivers = next(iter(roads.values()))["gains"]
+    expert = next(iter(beside))
     groups = {label: [who for who in drivers if _named(who, label)] for label in (*beside, *labels)}
 
     def grouped(name: str) -> dict[str, Floats]:
@@ -131,8 +131,8 @@ def table(
     gains, speeds = grouped("by_seed"), grouped("speeds")
     shown = dict(gains)
     for label in labels:
-        shown[f"{label}, {BEYOND}"] = gains[label] - gains[RINGS_TUNED]
-        shown[f"{label}, mean speed {BEYOND} [m/s]"] = speeds[label] - speeds[RINGS_TUNED]
+        shown[f"{label}, beyond {expert}"] = gains[label] - gains[expert]
+        shown[f"{label}, mean speed beyond {expert} [m/s]"] = speeds[label] - speeds[expert]
     rows = [
         {
             "road": name,

@@ -61,6 +61,8 @@ PRESETS["paper-exact"] = changed(
 
 RINGS_TUNED = "unjam:rings-tuned"
 """the expert that gets furthest on all rings of the family together"""
+SHARED_RINGS_TUNED = "unjam:shared-rings-tuned"
+"""the expert that gets furthest where several CAVs share a ring"""
 BRAKING_COST = 0.0075
 """weight of the acceleration's term where the speed's is such that the limit earns 1"""
 
@@ -95,7 +97,8 @@ PRESETS["rings"] = {
 PRESETS["shared-rings"] = changed(
     PRESETS["rings"],
     {
-        "steps": 3_600_000,
+        "expert": SHARED_RINGS_TUNED,
+        "steps": 2_400_000,
         "trpo": {"batch_steps": 240_000},
         "ppo": {"batch_steps": 240_000},
         "evaluation": {"every": 2, "validation_episodes": 16},
