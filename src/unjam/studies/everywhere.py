@@ -68,9 +68,10 @@ def driven(
     scenario: Scenario, drivers: dict[str, str], seeds: list[tuple[int, ...]], run: Run
 ) -> dict[str, Rows]:
     """Return what is kept of each driver's episodes, by label; `drivers` are names of drivers by label."""
+    made = [make_driver(name, scenario.decision_step) for name in drivers.values()]  # one each: networks
     tasks = [
-        EpisodeTask(scenario.part(index, len(seeds)), make_driver(name, scenario.decision_step), seed)
-        for name in drivers.values()
+        EpisodeTask(scenario.part(index, len(seeds)), driver, seed)
+        for driver in made
         for index, seed in enumerate(seeds)
     ]
     rows = [{key: row[key] for key in KEPT} for row in map(measure, run(tasks))]
