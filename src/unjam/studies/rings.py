@@ -27,7 +27,7 @@ from unjam.studies.everywhere import (
     gains_of,
 )
 from unjam.studies.study import VARIANTS, PlannedRun, Study, StudyFolder, measure_parts
-from unjam.training.family import FAMILY, GROWN, HURRIED, SHARED_RINGS, FamilyRoad, is_in, ring_changes
+from unjam.training.family import FAMILY, GROWN, HURRIED, LATE, SHARED_RINGS, FamilyRoad, is_in, ring_changes
 from unjam.training.presets import RINGS_TUNED, SHARED_RINGS_TUNED
 from unjam.training.seeds import held_out_seeds
 from unjam.worlds.batch.run import run_batches
@@ -41,7 +41,6 @@ BESIDE = {
 """who is driven beside those that are trained, by label"""
 BESIDE_SHARED = {SHARED_RINGS_TUNED: SHARED_RINGS_TUNED} | BESIDE
 RINGS = {name: road for name, road in FAMILY.items() if is_in(road, ROAD)}
-LATE = {"lag": 0.3, "delay": 0.2}
 SHARED = {
     **{name: road for name, road in FAMILY.items() if is_in(road, SHARED_RINGS)},
     "ring-88-grown-6-cavs": FamilyRoad("ring", ring_changes(88, 6, GROWN), "axis"),
