@@ -30,6 +30,7 @@ from unjam.scenarios.figure_eight import FigureEight
 from unjam.scenarios.on_ramp import OnRamp
 from unjam.scenarios.ring import Ring
 from unjam.scenarios.scenario import Scenario
+from unjam.studies.everywhere import file_of
 from unjam.studies.study import Study, StudyFolder, judged, read_part
 from unjam.training.export import export_controller
 from unjam.training.family import GROWN
@@ -44,6 +45,7 @@ ROADS: dict[str, str] = {
     "unjam:ring-gap-tuned": "ring",
     "unjam:ring-tuned": "ring",
     "unjam:rings-tuned": "ring",
+    "unjam:shared-rings-tuned": "ring",
     "unjam:ring-jammed-best": "ring-jammed",
     "unjam:ring-jammed-tuned": "ring-jammed",
     "unjam:figure-eight-best": "figure-eight",
@@ -54,6 +56,8 @@ OF_LANES = ("unjam:on-ramp-tuned", *(name for name, road in ROADS.items() if roa
 IMPAIRED_DRIVERS = ("unjam:best", "unjam:ring-best", "unjam:ring-jammed-best", "unjam:ring-jammed-tuned")
 ROOM = {"shorter": (8, 10), "as trained on": (10, 12), "longer": (13, 18)}
 """road for each vehicle [m], from and to"""
+WORST, DROVE = "worst", "drove"
+"""names of files: of the worst cases; and which shipped file drove each part, for others replace it"""
 KEPT = ("return", "mean_speed", "min_headway", "cav_max_braking", "steps", "collisions")
 """of each episode"""
 LANES: dict[str, dict[str, Any]] = {
@@ -126,18 +130,27 @@ def _write(studies: StudyFolder, seeds: int, folder: Path, workers: int) -> None
         "impaired": (impaired(0), IMPAIRED_DRIVERS, SEEDS_IMPAIRED),
         "impaired-jammed": (impaired(GROWN), IMPAIRED_DRIVERS, SEEDS_IMPAIRED),
     }
-    if not (folder / "worst.json").is_file():
-        worst = {controller: _worst_cases(controller, road) for controller, road in ROADS.items()}
-        write_whole(folder / "worst.json", to_json(worst))
-    missing = [part for part in parts if not (folder / f"{part}.json").is_file()]
+    drove = _read(folder, DROVE)
     with Workers(workers) as pool:
-        for part in missing:
-            roads, drivers, count = parts[part]
-            found = {}
+        for part, (roads, drivers, count) in {WORST: (iter(()), tuple(ROADS), 1), **parts}.items():
+            known = drove.setdefault(part, {})
+            missing = [driver for driver in drivers if known.get(driver) != file_of(driver)]
+            if not missing:
+                continue
+            found = _read(folder, part)
+            if part == WORST:
+                found |= {driver: _worst_cases(driver, ROADS[driver]) for driver in missing}
             for name, road in roads:
-                made = {driver: make_driver(driver, road.decision_step) for driver in (PEOPLE, *drivers)}
-                found[name] = judged(road, made, count, KEPT, pool)
+                made = {driver: make_driver(driver, road.decision_step) for driver in (PEOPLE, *missing)}
+                found[name] = found.get(name, {}) | judged(road, made, count, KEPT, pool)
             write_whole(folder / f"{part}.json", to_json(found))
+            known |= {driver: file_of(driver) for driver in missing}
+            write_whole(folder / f"{DROVE}.json", to_json(drove, indent=1))
+
+
+def _read(folder: Path, name: str) -> dict[str, Any]:
+    """Return what a file of the study holds; nothing where there is none yet."""
+    return read_part(folder, name) if (folder / f"{name}.json").is_file() else {}
 
 
 def _worst_cases(controller: str, road: str) -> dict[str, Any]:
@@ -161,7 +174,7 @@ def worst_table(folder: Path) -> pd.DataFrame:
             "smallest headway [s]": f"{worst['smallest_headway']:.2f}",
             "hardest braking [m/s²]": f"{worst['hardest_braking']:.1f}",
         }
-        for controller, worst in read_part(folder, "worst").items()
+        for controller, worst in read_part(folder, WORST).items()
     )
 
 
@@ -245,7 +258,7 @@ ENVELOPE = Study(
     minutes=30.0,
     goes_on=True,
     tables={
-        "worst": worst_table,
+        WORST: worst_table,
         **{part: partial(domain_table, part) for part in ("rings", "figure-eights")},
         **{part: partial(contact_table, part) for part in ("rings-raw", "lanes-raw")},
         **{part: partial(impaired_table, part) for part in ("impaired", "impaired-jammed")},

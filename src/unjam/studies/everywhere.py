@@ -97,24 +97,24 @@ def _go_on(scenario: Scenario, tuned: Sequence[str], found: dict[str, Any], run:
 
     Experts and drivers that came later, or whose shipped file is another one now, are not known.
     """
-    new = [driver for driver in tuned if found["tried"].get(driver) != _version(driver)]
+    new = [driver for driver in tuned if found["tried"].get(driver) != file_of(driver)]
     if new:
         candidates = dict.fromkeys((PEOPLE, found["best"], *new))
         rows = driven(scenario, {driver: driver for driver in candidates}, CHOOSING, run)
         found["best"] = best_of(rows)
-        found["tried"] |= {driver: _version(driver) for driver in new}
+        found["tried"] |= {driver: file_of(driver) for driver in new}
     asked = {PEOPLE: PEOPLE, found["best"]: found["best"], **JUDGED}
     missing = {
         label: driver
         for label, driver in asked.items()
-        if label not in found["rows"] or found["drove"][label] != _version(driver)
+        if label not in found["rows"] or found["drove"][label] != file_of(driver)
     }
     if missing:
         found["rows"] |= driven(scenario, missing, JUDGING, run)
-        found["drove"] |= {label: _version(driver) for label, driver in missing.items()}
+        found["drove"] |= {label: file_of(driver) for label, driver in missing.items()}
 
 
-def _version(driver: str) -> str:
+def file_of(driver: str) -> str:
     """Return which file a shipped controller is; nothing for others, whose name says what they are."""
     name = driver.removeprefix(SHIPPED)
     return "" if name == driver else sha256(shipped_file(name).read_bytes()).hexdigest()[:12]
