@@ -92,9 +92,9 @@ PRESETS["rings"] = {
     "tasks": [_task(name, ring) for name, ring in roads_of("rings", "seen").items()],
 }
 
-# Where several CAVs share a ring: a residual on all rings helps them and harms one that is alone. On the law for
-# all rings twice as large iterations learned in six of them what smaller ones unlearned; on the law that is tuned
-# for shared rings little is left to learn: results/tried/shared-rings-settings.json.
+# Where several CAVs share a ring: a residual on all rings helps them and harms one that is alone. On the law
+# for all rings twice as large iterations learned in six of them what smaller ones unlearned; on the law that
+# is tuned for shared rings little is left to learn: results/tried/shared-rings-settings.json.
 PRESETS["shared-rings"] = changed(
     PRESETS["rings"],
     {
