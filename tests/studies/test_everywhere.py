@@ -20,7 +20,7 @@ def test_each_road_has_a_row_and_the_mean_and_the_worst_follow() -> None:
     for parts in (("seen",), HELD_OUT):
         shown = table(parts, RESULTS)
         names = [name for name, road in roads.items() if road["part"] in parts]
-        assert list(shown["road"]) == [*names, "mean", "worst"]
+        assert list(shown["road"]) == [*names, "mean", "mean, where there is something to gain", "worst"]
         worst = min(roads[name]["gains"]["unjam:best"].mean for name in names)
         assert shown["unjam:best"].iloc[-1] == f"{worst:+.2f}"
 

@@ -40,6 +40,12 @@ def ceiling(row: dict[str, Any]) -> float:
     return row["mean_speed"] / row["speed_limit_ratio"]
 
 
+def nothing_to_gain(people: Rows, best: float) -> bool:
+    """Return whether the best is hardly better than people, so that only what is lost counts."""
+    before = float(np.mean([worth(row) for row in people]))
+    return best - before < LEAST * abs(before)
+
+
 def scaled(rows: Rows, people: Rows, best: float) -> Floats:
     """Return by how much a driver is better than people on each seed, over what the best is on average.
 
@@ -65,8 +71,7 @@ def gain(rows: Rows, people: Rows, best: float) -> Estimate:
     flow = paired_difference(rows, people, FLOW)
     slower = flow.high < -FLOW_LOST * float(np.mean([row[FLOW] for row in people]))
     verdict = drivable_in_all(rows, people)
-    before = float(np.mean([worth(row) for row in people]))
-    if best - before < LEAST * abs(before) or slower or verdict != DRIVABLE:
+    if nothing_to_gain(people, best) or slower or verdict != DRIVABLE:
         mean, low, high = min(mean, 0.0), min(low, 0.0), min(high, 0.0)
     return Estimate(mean, low, high, found.count)
 

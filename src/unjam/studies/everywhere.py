@@ -18,10 +18,11 @@ from matplotlib.figure import Figure
 from unjam.controller import SHIPPED, make_driver, shipped_file
 from unjam.files import to_json, write_whole
 from unjam.measures.drivable import DRIVABLE, drivable_in_all
-from unjam.measures.gain import MOST, WORST, Rows, gain, gain_by_seed, worth
+from unjam.measures.gain import MOST, WORST, Rows, gain, gain_by_seed, nothing_to_gain, worth
 from unjam.measures.metrics import measure
 from unjam.measures.statistics import estimate, signed
 from unjam.measures.table import PEOPLE
+from unjam.physics.arrays import Floats
 from unjam.reports.figures import INK, new_figure
 from unjam.scenarios.scenario import Scenario
 from unjam.studies.study import Study, StudyFolder
@@ -130,6 +131,8 @@ def best_of(rows: dict[str, Rows]) -> str:
 def gains_of(folder: Path) -> dict[str, dict[str, Any]]:
     """Return of each road its part, its best expert, and each driver's gain, speeds and verdict, by label.
 
+    `counts` is whether there is something to gain there.
+
     Speeds are means of the whole episode, start and waves included, seed by seed [m/s].
     """
     roads: dict[str, dict[str, Any]] = {}
@@ -144,6 +147,7 @@ def gains_of(folder: Path) -> dict[str, dict[str, Any]]:
         roads[found["road"]] = {
             **{key: found[key] for key in ("part", "best")},
             "people": float(np.mean([worth(row) for row in people])),
+            "counts": not nothing_to_gain(people, best),
             "gains": {label: gain(of, people, best) for label, of in rows.items()},
             "by_seed": {label: gain_by_seed(of, people, best) for label, of in rows.items()},
             "speeds": {label: np.array([row["mean_speed"] for row in of]) for label, of in rows.items()},
@@ -156,13 +160,22 @@ def table(parts: tuple[str, ...], folder: Path) -> pd.DataFrame:
     """Return what each driver gains on each road of some parts of the family, with the mean and the worst."""
     roads = {name: road for name, road in gains_of(folder).items() if road["part"] in parts}
     rows = [{"road": name, **_cells(road)} for name, road in roads.items()]
-    mean, worst = {"road": "mean"}, {"road": "worst"}
+    mean, gainful, worst = (
+        {"road": "mean"},
+        {"road": "mean, where there is something to gain"},
+        {"road": "worst"},
+    )
     for label in JUDGED:
-        gains = [road["gains"][label] for road in roads.values()]
-        mean[label] = signed(estimate(np.mean([road["by_seed"][label] for road in roads.values()], 0)), 2)
-        worst[label] = f"{min(each.mean for each in gains):+.2f}"
-    rows += [mean, worst]
+        by_seed = {name: road["by_seed"][label] for name, road in roads.items()}
+        mean[label] = _mean([*by_seed.values()])
+        gainful[label] = _mean([values for name, values in by_seed.items() if roads[name]["counts"]])
+        worst[label] = f"{min(road['gains'][label].mean for road in roads.values()):+.2f}"
+    rows += [mean, gainful, worst]
     return pd.DataFrame(rows).fillna("")
+
+
+def _mean(by_road: list[Floats]) -> str:
+    return signed(estimate(np.mean(by_road, 0)), 2)
 
 
 def _cells(road: dict[str, Any]) -> dict[str, str]:
