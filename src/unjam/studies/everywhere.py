@@ -48,6 +48,8 @@ TUNED: dict[str, tuple[str, ...]] = {
 """experts of which the best on a road is its 1"""
 PI_ON_RINGS = "pi:window=23,catch_up_speed=0.5994,gap_lower=3,gap_upper=50,time_constant=0.9775,safe_gap=4"
 """what `unjam tune rings --expert pi` finds"""
+HELD_OUT = ("combination", "axis")
+"""parts of the family that nobody has trained or tuned on"""
 JUDGED: dict[str, str] = {
     "unjam:best": "unjam:best",
     "PI, tuned on the rings": PI_ON_RINGS,
@@ -160,11 +162,8 @@ def table(parts: tuple[str, ...], folder: Path) -> pd.DataFrame:
     """Return what each driver gains on each road of some parts of the family, with the mean and the worst."""
     roads = {name: road for name, road in gains_of(folder).items() if road["part"] in parts}
     rows = [{"road": name, **_cells(road)} for name, road in roads.items()]
-    mean, gainful, worst = (
-        {"road": "mean"},
-        {"road": "mean, where there is something to gain"},
-        {"road": "worst"},
-    )
+    mean, worst = {"road": "mean"}, {"road": "worst"}
+    gainful = {"road": "mean, where there is something to gain"}
     for label in JUDGED:
         by_seed = {name: road["by_seed"][label] for name, road in roads.items()}
         mean[label] = _mean([*by_seed.values()])
@@ -172,6 +171,21 @@ def table(parts: tuple[str, ...], folder: Path) -> pd.DataFrame:
         worst[label] = f"{min(road['gains'][label].mean for road in roads.values()):+.2f}"
     rows += [mean, gainful, worst]
     return pd.DataFrame(rows).fillna("")
+
+
+def beyond(folder: Path) -> pd.DataFrame:
+    """Return by how much the first driver gains more than each single law, over the roads of each part."""
+    first, *others = JUDGED
+    roads, rows = gains_of(folder).values(), []
+    for label in others:
+        row = {"": f"{first} beyond {label}"}
+        for heading, parts in {"seen": ("seen",), "held out": HELD_OUT}.items():
+            by_road = [
+                road["by_seed"][first] - road["by_seed"][label] for road in roads if road["part"] in parts
+            ]
+            row[heading] = _mean(by_road)
+        rows.append(row)
+    return pd.DataFrame(rows)
 
 
 def _mean(by_road: list[Floats]) -> str:
@@ -201,12 +215,15 @@ def picture(folder: Path) -> Figure:
     return figure
 
 
-HELD_OUT = ("combination", "axis")
 EVERYWHERE_STUDY = Study(
     title="what one controller gains on every road of the family, seen and held out",
     runs=lambda seeds: [],
     write=_write,
     minutes=60.0,
     goes_on=True,
-    tables={"seen": partial(table, ("seen",)), "held out": partial(table, HELD_OUT)},
+    tables={
+        "seen": partial(table, ("seen",)),
+        "held out": partial(table, HELD_OUT),
+        "beyond": beyond,
+    },
 )
