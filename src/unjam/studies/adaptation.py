@@ -25,7 +25,6 @@ from unjam.scenarios.ring import Ring
 from unjam.studies.everywhere import PI_ON_RINGS
 from unjam.studies.study import Study, StudyFolder, measure_parts, read_part
 from unjam.training.family import GROWING, HURRIED
-from unjam.training.presets import RINGS_TUNED
 from unjam.training.seeds import held_out_seeds
 from unjam.worlds.batch.lanes import Leader
 from unjam.worlds.batch.run import begin
@@ -46,7 +45,7 @@ SETTLED = 0.95
 DRIVERS = {
     PEOPLE: "human",
     "PI, tuned on the rings": PI_ON_RINGS,
-    RINGS_TUNED: RINGS_TUNED,
+    "FollowerStopper": "follower-stopper",
     "unjam:best": "unjam:best",
 }
 
