@@ -1,14 +1,19 @@
 """The controllers that are part of the package."""
 
+import json
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import pytest
 
 import unjam
-from unjam.controller import SHIPPED, make_driver, shipped_file, shipped_names
+from unjam.controller import SHIPPED, load_controller, make_driver, shipped_file, shipped_names
+from unjam.controller.file import CERTIFICATE, read_controller
 from unjam.controller.verify import verify_controller
 from unjam.drivers import ResidualDriver
+from unjam.drivers.by_road import ByRoad
+from unjam.drivers.registry import recipe_of
 from unjam.drivers.wrappers import Filtered
 from unjam.errors import InputError
 from unjam.measures.drivable import DRIVABLE, drivable_in_all
@@ -18,6 +23,8 @@ from unjam.scenarios import FigureEight, Ring
 from unjam.training.presets import BEST
 from unjam.worlds.episode import run_episode
 from unjam.worlds.sumo.simulation import Simulation
+
+EVERYWHERE = Path(__file__).parents[2] / "results/everywhere"
 
 
 @pytest.mark.parametrize("name", shipped_names())
@@ -90,3 +97,19 @@ def test_none_is_undrivable_on_roads_it_was_never_trained_on(name: str, simulati
     for road in [*RINGS, *EIGHTS]:
         driven, alone = (row_of(each, road, simulation) for each in (f"{SHIPPED}{name}", "human"))
         assert drivable_in_all([driven], [alone]) == DRIVABLE, road
+
+
+@pytest.mark.parametrize("kind", ["loop", "shared", "crossing"])
+def test_each_law_of_the_controller_for_all_closed_roads_is_certified(kind: str) -> None:
+    best = load_controller(shipped_file("best"))
+    assert isinstance(best, ByRoad)
+    ships = kind == "crossing"
+    file = shipped_file("figure-eight-best") if ships else EVERYWHERE / f"certified/{kind}.unjam"
+    controller = read_controller(file)
+    assert isinstance(controller.driver, Filtered)
+    assert controller.driver.safety == Ring().safety, "the filter that every road has, too"
+    held = controller.driver if ships else controller.driver.driver
+    assert recipe_of(best.inner[kind])[0] == recipe_of(held)[0]
+    found = json.loads(controller.parts[CERTIFICATE])
+    assert found["worst"]["contacts"] == 0
+    assert found["worst"]["steps"] > 1_000_000
