@@ -1,6 +1,7 @@
 """A driver for every road: one law for each kind of road, chosen by what the road lets a car know of it."""
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import ClassVar
 
 from unjam.drivers.driver import Driver, Memory, Recipe
@@ -37,8 +38,8 @@ class ByRoad(Wrapper):
     """on closed roads that do not cross themselves, where a service tells that at least `SEVERAL` of all are
     CAVs; None: as on others of the kind"""
 
-    @property
-    def inner(self) -> dict[str, Driver]:
+    @cached_property
+    def inner(self) -> dict[str, Driver]:  # pyright: ignore[reportIncompatibleMethodOverride]
         """All of them, by the kind of road."""
         held = {kind: getattr(self, kind) for kind in KINDS_OF_ROAD}
         return {kind: driver for kind, driver in held.items() if driver is not None}
