@@ -29,6 +29,6 @@ def test_every_group_has_roads_of_both_kinds(group: str) -> None:
     assert roads_of(group, "combination", "axis")
 
 
-def test_rings_are_shared_where_a_twentieth_of_all_are_cavs() -> None:
+def test_rings_are_shared_where_six_in_a_hundred_are_cavs() -> None:
     assert list(roads_of("shared-rings", "seen")) == ["ring-33-growing-3-cavs", "ring-66-grown-4-cavs"]
     assert list(roads_of("shared-rings", "combination", "axis")) == ["ring-44-grown-5-cavs"]

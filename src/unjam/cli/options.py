@@ -150,7 +150,10 @@ def asked_run(
     scenario: Annotated[
         str | None, typer.Argument(help="Name of the scenario; the configuration's if left out.")
     ] = None,
-    preset: Annotated[str, typer.Option(help="Named starting point: demo, quick, best, rings, everywhere, paper.")] = "",
+    preset: Annotated[
+        str,
+        typer.Option(help="Named starting point: demo, quick, best, rings, shared-rings, everywhere, paper."),
+    ] = "",
     config: Annotated[Path | None, typer.Option(help="TOML file with any keys of the configuration.")] = None,
     settings: Annotated[
         list[str] | None,

@@ -10,8 +10,9 @@ from unjam.drivers.wrappers import Wrapper
 from unjam.physics.arrays import Array, namespace
 
 KINDS_OF_ROAD = ("motorway", "crossing", "loop", "elsewhere", "shared")
-SEVERAL = 0.05
-"""share of CAVs from which a closed road counts as shared among them"""
+SEVERAL = 0.06
+"""share of CAVs from which a closed road counts as shared among them; that of one CAV among sixteen does,
+too, for a share does not say how many they are"""
 
 
 @dataclass(frozen=True)

@@ -33,7 +33,6 @@ ACCELERATION_SCALE = 1.0
 LOOP_LENGTH_SCALE = 250.0
 ROUTE_POSITION_SCALE = 100.0
 TO_MERGE_SCALE = 1000.0
-CAV_SHARE_SCALE = 0.1
 
 
 class Seen(NamedTuple):
@@ -154,8 +153,8 @@ FEATURES: dict[str, Feature] = {
     "lane_speeds": _sections_ahead("lane_speeds", "in its lane"),
     "road_speeds": _sections_ahead("road_speeds", "on the road"),
     "cav_share": Feature(
-        lambda seen: as_column(seen.state.cav_share / CAV_SHARE_SCALE),
-        (Observed("share of CAVs", CAV_SHARE_SCALE, ""),),
+        lambda seen: as_column(seen.state.cav_share),
+        (Observed("share of CAVs", 1.0, ""),),
         told=("cav_share",),
     ),
     "beside": Feature(
@@ -169,8 +168,8 @@ FEATURES: dict[str, Feature] = {
     ),
 }
 """all that a network can be shown: the paper's five numbers; the expert's acceleration; what the expert
-remembers; the length of the closed road; the place on it; the position along a road with ends; on motorways
-the wanted speed, the way to where a ramp joins, the speeds ahead in its lane and on all, the share of CAVs,
+remembers; the length of the closed road; the place on it; the position along a road with ends; the share of
+CAVs; on motorways the wanted speed, the way to where a ramp joins, the speeds ahead in its lane and on all,
 and who drives beside it"""
 
 

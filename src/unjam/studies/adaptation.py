@@ -173,15 +173,16 @@ def table(name: str, folder: Path) -> pd.DataFrame:
     for label in DRIVERS:
         found, at = measured(folder, name, label), CHANGE // SECOND
         speeds, after = found["speeds"], settled_after(**found)
-        settled, slowest = after[~np.isnan(after)], [_smooth(values[at:]).min() for values in speeds]
+        settled, slowest = np.isfinite(after), [_smooth(values[at:]).min() for values in speeds]
+        median = np.median(np.where(settled, after, np.inf))  # of all: who never settles is the last
         rows.append(
             {
                 "": label,
                 "before [m/s]": _cell(speeds[:, at - LAST : at].mean(1)),
                 "slowest ten seconds after [m/s]": _cell(np.array(slowest)),
                 "last minute [m/s]": _cell(speeds[:, -LAST:].mean(1)),
-                "settled": f"{len(settled)} of {len(after)}",
-                "after, in the median [s]": f"{np.median(settled):.0f}" if len(settled) else "–",
+                "settled": f"{settled.sum()} of {len(after)}",
+                "after, in the median [s]": f"{median:.0f}" if np.isfinite(median) else "–",
             }
         )
     return pd.DataFrame(rows)

@@ -110,7 +110,7 @@ def _go_on(scenario: Scenario, tuned: Sequence[str], found: dict[str, Any], run:
     missing = {
         label: driver
         for label, driver in asked.items()
-        if label not in found["rows"] or found["drove"][label] != file_of(driver)
+        if label not in found["rows"] or found["drove"].get(label) != file_of(driver)
     }
     if missing:
         found["rows"] |= driven(scenario, missing, JUDGING, run)

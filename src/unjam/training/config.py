@@ -115,6 +115,10 @@ class RunConfig(Agents):
         whys = [why_not(road.make_scenario()) for road in self.roads().values()]
         if self.world == "batch" and all(whys):
             raise ValueError(f"world: batch is not allowed; allowed: sumo, for {whys[0]}")
+        if self.sampling == "regret" and (len(self.tasks) < 2 or self.evaluation.every == 0):
+            raise ValueError(
+                "sampling: regret is not allowed; allowed: weights, but for several validated tasks"
+            )
         return self
 
     def roads(self) -> dict[str, "RunConfig"]:
@@ -136,6 +140,7 @@ class RunConfig(Agents):
                 expert=task.expert or self.expert,
                 reward=task.reward or self.reward,
                 tasks=(),
+                sampling="weights",
                 world="sumo",
             )
             batched = self.world == "batch" and not why_not(road.make_scenario())

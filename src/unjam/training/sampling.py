@@ -33,10 +33,9 @@ class Sampler:
         """Return all that is needed to go on."""
         return {"reached": self.reached, "shares": self._shares}
 
-    def restore(self, state: dict[str, list[float]] | None) -> None:
-        """Go on from what `state` returned; None: from a checkpoint that knew weights alone."""
-        if state is not None:
-            self.reached, self._shares = state["reached"], state["shares"]
+    def restore(self, state: dict[str, list[float]]) -> None:
+        """Go on from what `state` returned; without `shares`, of a checkpoint of before, as weights say."""
+        self.reached, self._shares = state["reached"], state.get("shares", self._by_weight)
 
     def mean(self, values: Sequence[float]) -> float:
         """Return the mean of what each task has, by weight."""

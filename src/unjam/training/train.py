@@ -196,7 +196,7 @@ class Trainer:
             self.training.restore(state, tensors)
             self._validation_best = state["validation_best"]
             self._expert_returns = state["expert_returns"]
-            self._sampler.restore(state.get("sampler"))
+            self._sampler.restore(state.get("sampler", {"reached": self._expert_returns}))
             note_lineage(folder, state["iteration"])
 
     def train(self) -> None:
@@ -217,7 +217,7 @@ class Trainer:
         return [full_policy(task, self.config.policy, network) for task in self.tasks]
 
     def collect(self, network: Network, iteration: int) -> Collected:
-        """Return the episodes of an iteration, at least one of each road, as many as its weight asks for."""
+        """Return the episodes of an iteration, at least one of each road, as many as the sampler asks for."""
         counts = self._sampler.episodes(self.config.learner.batch_steps)
         return self._drive(self.drivers(network), counts, (self.config.seed, iteration), explore=True)
 
@@ -256,7 +256,7 @@ class Trainer:
                 **rows[0],
                 **{name: self._sampler.mean([row[name] for row in rows]) for name in names},
                 **{"k_star": None, "eps_m": None, "virtual": {}},
-                "collisions": sum(row["collisions"] for row in rows),
+                **{name: sum(row[name] for row in rows) for name in ("collisions", "episodes")},
                 "tasks": {
                     task.name: {name: row[name] for name in (*RETURNS, "episodes", "k_star", "eps_m")}
                     for task, row in zip(self.tasks, rows, strict=True)

@@ -153,9 +153,8 @@ class VirtualDynamics:
         residual_reward = residual[-1].clip(*self._model.reward_range)
         nobody = gaps >= largest
         speed = speeds[0]
-        position = state.route_position + distance_driven(
-            state.speed, speed, scenario.simulation_step, scenario.steps_per_decision
-        )
+        driven = distance_driven(state.speed, speed, scenario.simulation_step, scenario.steps_per_decision)
+        position, ahead = state.route_position + driven, state.to_crossing
         following = LocalState(
             speed=speed,
             leader_speed=torch.where(nobody[0], speed, speeds[1]),
@@ -164,6 +163,9 @@ class VirtualDynamics:
             follower_gap=gaps[1],
             route_position=torch.where(state.loop_length.isnan(), position, position % state.loop_length),
             loop_length=state.loop_length,
+            # Behind a crossing the next is taken to be a lap away: rows do not know where else there is one.
+            to_crossing=None if ahead is None else (ahead - driven) % state.loop_length,
+            cav_share=state.cav_share,
         )
         earned = base_reward(self._model.base, self._reward, following, applied, crashed)
         bounded = torch.stack(
