@@ -1,13 +1,17 @@
 """Does the study of all roads say what its files hold?"""
 
 import json
+from functools import partial
 from math import nan
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from unjam.measures.gain import MOST, WORST
 from unjam.measures.table import PEOPLE
+from unjam.scenarios import Ring
+from unjam.studies import everywhere
 from unjam.studies.everywhere import HELD_OUT, JUDGED, best_of, gains_of, picture, table
 from unjam.training.family import FAMILY
 
@@ -45,3 +49,46 @@ def test_the_best_of_a_road_could_have_driven_so_in_every_episode() -> None:
 def test_the_picture_has_a_field_for_each_driver_on_each_road() -> None:
     axes = picture(RESULTS).axes[0]
     assert len(axes.texts) == len(gains_of(RESULTS)) * len(JUDGED)
+
+
+def test_only_what_is_not_known_is_driven_and_the_best_may_be_another(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A row is known while the shipped file that drove it is the one that is there."""
+    asked: list[list[str]] = []
+    speeds = {PEOPLE: 3.0, "pi": 4.0, "unjam:ring-tuned": 4.5}
+
+    def driven(scenario: object, drivers: dict[str, str], seeds: object, run: object) -> dict[str, Any]:
+        asked.append([*drivers.values()])
+        return {label: [{**row, "mean_speed_second_half": speeds[name]}] for label, name in drivers.items()}
+
+    found = json.loads((RESULTS / "00.json").read_text())
+    row = {**found["rows"]["unjam:best"][0], "travel_time": nan}
+    files = {"unjam:ring-tuned": "one"}
+    monkeypatch.setattr(everywhere, "driven", driven)
+    monkeypatch.setattr(everywhere, "JUDGED", {"PI": "pi"})
+    monkeypatch.setattr(everywhere, "file_of", lambda driver: files.get(driver, ""))
+
+    road: dict[str, Any] = {"best": PEOPLE, "tried": {}, "drove": {}, "rows": {}}
+    go_on = partial(everywhere._go_on, Ring(), found=road, run=lambda tasks: [])
+    go_on(("pi",))
+    assert (asked, road["best"]) == ([[PEOPLE, "pi"], [PEOPLE, "pi", "pi"]], "pi")
+    go_on(("pi",))
+    assert len(asked) == 2, "all is known"
+    go_on(("pi", "unjam:ring-tuned"))
+    assert (asked[2:], road["best"]) == (
+        [[PEOPLE, "pi", "unjam:ring-tuned"], ["unjam:ring-tuned"]],
+        "unjam:ring-tuned",
+    )
+    files["unjam:ring-tuned"] = "another"
+    go_on(("pi", "unjam:ring-tuned"))
+    assert asked[4:] == [[PEOPLE, "unjam:ring-tuned"], ["unjam:ring-tuned"]]
+    del road["drove"][PEOPLE]  # as files of before have it
+    go_on(("pi", "unjam:ring-tuned"))
+    assert asked[6:] == [[PEOPLE]]
+
+
+def test_a_shipped_controller_is_known_by_its_file_and_others_by_their_name() -> None:
+    assert everywhere.file_of("pi:window=23") == ""
+    names = ("unjam:best", "unjam:ring-tuned")
+    assert len({everywhere.file_of(name) for name in names} - {""}) == 2

@@ -70,6 +70,16 @@ def test_drives_round_the_loop() -> None:
     assert_close(step.state.loop_length, torch.tensor([230.0]))
 
 
+def test_what_a_map_and_a_service_say_stays_known() -> None:
+    told = {"cav_share": torch.tensor([0.1, 0.1]), "to_crossing": torch.tensor([20.0, 0.5])}
+    state = some_state(2)._replace(speed=torch.tensor([10.0, 10.0]), **told)
+    step = world(model(residual={})).step(state, torch.zeros(2), torch.zeros(2, 1))
+    assert_close(step.state.cav_share, told["cav_share"])
+    assert_close(step.state.to_crossing, torch.tensor([19.0, 229.5]))
+    silent = world(model(residual={})).step(some_state(2), torch.zeros(2), torch.zeros(2, 1))
+    assert silent.state.cav_share is silent.state.to_crossing is None
+
+
 @given(st.integers(0, 10**6))
 def test_rows_at_once_step_as_single_rows(seed: int) -> None:
     together = world(model())
