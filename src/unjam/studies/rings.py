@@ -49,7 +49,7 @@ BESIDE = {
     **{label: JUDGED[label] for label in ("PI, tuned on the rings", "unjam:ring-best")},
 }
 """who is driven beside those that are trained, by label"""
-BESIDE_SHARED = {SHARED_RINGS_TUNED: SHARED_RINGS_TUNED} | BESIDE
+BESIDE_SHARED = {SHARED_RINGS_TUNED: SHARED_RINGS_TUNED, RINGS_TUNED: RINGS_TUNED}
 RINGS = {name: road for name, road in FAMILY.items() if is_in(road, ROAD)}
 SHARED = {
     **{name: road for name, road in FAMILY.items() if is_in(road, SHARED_RINGS)},
