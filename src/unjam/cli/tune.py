@@ -73,7 +73,7 @@ def tune(
     from unjam.training.tried import ASKED
     from unjam.training.tune import space_around
     from unjam.training.tune import tune as run
-    from unjam.worlds.batch.world import why_not
+    from unjam.worlds.batch.possible import why_not
     from unjam.worlds.reward import make_reward
     from unjam.worlds.workers import Workers
 

@@ -24,7 +24,7 @@ from unjam.training.sampling import Sampling, episodes_of_iteration, shares_by_w
 from unjam.training.seeds import TRAINING_BELOW
 from unjam.trust import check_values
 from unjam.virtual.settings import VirtualSettings
-from unjam.worlds.batch.world import why_not
+from unjam.worlds.batch.possible import why_not
 from unjam.worlds.episode import Task
 
 CONFIG = "config.toml"

@@ -4,11 +4,15 @@ from collections.abc import Sequence
 from math import ceil
 from typing import Literal
 
+from unjam.drivers.driver import Driver
 from unjam.worlds.episode import Task
+from unjam.worlds.workers import EpisodeTask
 
 Sampling = Literal["weights", "regret"]
 FOLLOWING = 0.5
 """part of the actual steps that regret shares out; weights share the rest, so that no road is forgotten"""
+WARMED_UP_TOGETHER = 8
+"""iterations whose rings are warmed up at once: a few rings cost nearly as much as many"""
 
 
 class Sampler:
@@ -79,3 +83,29 @@ def episodes_of_iteration(tasks: Sequence[Task], steps: int, shares: Sequence[fl
         max(1, ceil(round(share * steps / task.scenario.horizon, 9)))
         for task, share in zip(tasks, shares, strict=True)
     ]
+
+
+def episodes_of(
+    tasks: Sequence[Task],
+    drivers: Sequence[Driver],
+    counts: Sequence[int],
+    seed: tuple[int, ...],
+    *,
+    spread: bool,
+    explore: bool,
+) -> list[EpisodeTask]:
+    """Return `counts` episodes of each task, one after the other; each has a number behind the seed.
+
+    With `spread` those of a road cover the range of what its scenario draws.
+    """
+    wanted: list[EpisodeTask] = []
+    for task, driver, count in zip(tasks, drivers, counts, strict=True):
+        for part in range(count):
+            scenario = task.scenario.part(part, count) if spread else task.scenario
+            wanted.append(EpisodeTask(scenario, driver, (*seed, len(wanted)), task.reward, explore))
+    return wanted
+
+
+def iterations_ahead(iteration: int, left: int, steps: int) -> range:
+    """Return an iteration and those that follow while so many actual steps are left, `steps` in each."""
+    return range(iteration, iteration + max(1, min(ceil(left / steps), WARMED_UP_TOGETHER)))

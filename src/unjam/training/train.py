@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -43,10 +44,10 @@ from unjam.training.folder import (
     start_folder,
 )
 from unjam.training.model_facts import write_model_facts
-from unjam.training.sampling import Sampler
+from unjam.training.sampling import Sampler, episodes_of, iterations_ahead
 from unjam.training.seeds import VALIDATE
 from unjam.worlds.batch.run import run_where_possible
-from unjam.worlds.workers import EpisodeTask, Workers
+from unjam.worlds.workers import Workers
 
 MEANS = (
     *("mean_speed", "speed_std_fleet", "cav_mean_speed", "speed_std_cav", "mean_abs_accel"),
@@ -218,8 +219,9 @@ class Trainer:
 
     def collect(self, network: Network, iteration: int) -> Collected:
         """Return the episodes of an iteration, at least one of each road, as many as the sampler asks for."""
-        counts = self._sampler.episodes(self.config.learner.batch_steps)
-        return self._drive(self.drivers(network), counts, (self.config.seed, iteration), explore=True)
+        batch_steps, left = self.config.learner.batch_steps, self.config.steps - self.training.actual_steps
+        seeds = [(self.config.seed, each) for each in iterations_ahead(iteration, left, batch_steps)]
+        return self._drive(self.drivers(network), self._sampler.episodes(batch_steps), *seeds)
 
     def validate(self, iteration: Iteration, ended: bool = False) -> Validated:
         """Now and then, and at the end, drive the validation seeds, and keep the best controller."""
@@ -281,20 +283,17 @@ class Trainer:
     def returns_of(self, drivers: Sequence[Driver]) -> list[float]:
         """Return the mean return on the validation seeds, by road, each driven by its own of `drivers`."""
         counts = [self.config.evaluation.validation_episodes] * len(self.tasks)
-        episodes = self._drive(drivers, counts, (VALIDATE,))
+        episodes = self._drive(drivers, counts, (VALIDATE,), explore=False)
         return [float(np.mean([measure(episode)["return"] for episode in driven])) for driven in episodes]
 
     def _drive(
-        self, drivers: Sequence[Driver], counts: Sequence[int], seed: tuple[int, ...], explore: bool = False
+        self, drivers: Sequence[Driver], counts: Sequence[int], *seeds: tuple[int, ...], explore: bool = True
     ) -> Collected:
-        """Run `counts` episodes that cover the range of what each scenario draws; raise where one failed."""
-        wanted = []
-        for task, driver, count in zip(self.tasks, drivers, counts, strict=True):
-            for part in range(count):
-                scenario = task.scenario.part(part, count) if self.config.spread else task.scenario
-                wanted.append(EpisodeTask(scenario, driver, (*seed, len(wanted)), task.reward, explore))
-        run = self.workers.run
-        episodes = run_where_possible(wanted, run) if self.config.world == "batch" else run(wanted)
+        """Run `counts` episodes of the first seed, road by road; those of the others are to come."""
+        all_of = partial(episodes_of, self.tasks, drivers, counts, spread=self.config.spread, explore=explore)
+        now, *coming = map(all_of, seeds)
+        at_once = partial(run_where_possible, run=self.workers.run, coming=list(chain(*coming)))
+        episodes = (at_once if self.config.world == "batch" else self.workers.run)(now)
         raise_failure([measure(episode) for episode in episodes if not episode.ok])
         ends = np.cumsum(counts)
         return [episodes[end - count : end] for end, count in zip(ends, counts, strict=True)]

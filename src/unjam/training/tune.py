@@ -30,8 +30,8 @@ from unjam.training.folder import origin
 from unjam.training.search import Choice, Range, Space, quiet_optuna
 from unjam.training.seeds import tuning_seeds
 from unjam.training.tried import Tried, Verdict
+from unjam.worlds.batch.possible import why_not
 from unjam.worlds.batch.run import run_batch
-from unjam.worlds.batch.world import why_not
 from unjam.worlds.record import Episode
 from unjam.worlds.workers import EpisodeTask, Workers
 

@@ -32,7 +32,7 @@ from unjam.virtual.fitting import (
 from unjam.virtual.model import BASES
 from unjam.virtual.settings import VirtualSettings
 from unjam.worlds.batch.people import People, people_speed
-from unjam.worlds.batch.world import why_not
+from unjam.worlds.batch.possible import why_not
 from unjam.worlds.record import Episode, Floats
 
 INPUTS = 4

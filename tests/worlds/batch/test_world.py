@@ -23,8 +23,10 @@ from unjam.physics.arrays import Array
 from unjam.scenarios import FigureEight, Ring
 from unjam.scenarios.population import Population, write_population
 from unjam.training.speed import neural_driver
-from unjam.worlds.batch.run import begin, run_batch, run_batches
-from unjam.worlds.batch.world import RingBatch, why_not
+from unjam.worlds.batch.begun import BegunRings
+from unjam.worlds.batch.possible import why_not
+from unjam.worlds.batch.run import BEGUN, begin, run_batch, run_batches
+from unjam.worlds.batch.world import RingBatch
 from unjam.worlds.drive import driven_to_the_end
 from unjam.worlds.episode import run_episode
 from unjam.worlds.record import Episode, Floats
@@ -120,6 +122,38 @@ def test_a_ring_of_the_batch_is_sumos_of_the_same_seed(name: str, simulation: Si
     driver = named_driver(expert, ring.decision_step)
     for found, seed in zip(run_batch(tasks(ring, driver, (1, 2))), (1, 2), strict=True):
         assert_alike(found, run_episode(ring, driver, seed, simulation=simulation))
+
+
+@pytest.mark.parametrize("name", ["people alone after a warm-up", "a CAV after a warm-up", "wrong sensors"])
+def test_a_ring_that_was_warmed_up_with_others_goes_on_to_the_same_bits(name: str) -> None:
+    ring, expert = RINGS[name]
+    now, coming = (tasks(ring, named_driver(expert, 0.1), seeds) for seeds in ((1, 2), (3, 4, 5)))
+    BEGUN.clear()
+    alone = run_batch(coming)
+    BEGUN.clear()
+    run_batches(now, coming=[*coming, *tasks(replace(ring, cavs=2), Constant(), [3])])
+    assert [(scenario.cavs, seed) for scenario, seed, _ in BEGUN] == [
+        (ring.cavs, (each,)) for each in range(1, 6)
+    ]
+    for found, expected in zip(run_batch(coming[::-1]), alone[::-1], strict=True):
+        assert found.speeds.tobytes() == expected.speeds.tobytes()
+        assert found.positions.tobytes() == expected.positions.tobytes()
+
+
+def test_rings_are_warmed_up_once_and_the_newest_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[list[str]] = []
+
+    def warm_up(rings: Sequence[str]) -> dict[str, Any]:
+        asked.append(list(rings))
+        return {ring: f"{ring} begun" for ring in rings}
+
+    monkeypatch.setattr("unjam.worlds.batch.begun.MOST_KEPT", 4)
+    kept = BegunRings[str]()
+    assert kept.of(["a", "b", "a"], ["b", "c"], warm_up) == ["a begun", "b begun", "a begun"]
+    assert kept.of(["c"], ["d"], warm_up) == ["c begun"], "nothing is missing, so nothing is warmed up ahead"
+    assert kept.of(["a", "e", "f"], [], warm_up) == ["a begun", "e begun", "f begun"]
+    assert asked == [["a", "b", "c"], ["e", "f"]]
+    assert list(kept) == ["b", "c", "e", "f"]
 
 
 def test_it_stays_so_for_five_minutes(simulation: Simulation) -> None:

@@ -61,14 +61,14 @@ def leaders(
     fastest = at_most(speed + people.max_acceleration * step, people.desired_speed)
     braking, headway = people.comfortable_deceleration, people.time_headway
     sight = fastest * (step + headway) + stopping_distance(fastest, braking, step)
-    beyond = [(place - edge * lane_length) % loop for edge in range(EDGES)]
-    last = [each.argmin(0) for each in beyond]
-    columns = xp.arange(speed.shape[1])
-    first = xp.stack([each[row, columns] for each, row in zip(beyond, last, strict=True)])
-    speeds = xp.stack([speed[row, columns] for row in last])
+    # A remainder takes longer than all else here; that of less than a loop is known.
+    beyond = place - xp.arange(EDGES)[:, None, None] * lane_length
+    beyond = xp.where(beyond < 0.0, beyond + loop, beyond)
+    last, columns = beyond.argmin(1), xp.arange(speed.shape[1])
+    first, speeds = beyond[xp.arange(EDGES)[:, None], last, columns], speed[last, columns]
     sees, looked_at = seen > 0.0, 0.0 * loop
     while bool(sees.any()):
-        lane = (lane + 1.0) % EDGES
+        lane = xp.where(lane == EDGES - 1.0, 0.0, lane + 1.0)
         number = xp.asarray(lane, dtype=xp.int64)
         front, there = first[number, columns], speeds[number, columns]
         # Whoever's rear bumper is still on a lane is there too.

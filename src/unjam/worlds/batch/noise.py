@@ -1,7 +1,7 @@
 """The noise of many episodes at once: each world's as SUMO's episode of its seed draws it, or quicker."""
 
-from collections.abc import Callable, Sequence
-from typing import Protocol
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +27,15 @@ class Noise(Protocol):
     def of_networks(self, decision: int) -> Array:
         """Return a number for each CAV, shape (CAVs * W,), for its network's exploration."""
         ...
+
+
+class NoiseState(NamedTuple):
+    """Where the noise of one world's people is."""
+
+    generator: Mapping[str, Any]
+    """state of its bit generator"""
+    left: NDArray[np.float64]
+    """of the block that was drawn last, the next step at the end, shape (steps, vehicles)"""
 
 
 class SeededNoise:
@@ -55,6 +64,20 @@ class SeededNoise:
             block = np.ascontiguousarray(self._drawn.transpose(1, 2, 0))
             self._left = list(self._numbers(block))[::-1]
         return self._left.pop()
+
+    def states(self) -> list[NoiseState]:
+        """Return where each world's noise is, NumPy arrays."""
+        left = np.array(self._left).reshape(-1, *self._drawn.shape[2:], len(self._people))
+        return [
+            NoiseState(generator.bit_generator.state, left[:, :, world].copy())
+            for world, generator in enumerate(self._people)
+        ]
+
+    def go_on(self, states: Sequence[NoiseState]) -> None:
+        """Go on from where each world's noise was; all must have as much left."""
+        for generator, state in zip(self._people, states, strict=True):
+            generator.bit_generator.state = dict(state.generator)
+        self._left = list(self._numbers(np.stack([state.left for state in states], 2)))
 
     def begin_anew(self) -> None:
         """Drop what is left of a block."""

@@ -3,11 +3,22 @@
 Sources: SUMO's MSCFModel_IDM (`_v`), MSCFModel (`finalizeSpeed`) and MSVehicle (`executeMove`).
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+
+import numpy as np
 
 from unjam.physics.arrays import Array, at_least, at_most
-from unjam.physics.idm import PARAMETER_NAMES, IDMParameters, IDMRows, by_squaring, idm_acceleration
+from unjam.physics.idm import (
+    PARAMETER_NAMES,
+    IDMParameters,
+    IDMRows,
+    by_squaring,
+    idm_acceleration,
+    parameter_rows,
+)
 from unjam.physics.kinematics import next_speed
+from unjam.scenarios.road import ClosedRoad
+from unjam.worlds.batch.noise import Numbers
 
 People = Callable[[Array, Array, Array], Array]
 """speeds, leaders' speeds and gaps to them, shape (vehicles, W), to the speeds after a step without noise"""
@@ -38,3 +49,11 @@ def people_speed(
 def without_gap(people: IDMParameters | IDMRows) -> IDMRows:
     """Return people who keep no gap at standstill, as to the end of a lane."""
     return IDMRows(**{name: getattr(people, name) for name in PARAMETER_NAMES})._replace(minimum_gap=0.0)
+
+
+def people_of(roads: Sequence[ClosedRoad], alike: IDMParameters, numbers: Numbers) -> IDMParameters | IDMRows:
+    """Return how the people of W roads drive: all alike, or each vehicle's driver, shape (vehicles, W)."""
+    if not roads[0].people:
+        return alike
+    drivers = [parameter_rows([road.people[name] for name in road.vehicle_ids]) for road in roads]
+    return IDMRows(*(numbers(np.stack(values, 1)) for values in zip(*drivers, strict=True)))

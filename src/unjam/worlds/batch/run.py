@@ -10,15 +10,20 @@ from unjam.drivers.residual import AGE
 from unjam.errors import InputError
 from unjam.scenarios.ring import Ring
 from unjam.tree import mapped
+from unjam.worlds.batch.begun import Begun, BegunRings
 from unjam.worlds.batch.noise import Numbers
+from unjam.worlds.batch.possible import alike, why_not
 from unjam.worlds.batch.record import Rings
-from unjam.worlds.batch.world import RingBatch, alike, why_not
+from unjam.worlds.batch.world import RingBatch
 from unjam.worlds.drive import Drive, driven_to_the_end
 from unjam.worlds.episode import rewarded
 from unjam.worlds.record import Episode
 from unjam.worlds.reward import make_reward
 from unjam.worlds.workers import EpisodeTask
 
+_Ring = tuple[Ring, tuple[int, ...], frozenset[str]]
+"""a ring, an episode's seed, and what of all that is told drivers ask for"""
+BEGUN = BegunRings[_Ring]()
 MOST = 128
 """rings that are stepped at once at most, where whole episodes are kept: some 130 MB for 22 vehicles each"""
 
@@ -47,28 +52,51 @@ def begin(
     return driving
 
 
-def run_batch(tasks: Sequence[EpisodeTask], numbers: Numbers = np.asarray) -> list[Episode]:
+def run_batch(
+    tasks: Sequence[EpisodeTask], numbers: Numbers = np.asarray, coming: Sequence[EpisodeTask] = ()
+) -> list[Episode]:
     """Return the episodes of tasks, as `run_episode` does in SUMO, but for rounding; all are stepped at once.
 
     Args:
         tasks: rings that differ in length and seed alone.
         numbers: makes the arrays that are stepped.
+        coming: tasks that will follow, alike; they are warmed up beforehand where these have to be.
 
     Raises:
-        InputError: the tasks differ in more, or `batch.world.why_not` says why they cannot be run so.
+        InputError: the tasks differ in more, or `batch.possible.why_not` says why they cannot be run so.
     """
     first = tasks[0]
     if any(_driven(each) != _driven(first) for each in tasks):
         raise InputError("batch: the tasks differ in driver, reward or exploration, or want fuel")
     scenarios, seeds = [cast(Ring, each.scenario) for each in tasks], [each.seed for each in tasks]
     world = RingBatch(scenarios, seeds, numbers, first.reward)
+    if numbers is np.asarray and world.scenario.warmup > 0:
+        world.begun = BEGUN.of([_ring(task) for task in tasks], [_ring(task) for task in coming], _warm_up)
     rings: Rings = driven_to_the_end(begin(world, first.driver, numbers, first.explore))
     earned = make_reward(first.reward or first.scenario.reward)
     return [rewarded(episode, earned) for episode in rings.episodes]
 
 
-def run_batches(tasks: Sequence[EpisodeTask]) -> list[Episode]:
-    """Return the episodes of tasks on rings of any kinds, in their order; those that are alike at once."""
+def _ring(task: EpisodeTask) -> _Ring:
+    return cast(Ring, task.scenario), task.seed, frozenset(task.driver.asks)
+
+
+def _warm_up(rings: Sequence[_Ring]) -> dict[_Ring, Begun]:
+    """Return rings after their warm-up, `MOST` at once."""
+    found: dict[_Ring, Begun] = {}
+    for some in (rings[first : first + MOST] for first in range(0, len(rings), MOST)):
+        scenarios, seeds, (asked, *_) = zip(*some, strict=True)
+        world = RingBatch(scenarios, seeds, keep=False)
+        world.asked = asked
+        found |= zip(some, world.warmed_up(), strict=True)
+    return found
+
+
+def run_batches(tasks: Sequence[EpisodeTask], coming: Sequence[EpisodeTask] = ()) -> list[Episode]:
+    """Return the episodes of tasks on rings of any kinds, in their order; those that are alike at once.
+
+    `coming` are tasks that will follow: see `run_batch`.
+    """
     batches: list[dict[int, EpisodeTask]] = []
     for index, task in enumerate(tasks):
         fits = (batch for batch in batches if len(batch) < MOST and _alike(task, next(iter(batch.values()))))
@@ -78,16 +106,24 @@ def run_batches(tasks: Sequence[EpisodeTask]) -> list[Episode]:
         batch[index] = task
     found: dict[int, Episode] = {}
     for batch in batches:
-        found |= zip(batch, run_batch(list(batch.values())), strict=True)
+        first = next(iter(batch.values()))
+        later = [task for task in coming if _alike(task, first)]
+        found |= zip(batch, run_batch(list(batch.values()), coming=later), strict=True)
     return [found[index] for index in range(len(tasks))]
 
 
 def run_where_possible(
-    tasks: Sequence[EpisodeTask], run: Callable[[Sequence[EpisodeTask]], list[Episode]]
+    tasks: Sequence[EpisodeTask],
+    run: Callable[[Sequence[EpisodeTask]], list[Episode]],
+    coming: Sequence[EpisodeTask] = (),
 ) -> list[Episode]:
-    """Return the episodes of tasks, in their order: in batches where that can be, else what `run` answers."""
+    """Return the episodes of tasks, in their order: in batches where that can be, else what `run` answers.
+
+    `coming` are tasks that will follow: see `run_batch`.
+    """
     batched = [not why_not(task.scenario) for task in tasks]
-    quick = iter(run_batches([task for task, at_once in zip(tasks, batched, strict=True) if at_once]))
+    later = [task for task in coming if not why_not(task.scenario)]
+    quick = iter(run_batches([task for task, at_once in zip(tasks, batched, strict=True) if at_once], later))
     others = [task for task, at_once in zip(tasks, batched, strict=True) if not at_once]
     slow = iter(run(others) if others else ())
     return [next(quick if at_once else slow) for at_once in batched]

@@ -6,7 +6,6 @@ ring of the first CAV, then of the second, and so on.
 """
 
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import fields
 from functools import reduce
 from typing import Any, cast
 
@@ -17,43 +16,21 @@ from unjam.drivers.local_state import LocalState
 from unjam.drivers.safety import Ahead, Cars
 from unjam.errors import EpisodeError, InputError
 from unjam.physics.arrays import Array, at_least, at_most, namespace
-from unjam.physics.idm import IDMParameters, IDMRows, parameter_rows
 from unjam.physics.kinematics import gap_on_loop, next_position, next_speed
 from unjam.scenarios.ring import Ring
 from unjam.scenarios.road import ClosedRoad
-from unjam.scenarios.scenario import VEHICLE_LENGTH, Scenario
+from unjam.scenarios.scenario import VEHICLE_LENGTH
 from unjam.worlds.audit import MOVING_SPEED
+from unjam.worlds.batch.begun import Begun
 from unjam.worlds.batch.lanes import CONTACT, Leader, end_of_lane, leaders, touching
 from unjam.worlds.batch.noise import Noise, Numbers, QuickNoise, SeededNoise
-from unjam.worlds.batch.people import People, people_speed, without_gap
+from unjam.worlds.batch.people import People, people_of, people_speed, without_gap
+from unjam.worlds.batch.possible import alike, why_not
 from unjam.worlds.batch.record import RingLog, Rings, as_numpy
 from unjam.worlds.batch.sensors import RingReadings
 from unjam.worlds.closed import HISTORY
 from unjam.worlds.reward import Outcome, make_reward, time_headway
 from unjam.worlds.world import Driven, OnProgress
-
-LONGEST_STEP = 0.37
-"""simulation step up to which SUMO's IDM makes one step of it [s]"""
-
-
-def why_not(scenario: Scenario) -> str:
-    """Return why a scenario cannot be stepped in a batch exactly as SUMO does it; empty where it can."""
-    if not isinstance(scenario, Ring):
-        return f"{scenario.title}: it is no ring"
-    if scenario.human_control != "native":
-        return "human_control: people are commanded"
-    exact = scenario.actuation == "raw" or (scenario.actuation == "shielded" and scenario.safety.active)
-    if not exact:
-        return "actuation: SUMO's own check decides what CAVs do; allowed: raw, or a safety filter that acts"
-    if scenario.simulation_step > LONGEST_STEP:
-        return f"simulation_step: {scenario.simulation_step:g} s; allowed: <= {LONGEST_STEP:g} s"
-    return ""
-
-
-def alike(one: Ring, other: Ring) -> bool:
-    """Return whether rings differ in their lengths alone, so that they can be stepped together."""
-    shared = (each.name for each in fields(one) if each.name != Ring.size)
-    return type(one) is type(other) and all(getattr(one, name) == getattr(other, name) for name in shared)
 
 
 class RingBatch:
@@ -66,6 +43,8 @@ class RingBatch:
     single, kept = False, None
     asked: Collection[str] = ()
     """fields of a `LocalState` that the driver looks at: of those that are told, only these are"""
+    begun: Sequence[Begun] = ()
+    """each ring after its warm-up, where that was run before; NumPy arrays"""
 
     def __init__(
         self,
@@ -115,7 +94,7 @@ class RingBatch:
         self._gap = numbers(gap_on_loop(start, np.roll(start, -1, 0), loops, VEHICLE_LENGTH))
         self._position = numbers(start)
         self._speed = numbers(np.zeros((vehicles + 1, worlds)))
-        self._people, self._drives = _people(roads, scenario, numbers), people
+        self._people, self._drives = people_of(roads, scenario.humans, numbers), people
         self._scale = numbers(np.full((vehicles, 1), scenario.noise_per_step * scenario.simulation_step))
         self._cars = Cars(scenario.safety, scenario.actuator, scenario.simulation_step)
         self._brakes = scenario.cav_brakes * scenario.simulation_step
@@ -148,19 +127,13 @@ class RingBatch:
         self._forget()
 
     def start(self, controlled: bool, on_progress: OnProgress | None = None) -> LocalState | None:
-        """Run the warm-up, then hand the CAVs over, unless they stay human (`controlled` false).
+        """Run the warm-up, unless it is `begun`; then hand the CAVs over, or they stay human.
 
         Returns:
             What the CAVs perceived in the last minute of the warm-up at the times of decisions, NumPy arrays
             of shape (CAVs * W, moments), oldest first; None without a warm-up that may be remembered.
         """
-        scenario, seen = self.scenario, list[LocalState]()
-        each, longest = scenario.steps_per_decision, round(HISTORY / scenario.decision_step)
-        for step in range(scenario.warmup):
-            left = scenario.warmup - step
-            if left % each == 0 and left // each <= longest:
-                seen.append(self._state().each(as_numpy))
-            self._simulate(None)
+        seen = self._go_on(self.begun) if self.begun else self._warm_up()
         if bool(self._crashed.any()):
             raise EpisodeError("collision in the all-human warm-up of a ring")
         self._controlled = controlled
@@ -168,9 +141,41 @@ class RingBatch:
             self._scale[self._places] = 0.0
             self._noise.begin_anew()
         self._forget()
+        return seen
+
+    def _warm_up(self) -> LocalState | None:
+        """Let people drive as long as the scenario says, and return what `start` does."""
+        scenario, seen = self.scenario, list[LocalState]()
+        each, longest = scenario.steps_per_decision, round(HISTORY / scenario.decision_step)
+        for step in range(scenario.warmup):
+            left = scenario.warmup - step
+            if left % each == 0 and left // each <= longest:
+                seen.append(self._state().each(as_numpy))
+            self._simulate(None)
         if not seen or not scenario.recall_warmup:
             return None
         return seen[0].each(lambda *values: np.stack(values, 1), *seen[1:])
+
+    def warmed_up(self) -> list[Begun]:
+        """Run the warm-up, and return each ring after it; with arrays of NumPy, and noise as SUMO's."""
+        seen, states = self._warm_up(), cast(SeededNoise, self._noise).states()
+        by_ring = seen and seen.each(lambda values: values.reshape(*self._shape, -1).swapaxes(0, 1).copy())
+        speed, position, gap = (values.T.copy() for values in (self._speed, self._position, self._gap))
+        found = []
+        for ring, noise in enumerate(states):
+            crashed, remembered = bool(self._crashed[ring]), by_ring and by_ring.at(ring)
+            found.append(Begun(speed[ring], position[ring], gap[ring], crashed, noise, remembered))
+        return found
+
+    def _go_on(self, begun: Sequence[Begun]) -> LocalState | None:
+        """Go on where rings had begun, and return what `start` does."""
+        speeds, positions, gaps, crashed, noise, seen = zip(*begun, strict=True)
+        self._speed, self._position, self._gap = (np.stack(each, 1) for each in (speeds, positions, gaps))
+        self._crashed = np.array(crashed)
+        cast(SeededNoise, self._noise).go_on(noise)
+        if seen[0] is None:
+            return None
+        return seen[0].each(lambda *values: np.stack(values, 1).reshape(self.rows, -1), *seen[1:])
 
     @property
     def ended(self) -> bool:
@@ -319,11 +324,3 @@ class RingBatch:
             if self._keep
             else (),
         )
-
-
-def _people(roads: Sequence[ClosedRoad], scenario: Ring, numbers: Numbers) -> IDMParameters | IDMRows:
-    """Return how people drive: all alike, or each vehicle's driver, shape (vehicles, W)."""
-    if not roads[0].people:
-        return scenario.humans
-    drivers = [parameter_rows([road.people[name] for name in road.vehicle_ids]) for road in roads]
-    return IDMRows(*(numbers(np.stack(values, 1)) for values in zip(*drivers, strict=True)))
