@@ -62,7 +62,7 @@ class Workers:
         # Of all workers, so that nothing stays behind of one that was killed.
         sweep_private_folders()
         self._temporary = PrivateFolder()
-        self._idle: queue.SimpleQueue[_Worker] = queue.SimpleQueue()
+        self._idle: queue.LifoQueue[_Worker] = queue.LifoQueue()
         self._all = [_Worker(silence, self._temporary.name) for _ in range(count)]
         self._threads = ThreadPoolExecutor(count, thread_name_prefix="unjam-worker")
         for worker in self._all:

@@ -70,7 +70,7 @@ def run_batch(
         raise InputError("batch: the tasks differ in driver, reward or exploration, or want fuel")
     scenarios, seeds = [cast(Ring, each.scenario) for each in tasks], [each.seed for each in tasks]
     world = RingBatch(scenarios, seeds, numbers, first.reward)
-    if numbers is np.asarray and world.scenario.warmup > 0:
+    if world.scenario.warmup > 0:
         world.begun = BEGUN.of([_ring(task) for task in tasks], [_ring(task) for task in coming], _warm_up)
     rings: Rings = driven_to_the_end(begin(world, first.driver, numbers, first.explore))
     earned = make_reward(first.reward or first.scenario.reward)

@@ -44,7 +44,7 @@ class RingBatch:
     asked: Collection[str] = ()
     """fields of a `LocalState` that the driver looks at: of those that are told, only these are"""
     begun: Sequence[Begun] = ()
-    """each ring after its warm-up, where that was run before; NumPy arrays"""
+    """each ring after its warm-up, where that was run before"""
 
     def __init__(
         self,
@@ -170,8 +170,9 @@ class RingBatch:
     def _go_on(self, begun: Sequence[Begun]) -> LocalState | None:
         """Go on where rings had begun, and return what `start` does."""
         speeds, positions, gaps, crashed, noise, seen = zip(*begun, strict=True)
-        self._speed, self._position, self._gap = (np.stack(each, 1) for each in (speeds, positions, gaps))
-        self._crashed = np.array(crashed)
+        self._speed, self._position, self._gap, self._crashed = (
+            self._numbers(np.stack(each, -1)) for each in (speeds, positions, gaps, crashed)
+        )
         cast(SeededNoise, self._noise).go_on(noise)
         if seen[0] is None:
             return None
