@@ -6,7 +6,13 @@ from hypothesis import strategies as st
 
 from unjam.drivers import PISaturation
 from unjam.scenarios import Ring
-from unjam.training.sampling import FOLLOWING, episodes_of_iteration, shares_by_regret, shares_by_weight
+from unjam.training.sampling import (
+    FOLLOWING,
+    episodes_of_iteration,
+    iterations_ahead,
+    shares_by_regret,
+    shares_by_weight,
+)
 from unjam.worlds.episode import Task
 
 RING = Ring(horizon=100)
@@ -53,3 +59,11 @@ def test_shares_sum_to_one_and_none_falls_below_what_weights_leave_it(
 
 def test_every_road_has_an_episode_however_small_its_share() -> None:
     assert episodes_of_iteration(tasks(1.0, 1.0), 1000, [0.001, 0.999]) == [1, 10]
+
+
+@pytest.mark.parametrize(
+    ("count", "left", "ahead"),
+    [(4, 10**6, 8), (4, 2500, 3), (4, 1, 1), (4, 0, 1), (64, 10**6, 8), (300, 10**6, 3), (4000, 10**6, 1)],
+)
+def test_iterations_are_warmed_up_ahead_as_far_as_they_are_kept(count: int, left: int, ahead: int) -> None:
+    assert iterations_ahead(5, left, 1000, tasks(1.0), [count]) == range(5, 5 + ahead)

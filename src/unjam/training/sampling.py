@@ -5,6 +5,8 @@ from math import ceil
 from typing import Literal
 
 from unjam.drivers.driver import Driver
+from unjam.scenarios.ring import Ring
+from unjam.worlds.batch.begun import MOST_KEPT
 from unjam.worlds.episode import Task
 from unjam.worlds.workers import EpisodeTask
 
@@ -106,6 +108,19 @@ def episodes_of(
     return wanted
 
 
-def iterations_ahead(iteration: int, left: int, steps: int) -> range:
-    """Return an iteration and those that follow while so many actual steps are left, `steps` in each."""
-    return range(iteration, iteration + max(1, min(ceil(left / steps), WARMED_UP_TOGETHER)))
+def iterations_ahead(
+    iteration: int, left: int, steps: int, tasks: Sequence[Task], counts: Sequence[int]
+) -> range:
+    """Return an iteration and those that follow whose rings are warmed up along with its own.
+
+    Args:
+        iteration: number of this one.
+        left: actual steps that are left, this iteration's among them.
+        steps: of an iteration.
+        tasks: roads.
+        counts: episodes of each in an iteration; so many that the next ones' would not be kept warm up alone.
+    """
+    roads = zip((task.scenario for task in tasks), counts, strict=True)
+    cavs = sum(count * road.cavs for road, count in roads if isinstance(road, Ring))
+    together = min(WARMED_UP_TOGETHER, MOST_KEPT // (2 * max(cavs, 1)), ceil(left / steps))
+    return range(iteration, iteration + max(together, 1))

@@ -219,9 +219,10 @@ class Trainer:
 
     def collect(self, network: Network, iteration: int) -> Collected:
         """Return the episodes of an iteration, at least one of each road, as many as the sampler asks for."""
-        batch_steps, left = self.config.learner.batch_steps, self.config.steps - self.training.actual_steps
-        seeds = [(self.config.seed, each) for each in iterations_ahead(iteration, left, batch_steps)]
-        return self._drive(self.drivers(network), self._sampler.episodes(batch_steps), *seeds)
+        steps, left = self.config.learner.batch_steps, self.config.steps - self.training.actual_steps
+        counts = self._sampler.episodes(steps)
+        ahead = iterations_ahead(iteration, left, steps, self.tasks, counts)
+        return self._drive(self.drivers(network), counts, *((self.config.seed, each) for each in ahead))
 
     def validate(self, iteration: Iteration, ended: bool = False) -> Validated:
         """Now and then, and at the end, drive the validation seeds, and keep the best controller."""

@@ -23,7 +23,8 @@ from unjam.physics.arrays import Array
 from unjam.scenarios import FigureEight, Ring
 from unjam.scenarios.population import Population, write_population
 from unjam.training.speed import neural_driver
-from unjam.worlds.batch.begun import BegunRings
+from unjam.worlds.batch.begun import Begun, BegunRings
+from unjam.worlds.batch.noise import NoiseState
 from unjam.worlds.batch.possible import why_not
 from unjam.worlds.batch.run import BEGUN, begin, run_batch, run_batches
 from unjam.worlds.batch.world import RingBatch
@@ -143,16 +144,20 @@ def test_a_ring_that_was_warmed_up_with_others_goes_on_to_the_same_bits(name: st
 def test_rings_are_warmed_up_once_and_the_newest_kept(monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[list[str]] = []
 
-    def warm_up(rings: Sequence[str]) -> dict[str, Any]:
+    def warm_up(rings: Sequence[str]) -> dict[str, Begun]:
         asked.append(list(rings))
-        return {ring: f"{ring} begun" for ring in rings}
+        still, noise = np.zeros(3), NoiseState({}, np.zeros((0, 2)))
+        return {ring: Begun(still, still[1:], still[1:], False, noise, None) for ring in rings}
 
     monkeypatch.setattr("unjam.worlds.batch.begun.MOST_KEPT", 4)
     kept = BegunRings[str]()
-    assert kept.of(["a", "b", "a"], ["b", "c"], warm_up) == ["a begun", "b begun", "a begun"]
-    assert kept.of(["c"], ["d"], warm_up) == ["c begun"], "nothing is missing, so nothing is warmed up ahead"
-    assert kept.of(["a", "e", "f"], [], warm_up) == ["a begun", "e begun", "f begun"]
-    assert asked == [["a", "b", "c"], ["e", "f"]]
+    first, second, same = kept.of(["a", "b", "a"], ["b", "c"], warm_up)
+    assert first is same is kept["a"]
+    assert second is kept["b"]
+    assert kept.of(["c"], ["d"], warm_up) == [kept["c"]]
+    assert asked == [["a", "b", "c"]], "where nothing is missing nothing is warmed up ahead"
+    assert kept.of(["a", "e", "f"], [], warm_up) == [first, kept["e"], kept["f"]]
+    assert asked[1:] == [["e", "f"]]
     assert list(kept) == ["b", "c", "e", "f"]
 
 

@@ -7,8 +7,8 @@ from unjam.drivers.local_state import LocalState
 from unjam.worlds.batch.noise import NoiseState
 from unjam.worlds.record import Floats
 
-MOST_KEPT = 1024
-"""rings that are kept: some 60 kB each, most of them what the CAV saw in the last minute"""
+MOST_KEPT = 2048
+"""CAVs whose rings are kept: some 60 kB each, most of them what the CAV saw in the last minute"""
 
 Ring = TypeVar("Ring", bound=Hashable)
 
@@ -27,6 +27,11 @@ class Begun(NamedTuple):
     noise: NoiseState
     seen: LocalState | None
     """what the CAVs perceived in the last minute, shape (CAVs, moments); None where that is not remembered"""
+
+    @property
+    def cavs(self) -> int:
+        """How many CAVs' past is kept, one at least."""
+        return 1 if self.seen is None else len(self.seen.speed)
 
 
 class BegunRings(dict[Ring, Begun]):
@@ -47,7 +52,10 @@ class BegunRings(dict[Ring, Begun]):
         known = {**self, **warm_up(new)} if missing else self
         found = [known[ring] for ring in wanted]
         if missing:
-            newest = list(known.items())[-MOST_KEPT:]
+            left = sum(begun.cavs for begun in known.values())
             self.clear()
-            self.update(newest)
+            for ring, begun in known.items():
+                if left <= MOST_KEPT:
+                    self[ring] = begun
+                left -= begun.cavs
         return found
