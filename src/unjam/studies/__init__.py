@@ -2,7 +2,7 @@
 
 from unjam.studies.adaptation import ADAPTATION
 from unjam.studies.comparison import FIGURE_5, comparison_of
-from unjam.studies.drivable import DRIVABLE_EIGHT, DRIVABLE_STUDY
+from unjam.studies.drivable import DRIVABLE_EIGHT, DRIVABLE_JAMMED, DRIVABLE_STUDY
 from unjam.studies.envelope import ENVELOPE
 from unjam.studies.everywhere import EVERYWHERE_STUDY
 from unjam.studies.figure_6 import FIGURE_6
@@ -60,6 +60,7 @@ STUDIES: dict[str, Study] = {
     "robustness": ROBUSTNESS,
     "drivable": DRIVABLE_STUDY,
     "drivable-eight": DRIVABLE_EIGHT,
+    "drivable-jammed": DRIVABLE_JAMMED,
     "envelope": ENVELOPE,
     "everywhere": EVERYWHERE_STUDY,
     "adaptation": ADAPTATION,

@@ -115,9 +115,11 @@ ROADS = {
 }
 
 
-def _write(roads: Sequence[str], studies: StudyFolder, seeds: int, folder: Path, workers: int) -> None:
+def _write(
+    roads: Sequence[str], variant: str, studies: StudyFolder, seeds: int, folder: Path, workers: int
+) -> None:
     made = {
-        road: [make_driver(str(studies.folder_of(run)), 0.1) for run in planned([road], ["best"], seeds)]
+        road: [make_driver(str(studies.folder_of(run)), 0.1) for run in planned([road], [variant], seeds)]
         for road in roads
     }
     with Workers(workers) as pool:
@@ -187,11 +189,11 @@ def _dissolved(times: Floats) -> str:
     return NOTHING if not share else f"{np.nanmean(times):.1f}" + (f" ({share:.0%})" if share < 1.0 else "")
 
 
-def _study(title: str, roads: Sequence[str], minutes: float) -> Study:
+def _study(title: str, roads: Sequence[str], minutes: float, variant: str = "best") -> Study:
     return Study(
         title=title,
-        runs=lambda seeds: planned(roads, ["best"], seeds),
-        write=partial(_write, roads),
+        runs=lambda seeds: planned(roads, [variant], seeds),
+        write=partial(_write, roads, variant),
         minutes=minutes,
         tables={road: partial(table, road) for road in roads},
     )
@@ -204,4 +206,10 @@ DRIVABLE_STUDY = _study(
 )
 DRIVABLE_EIGHT = _study(
     "what a drivable residual is worth beside the tuned expert, on the figure eight", ("figure-eight",), 5.0
+)
+DRIVABLE_JAMMED = _study(
+    "what a residual with settings of a search is worth beside the tuned expert, on the jammed ring",
+    ("ring-jammed",),
+    20.0,
+    "searched",
 )

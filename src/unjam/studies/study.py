@@ -158,6 +158,11 @@ PLAIN = {
     **{"trpo.target_kl": 0.01, "ppo.epochs": 20, "evaluation.every": 5, "evaluation.validation_episodes": 4},
 }
 """learning from nothing on many roads: with a residual's little noise it ends with CAVs that stand"""
+SEARCHED = {
+    **{"trpo.target_kl": 0.016, "trpo.gamma": 0.996, "trpo.gae_lambda": 0.96},
+    **{"policy.exploration_std": 0.05, "policy.hold": 1.5},
+}
+"""what a search found for the jammed ring, rounded: results/tried/ring-jammed-search"""
 VARIANTS: dict[str, Variant] = {
     "trpo": Variant("TRPO", "paper", ALONE),
     "ppo": Variant("PPO", "paper", {"agent": "ppo", **ALONE}),
@@ -185,6 +190,7 @@ VARIANTS: dict[str, Variant] = {
     "best": Variant("ours, all its steps", "best", {}, None),
     "best-few": Variant("ours, few steps", "best", SMALL, 756_000),
     "best-middle": Variant("ours, twice as many", "best", {"trpo.batch_steps": 24_000}, 1_512_000),
+    "searched": Variant("residual", "best", SEARCHED, 6_000_000),
     "rings": Variant("residual", "rings", TWO_EACH, None),
     "shared-rings": Variant("residual", "shared-rings", TWO_EACH, None),
     "rings-trpo": Variant("TRPO", "rings", PLAIN, 1_200_000),
