@@ -160,6 +160,13 @@ def test_nothing_to_do_is_done_at_once() -> None:
         assert processes(workers) == []
 
 
+def test_one_task_after_the_other_starts_one_process() -> None:
+    with Workers(2) as workers:
+        for seed in range(2):
+            workers.run([EpisodeTask(SHORT, IDM(), (seed,))])
+        assert len(processes(workers)) == 1
+
+
 def test_a_worker_goes_on_with_the_next_task(workers: Workers) -> None:
     workers.run([EpisodeTask(SHORT, IDM(), (0,))])
     first = processes(workers)
