@@ -10,7 +10,7 @@ from unjam.worlds.record import Floats
 MOST_KEPT = 2048
 """CAVs whose rings are kept: some 60 kB each, most of them what the CAV saw in the last minute"""
 
-Ring = TypeVar("Ring", bound=Hashable)
+Key = TypeVar("Key", bound=Hashable)
 
 
 class Begun(NamedTuple):
@@ -34,14 +34,14 @@ class Begun(NamedTuple):
         return 1 if self.seen is None else len(self.seen.speed)
 
 
-class BegunRings(dict[Ring, Begun]):
+class BegunRings(dict[Key, Begun]):
     """Rings that were warmed up already; the newest are kept."""
 
     def of(
         self,
-        wanted: Sequence[Ring],
-        coming: Sequence[Ring],
-        warm_up: Callable[[Sequence[Ring]], Mapping[Ring, Begun]],
+        wanted: Sequence[Key],
+        coming: Sequence[Key],
+        warm_up: Callable[[Sequence[Key]], Mapping[Key, Begun]],
     ) -> list[Begun]:
         """Return each wanted ring.
 
