@@ -31,6 +31,9 @@ LESS = {
 }
 """what is added to a command, for it to take seconds: options that its --help names, nothing else"""
 
+WITHOUT_WAVE = ["--set", "warmup=600"]
+"""for a wave to be there takes ten minutes of people alone"""
+
 
 def commands(text: str) -> list[list[str]]:
     """The words of every command in the text's consoles, without what is said about it."""
@@ -62,7 +65,8 @@ def test_every_unjam_command_of_the_readme_runs_in_its_order(
     verbs = [words for words in COMMANDS if words[0] == "unjam"]
     assert len(verbs) > 12
     for _, verb, *words in verbs:
-        ran = unjam(verb, *words, *LESS.get(verb, []), pictures=False)
+        short = WITHOUT_WAVE if verb in ("drive", "watch") and "ring-jammed" in words else []
+        ran = unjam(verb, *words, *LESS.get(verb, []), *short, pictures=False)
         assert ran.returncode == 0, f"unjam {verb} {shlex.join(words)}: {ran.stderr[-2000:]}"
     assert (tmp_path / "wave.mp4").stat().st_size > 1000
     monkeypatch.chdir(tmp_path)
