@@ -51,7 +51,9 @@ def without_gap(people: IDMParameters | IDMRows) -> IDMRows:
     return IDMRows(**{name: getattr(people, name) for name in PARAMETER_NAMES})._replace(minimum_gap=0.0)
 
 
-def people_of(roads: Sequence[ClosedRoad], alike: IDMParameters, numbers: Numbers) -> IDMParameters | IDMRows:
+def parameters_of(
+    roads: Sequence[ClosedRoad], alike: IDMParameters, numbers: Numbers
+) -> IDMParameters | IDMRows:
     """Return how the people of W roads drive: all alike, or each vehicle's driver, shape (vehicles, W)."""
     if not roads[0].people:
         return alike

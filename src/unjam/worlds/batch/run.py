@@ -95,7 +95,7 @@ def _warm_up(rings: Sequence[_Ring]) -> dict[_Ring, Begun]:
 def run_batches(tasks: Sequence[EpisodeTask], coming: Sequence[EpisodeTask] = ()) -> list[Episode]:
     """Return the episodes of tasks on rings of any kinds, in their order; those that are alike at once.
 
-    `coming` are tasks that will follow: see `run_batch`.
+    `coming` are tasks that will follow, of any kinds: see `run_batch`.
     """
     batches: list[dict[int, EpisodeTask]] = []
     for index, task in enumerate(tasks):
@@ -122,8 +122,7 @@ def run_where_possible(
     `coming` are tasks that will follow: see `run_batch`.
     """
     batched = [not why_not(task.scenario) for task in tasks]
-    later = [task for task in coming if not why_not(task.scenario)]
-    quick = iter(run_batches([task for task, at_once in zip(tasks, batched, strict=True) if at_once], later))
+    quick = iter(run_batches([task for task, at_once in zip(tasks, batched, strict=True) if at_once], coming))
     others = [task for task, at_once in zip(tasks, batched, strict=True) if not at_once]
     slow = iter(run(others) if others else ())
     return [next(quick if at_once else slow) for at_once in batched]

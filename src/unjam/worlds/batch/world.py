@@ -24,7 +24,7 @@ from unjam.worlds.audit import MOVING_SPEED
 from unjam.worlds.batch.begun import Begun
 from unjam.worlds.batch.lanes import CONTACT, Leader, end_of_lane, leaders, touching
 from unjam.worlds.batch.noise import Noise, Numbers, QuickNoise, SeededNoise
-from unjam.worlds.batch.people import People, people_of, people_speed, without_gap
+from unjam.worlds.batch.people import People, parameters_of, people_speed, without_gap
 from unjam.worlds.batch.possible import alike, why_not
 from unjam.worlds.batch.record import RingLog, Rings, as_numpy
 from unjam.worlds.batch.sensors import RingReadings
@@ -94,7 +94,7 @@ class RingBatch:
         self._gap = numbers(gap_on_loop(start, np.roll(start, -1, 0), loops, VEHICLE_LENGTH))
         self._position = numbers(start)
         self._speed = numbers(np.zeros((vehicles + 1, worlds)))
-        self._people, self._drives = people_of(roads, scenario.humans, numbers), people
+        self._people, self._drives = parameters_of(roads, scenario.humans, numbers), people
         self._scale = numbers(np.full((vehicles, 1), scenario.noise_per_step * scenario.simulation_step))
         self._cars = Cars(scenario.safety, scenario.actuator, scenario.simulation_step)
         self._brakes = scenario.cav_brakes * scenario.simulation_step
