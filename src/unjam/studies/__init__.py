@@ -7,11 +7,18 @@ from unjam.studies.envelope import ENVELOPE
 from unjam.studies.everywhere import EVERYWHERE_STUDY
 from unjam.studies.figure_6 import FIGURE_6
 from unjam.studies.imagined import imagined
-from unjam.studies.rings import BESIDE_SHARED, FRESH, SHARED, on_rings
+from unjam.studies.roads_together import (
+    BESIDE_EVERYWHERE,
+    BESIDE_SHARED,
+    FRESH,
+    SHARED,
+    trained_together,
+)
 from unjam.studies.robustness import FIGURE_10, ROBUSTNESS
 from unjam.studies.study import PAPERS_ROADS, Study
 from unjam.studies.theory import FIGURE_8, THEORY
 from unjam.studies.to_the_letter import to_the_letter
+from unjam.training.family import ALL_ROADS, SHARED_RINGS
 
 TABLE_1: dict[str, Study] = {
     f"table-1-{road}": comparison_of(
@@ -64,17 +71,22 @@ STUDIES: dict[str, Study] = {
     "envelope": ENVELOPE,
     "everywhere": EVERYWHERE_STUDY,
     "adaptation": ADAPTATION,
-    "rings": on_rings(
+    "rings": trained_together(
         "what one residual, trained on all rings of the family together, gains on each", {"rings": 10}
     ),
-    "shared-rings": on_rings(
+    "shared-rings": trained_together(
         "what is tuned and what is learned where several CAVs share a ring, seen and new",
         {"shared-rings": 10},
-        *("shared-rings", SHARED, BESIDE_SHARED, FRESH),
+        *(SHARED_RINGS, BESIDE_SHARED, SHARED, FRESH),
     ),
-    "rings-alone": on_rings(
+    "rings-alone": trained_together(
         "what TRPO and PPO gain on the rings of the family without an expert",
         {"rings-trpo": 5, "rings-ppo": 5},
+    ),
+    "everywhere-trained": trained_together(
+        "what one residual, and TRPO and PPO without an expert, gain on all roads of the family",
+        {"everywhere": 10, "everywhere-trpo": 5, "everywhere-ppo": 5},
+        *(ALL_ROADS, BESIDE_EVERYWHERE),
     ),
 }
 """every study by name"""

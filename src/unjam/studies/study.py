@@ -39,6 +39,7 @@ ROADS: dict[str, dict[str, Any]] = {
     "ring-jammed": {"scenario": "ring-jammed"},
     "rings": {"scenario": "ring"},
     "shared-rings": {"scenario": "ring"},
+    "everywhere": {"scenario": "ring"},
     "ring-11": {"scenario": "ring", "road.vehicles": 11},
     "ring-5": {"scenario": "ring", "road.vehicles": 5},
     "figure-eight": {"scenario": "figure-eight"},
@@ -195,6 +196,9 @@ VARIANTS: dict[str, Variant] = {
     "shared-rings": Variant("residual", "shared-rings", TWO_EACH, None),
     "rings-trpo": Variant("TRPO", "rings", PLAIN, 1_200_000),
     "rings-ppo": Variant("PPO", "rings", {"agent": "ppo", **PLAIN}, 1_200_000),
+    "everywhere": Variant("residual", "everywhere", TWO_EACH, None),
+    "everywhere-trpo": Variant("TRPO", "everywhere", PLAIN, MILLION),
+    "everywhere-ppo": Variant("PPO", "everywhere", {"agent": "ppo", **PLAIN}, MILLION),
     "best-imagined": Variant("ours, few steps and whole roads imagined", "best", IMAGINED, 756_000),
 }
 """the paper's methods with the paper's settings, and what we make of them"""

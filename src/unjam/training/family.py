@@ -100,7 +100,7 @@ GROUPS = (*dict.fromkeys(KINDS.values()), SHARED_RINGS, ALL_ROADS)
 """names of several roads"""
 
 
-def is_in(road: FamilyRoad, group: str) -> bool:
+def _is_in(road: FamilyRoad, group: str) -> bool:
     """Return whether a road belongs to a group, one of `GROUPS`."""
     if group == SHARED_RINGS:
         changes = road.changes
@@ -108,6 +108,11 @@ def is_in(road: FamilyRoad, group: str) -> bool:
     return group in (KINDS[road.scenario], ALL_ROADS)
 
 
+def family_roads(group: str) -> dict[str, FamilyRoad]:
+    """Return the roads of a group, one of `GROUPS`, seen and held out, by name."""
+    return {name: road for name, road in FAMILY.items() if _is_in(road, group)}
+
+
 def roads_of(group: str, *parts: Part) -> dict[str, Scenario]:
-    """Return the roads of some parts of the family, by name; `group` is one of `GROUPS`."""
-    return {name: road.make() for name, road in FAMILY.items() if road.part in parts and is_in(road, group)}
+    """Return the roads of some parts of a group, one of `GROUPS`, by name."""
+    return {name: road.make() for name, road in family_roads(group).items() if road.part in parts}

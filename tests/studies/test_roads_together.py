@@ -1,4 +1,4 @@
-"""Does the study of a residual for all rings say what its files hold?"""
+"""Do studies of what is trained on many roads together say what their files hold?"""
 
 import json
 from pathlib import Path
@@ -8,9 +8,9 @@ import pytest
 
 from unjam.drivers.by_road import SEVERAL
 from unjam.studies.everywhere import JUDGING
-from unjam.studies.rings import BESIDE, FRESH, RINGS, SHARED, _on_ring, table
+from unjam.studies.roads_together import BESIDE, FRESH, RINGS, SHARED, _on_road, table
 from unjam.studies.study import PlannedRun, StudyFolder
-from unjam.training.family import FAMILY
+from unjam.training.family import FAMILY, family_roads
 from unjam.training.presets import RINGS_TUNED
 
 EVERYWHERE = Path(__file__).parents[2] / "results/everywhere"
@@ -60,7 +60,9 @@ def test_shared_rings_are_judged_on_seeds_and_rings_that_chose_nothing() -> None
 def test_a_training_on_several_roads_is_finished_when_all_are_judged(tmp_path: Path) -> None:
     studies, run = StudyFolder(tmp_path), PlannedRun("rings", "rings", 0)
     assert studies.controller_of(run) == studies.folder_of(run) / "ring-22-standing"
-    assert set(run.config.roads()) == {name for name in RINGS if FAMILY[name].part == "seen"}
+    assert set(run.config.roads()) == {
+        name for name, ring in family_roads(RINGS).items() if ring.part == "seen"
+    }
     assert not studies.has(run)
 
 
@@ -71,9 +73,9 @@ def test_a_ring_is_driven_by_all_on_the_same_seeds(monkeypatch: pytest.MonkeyPat
         asked.append((set(drivers.values()), seeds))
         return {label: [] for label in drivers}
 
-    monkeypatch.setattr("unjam.studies.rings.driven", driven)
-    monkeypatch.setattr("unjam.studies.rings.best_of", lambda rows: "pi")
-    found = _on_ring("ring-22-grown", FAMILY["ring-22-grown"], BESIDE | {"residual 0": "runs/0"}, JUDGING)
+    monkeypatch.setattr("unjam.studies.roads_together.driven", driven)
+    monkeypatch.setattr("unjam.studies.roads_together.best_of", lambda rows: "pi")
+    found = _on_road("ring-22-grown", FAMILY["ring-22-grown"], BESIDE | {"residual 0": "runs/0"}, JUDGING)
     (chose, tuning), (judged, judging) = asked
     assert {"human", "pi", RINGS_TUNED} <= judged
     assert "runs/0" in judged - chose

@@ -1,7 +1,7 @@
-"""What one residual gains on each ring of the family, seen and held out, that was trained on all together.
+"""What one controller gains on each of many roads, seen and held out, that was trained on all together.
 
-Beside the expert that was tuned for all of them at once, and the best tuned expert of each. Rings are stepped
-in batches, which are SUMO's but for rounding.
+Beside what it was trained on, and the best tuned expert of each road. Rings are stepped in batches, which are
+SUMO's but for rounding.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -28,31 +28,32 @@ from unjam.studies.everywhere import (
 )
 from unjam.studies.study import VARIANTS, PlannedRun, Study, StudyFolder, measure_parts
 from unjam.training.family import (
-    FAMILY,
     GROWING,
     GROWN,
     HURRIED,
+    KINDS,
     LATE,
     SHARED_RINGS,
     FamilyRoad,
-    is_in,
+    family_roads,
     ring_changes,
 )
 from unjam.training.presets import RINGS_TUNED, SHARED_RINGS_TUNED
 from unjam.training.seeds import held_out_seeds
-from unjam.worlds.batch.run import run_batches
+from unjam.worlds.batch.run import run_where_possible
+from unjam.worlds.record import Episode
+from unjam.worlds.workers import EpisodeTask, Workers
 
-ROAD = "rings"
-"""the roads that are trained on together"""
+RINGS = "rings"
 BESIDE = {
     RINGS_TUNED: RINGS_TUNED,
     **{label: JUDGED[label] for label in ("PI, tuned on the rings", "unjam:ring-best")},
 }
-"""who is driven beside those that are trained, by label"""
+"""who is driven on rings beside those that are trained, by label"""
 BESIDE_SHARED = {SHARED_RINGS_TUNED: SHARED_RINGS_TUNED, RINGS_TUNED: RINGS_TUNED}
-RINGS = {name: road for name, road in FAMILY.items() if is_in(road, ROAD)}
+BESIDE_EVERYWHERE = {label: JUDGED[label] for label in ("unjam:best", "PI, tuned on the rings", "jam-ahead")}
 SHARED = {
-    **{name: road for name, road in FAMILY.items() if is_in(road, SHARED_RINGS)},
+    **family_roads(SHARED_RINGS),
     "ring-88-grown-6-cavs": FamilyRoad("ring", ring_changes(88, 6, GROWN), "axis"),
     "ring-44-hurried-3-cavs": FamilyRoad("ring", ring_changes(44, 3, GROWN, humans=HURRIED), "axis"),
     "ring-44-late-4-cavs": FamilyRoad("ring", ring_changes(44, 4, GROWN, actuator=LATE), "axis"),
@@ -67,19 +68,20 @@ FRESH = held_out_seeds(20, 1000)
 """seeds on which nobody was driven when it was decided which rings want a law of their own"""
 
 
-def on_rings(
+def trained_together(
     title: str,
     variants: dict[str, int],
-    group: str = ROAD,
-    rings: Mapping[str, FamilyRoad] = RINGS,
+    group: str = RINGS,
     beside: Mapping[str, str] = BESIDE,
+    roads: Mapping[str, FamilyRoad] | None = None,
     seeds_that_judge: Sequence[tuple[int, ...]] = JUDGING,
 ) -> Study:
     """Return the study of some variants, each with the most trainings that it wants.
 
-    They are trained on a group of the family, and judged on `rings` beside drivers by label; the first of
-    these is the one that was tuned for the same roads, which trainings are compared with.
+    They are trained on what is seen of a group of the family, and judged on all of it, or on `roads`, beside
+    drivers by label; the first of these is for the same roads, and trainings are compared with it.
     """
+    judged_on = family_roads(group) if roads is None else roads
 
     def runs(seeds: int) -> list[PlannedRun]:
         return [
@@ -95,8 +97,8 @@ def on_rings(
         }
         drivers = {**beside, **trained}
         parts = {
-            f"{number:02d}": (_on_ring, (name, road, drivers, list(seeds_that_judge)))
-            for number, (name, road) in enumerate(rings.items())
+            f"{number:02d}": (_on_road, (name, road, drivers, list(seeds_that_judge)))
+            for number, (name, road) in enumerate(judged_on.items())
         }
         measure_parts(folder, parts, workers)
 
@@ -108,22 +110,27 @@ def on_rings(
     return Study(title, runs, write, minutes=25.0, goes_on=True, tables=tables)
 
 
-def _on_ring(
+def _on_road(
     name: str, road: FamilyRoad, judged: dict[str, str], seeds: list[tuple[int, ...]]
 ) -> dict[str, Any]:
-    """Return what everybody did on a ring on the seeds that judge; others choose its best."""
+    """Return what everybody did on a road on the seeds that judge; others choose its best."""
     scenario = road.make()
-    tried = {driver: driver for driver in (PEOPLE, *TUNED[ROAD])}
-    best = best_of(driven(scenario, tried, CHOOSING, run_batches))
+    tried = {driver: driver for driver in (PEOPLE, *TUNED[KINDS[road.scenario]])}
+    best = best_of(driven(scenario, tried, CHOOSING, _run))
     drivers = {PEOPLE: PEOPLE, best: best, **judged}
-    rows = driven(scenario, drivers, seeds, run_batches)
+    rows = driven(scenario, drivers, seeds, _run)
     return {"road": name, "part": road.part, "best": best, "rows": rows}
+
+
+def _run(tasks: list[EpisodeTask]) -> list[Episode]:
+    with Workers() as workers:
+        return run_where_possible(tasks, workers.run)
 
 
 def table(
     labels: Sequence[str], parts: tuple[str, ...], beside: Mapping[str, str], folder: Path
 ) -> pd.DataFrame:
-    """Return what each gains on each ring, and trainings beyond the expert that was tuned for such rings.
+    """Return what each gains on each road, and trainings beyond the driver that is for such roads.
 
     Of several trainings the interval knows that they share the seeds.
     """
@@ -141,7 +148,9 @@ def table(
 
     gains, speeds = grouped("by_seed"), grouped("speeds")
     shown = dict(gains)
-    pairs = [(label, expert) for label in labels] + ([] if expert == RINGS_TUNED else [(expert, RINGS_TUNED)])
+    pairs = [(label, expert) for label in labels]
+    if expert != RINGS_TUNED and RINGS_TUNED in beside:
+        pairs.append((expert, RINGS_TUNED))
     for one, other in pairs:
         shown[f"{one}, beyond {other}"] = gains[one] - gains[other]
         shown[f"{one}, mean speed beyond {other} [m/s]"] = speeds[one] - speeds[other]
