@@ -10,9 +10,13 @@ PYTHON ?= python3
 VENV ?= .venv
 TORCH_INDEX ?=
 BIN := $(VENV)/bin
-PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet -c constraints.txt
+# Compiling all that is installed takes as long as installing it, and most of it is never imported
+PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet --no-compile -c constraints.txt
 
 .PHONY: demo test test-all coverage check bless docs bench soak clean
+
+# Each process finds what another has compiled
+export PYTHONDONTWRITEBYTECODE =
 
 demo: $(VENV)/.installed
 	$(BIN)/unjam train ring-jammed --preset demo
@@ -20,9 +24,6 @@ demo: $(VENV)/.installed
 
 # The tests of a file share what they have made
 SPREAD := -n 2 --dist loadfile --no-loadscope-reorder
-
-# The suite starts hundreds of interpreters; each finds what another has compiled
-test test-all coverage: export PYTHONDONTWRITEBYTECODE =
 
 test: $(VENV)/.installed-dev
 	$(BIN)/python -m pytest $(SPREAD) -m "not slow"
