@@ -29,7 +29,7 @@ EPISODES, FRESH = 24, 8
 SCALES = (10.0, 10.0, 30.0)
 """of speed, the leader's speed [m/s] and the gap [m]"""
 TARGETS = ("size of the wave", "road for each vehicle", "number of vehicles")
-TRAININGS, EPOCHS, PATIENCE = 5, 60, 8
+TRAININGS, EPOCHS, PATIENCE = 5, 40, 6
 LOOK = 10
 """decisions between two looks: a second"""
 
@@ -180,4 +180,5 @@ def explained(
 
 
 if __name__ == "__main__":
+    torch.set_num_threads(1)  # small products wait for threads
     main(Path(sys.argv[1]))
