@@ -2,7 +2,12 @@
 
 from unjam.studies.adaptation import ADAPTATION
 from unjam.studies.comparison import FIGURE_5, comparison_of
-from unjam.studies.drivable import DRIVABLE_EIGHT, DRIVABLE_JAMMED, DRIVABLE_STUDY
+from unjam.studies.drivable import (
+    DRIVABLE_EIGHT,
+    DRIVABLE_JAMMED,
+    DRIVABLE_JAMMED_WHOLE,
+    DRIVABLE_STUDY,
+)
 from unjam.studies.envelope import ENVELOPE
 from unjam.studies.everywhere import EVERYWHERE_STUDY
 from unjam.studies.figure_6 import FIGURE_6
@@ -68,6 +73,7 @@ STUDIES: dict[str, Study] = {
     "drivable": DRIVABLE_STUDY,
     "drivable-eight": DRIVABLE_EIGHT,
     "drivable-jammed": DRIVABLE_JAMMED,
+    "drivable-jammed-whole": DRIVABLE_JAMMED_WHOLE,
     "envelope": ENVELOPE,
     "everywhere": EVERYWHERE_STUDY,
     "adaptation": ADAPTATION,

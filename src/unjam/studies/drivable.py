@@ -207,9 +207,12 @@ DRIVABLE_STUDY = _study(
 DRIVABLE_EIGHT = _study(
     "what a drivable residual is worth beside the tuned expert, on the figure eight", ("figure-eight",), 5.0
 )
-DRIVABLE_JAMMED = _study(
-    "what a residual with settings of a search is worth beside the tuned expert, on the jammed ring",
-    ("ring-jammed",),
-    20.0,
-    "searched",
+DRIVABLE_JAMMED, DRIVABLE_JAMMED_WHOLE = (
+    _study(
+        f"what a residual with settings of a search {by} is worth beside the tuned expert, on the jammed ring",
+        ("ring-jammed",),
+        20.0,
+        variant,
+    )
+    for by, variant in (("by its first 150 s", "searched"), ("by whole episodes", "searched-whole"))
 )
