@@ -209,7 +209,7 @@ DRIVABLE_EIGHT = _study(
 )
 DRIVABLE_JAMMED, DRIVABLE_JAMMED_WHOLE = (
     _study(
-        f"what a residual with settings of a search {by} is worth beside the tuned expert, on the jammed ring",
+        f"what a residual that was searched {by} is worth beside the tuned expert, on the jammed ring",
         ("ring-jammed",),
         20.0,
         variant,
