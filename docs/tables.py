@@ -98,6 +98,24 @@ def _steps_of(text: str) -> int:
     return int("".join(digit for digit in text if digit.isdigit()) or 0)
 
 
+def guesses() -> pd.DataFrame:
+    """Return what a car can guess of its road on seen and on held-out rings, by what it remembers."""
+    explained = json.loads((RESULTS / "tried/memory/memory.json").read_text())["explained"]
+    return pd.DataFrame(
+        [
+            {"what is remembered": form}
+            | {
+                f"{target}, {rings.removeprefix('fresh episodes of ')}": "{mean:.2f} [{low:.2f}, {high:.2f}]".format(
+                    **share
+                )
+                for target in next(iter(by_rings.values()))
+                for rings, share in ((rings, of[target]) for rings, of in by_rings.items())
+            }
+            for form, by_rings in explained.items()
+        ]
+    )
+
+
 SOAK = "soak/soak.json"
 
 
