@@ -99,21 +99,18 @@ def _steps_of(text: str) -> int:
 
 
 def guesses() -> pd.DataFrame:
-    """Return what a car can guess of its road on seen and on held-out rings, by what it remembers."""
+    """Return what a car can guess of its road, by what it remembers: on seen rings; on held-out ones."""
     explained = json.loads((RESULTS / "tried/memory/memory.json").read_text())["explained"]
-    return pd.DataFrame(
-        [
-            {"what is remembered": form}
-            | {
-                f"{target}, {rings.removeprefix('fresh episodes of ')}": "{mean:.2f} [{low:.2f}, {high:.2f}]".format(
-                    **share
-                )
-                for target in next(iter(by_rings.values()))
-                for rings, share in ((rings, of[target]) for rings, of in by_rings.items())
-            }
-            for form, by_rings in explained.items()
-        ]
-    )
+    seen, held_out = next(iter(explained.values()))
+    rows = []
+    for form, of in explained.items():
+        row = {"what is remembered": form}
+        for target in of[seen]:
+            for rings, where in ((seen, "seen"), (held_out, "held out")):
+                share = of[rings][target]
+                row[f"{target}, {where}"] = f"{share['mean']:.2f} [{share['low']:.2f}, {share['high']:.2f}]"
+        rows.append(row)
+    return pd.DataFrame(rows)
 
 
 SOAK = "soak/soak.json"
