@@ -24,7 +24,7 @@ from unjam.training.sampling import Sampling, episodes_of_iteration, shares_by_w
 from unjam.training.seeds import TRAINING_BELOW
 from unjam.trust import check_values
 from unjam.virtual.settings import VirtualSettings
-from unjam.worlds.batch.possible import why_not
+from unjam.worlds.batch.possible import statistical_why_not, why_not
 from unjam.worlds.episode import Task
 
 CONFIG = "config.toml"
@@ -93,8 +93,9 @@ class RunConfig(Agents):
     workers: Count = 2
     world: Literal["sumo", "batch"] = "sumo"
     """where episodes of training and validation are driven: in SUMO, or, on rings, all of an iteration at
-    once in what equals it but for rounding; it pays where iterations are large. Other roads of a mixture are
-    driven in SUMO, which judges in any case"""
+    once in what equals it but for rounding; it pays where iterations are large. A figure eight alone is
+    driven so too, where episodes are SUMO's in distribution. Other roads of a mixture are driven in SUMO,
+    which judges in any case"""
     spread: bool = True
     """whether the episodes of an iteration, and of a validation, cover the range of what they draw (the
     ring's lengths) evenly"""
@@ -112,7 +113,8 @@ class RunConfig(Agents):
 
     @model_validator(mode="after")
     def _possible(self) -> "RunConfig":
-        whys = [why_not(road.make_scenario()) for road in self.roads().values()]
+        why_none = why_not if self.tasks else statistical_why_not
+        whys = [why_none(road.make_scenario()) for road in self.roads().values()]
         if self.world == "batch" and all(whys):
             raise ValueError(f"world: batch is not allowed; allowed: sumo, for {whys[0]}")
         if self.sampling == "regret" and (len(self.tasks) < 2 or self.evaluation.every == 0):

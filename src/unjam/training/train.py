@@ -293,11 +293,11 @@ class Trainer:
         """Run `counts` episodes of the first seed, road by road; those of the others are to come."""
         all_of = partial(episodes_of, self.tasks, drivers, counts, spread=self.config.spread, explore=explore)
         now, *coming = map(all_of, seeds)
-        at_once = partial(run_where_possible, run=self.workers.run, coming=list(chain(*coming)))
+        alone, later = len(self.tasks) == 1, list(chain(*coming))
+        at_once = partial(run_where_possible, run=self.workers.run, coming=later, statistical=alone)
         episodes = (at_once if self.config.world == "batch" else self.workers.run)(now)
         raise_failure([measure(episode) for episode in episodes if not episode.ok])
-        ends = np.cumsum(counts)
-        return [episodes[end - count : end] for end, count in zip(ends, counts, strict=True)]
+        return [episodes[end - count : end] for end, count in zip(np.cumsum(counts), counts, strict=True)]
 
     def _row(self, iteration: Iteration, validated: Validated, index: int) -> dict[str, Any]:
         """Return the row of progress of one road."""

@@ -4,6 +4,7 @@ from collections.abc import Callable, Hashable, Mapping, Sequence
 from typing import NamedTuple, TypeVar
 
 from unjam.drivers.local_state import LocalState
+from unjam.worlds.batch.crossing import Memory
 from unjam.worlds.batch.noise import NoiseState
 from unjam.worlds.record import Floats
 
@@ -27,6 +28,9 @@ class Begun(NamedTuple):
     noise: NoiseState
     seen: LocalState | None
     """what the CAVs perceived in the last minute, shape (CAVs, moments); None where that is not remembered"""
+
+    waits: Memory | None = None
+    """on a figure eight who waits, and who is on the crossing since when; None elsewhere"""
 
     @property
     def cavs(self) -> int:

@@ -5,6 +5,7 @@ from math import pi
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from unjam.physics.arrays import Array, namespace
 from unjam.scenarios.figure_eight import CROSSING_LINK, INNER_LINK, OUTER_LINK
@@ -105,3 +106,8 @@ def touching_across(position: Array, gap: Array, loop: Array) -> Array:
     ]
     both = covers[0].any(0) & covers[1].any(0)
     return found | ((covers[0] | covers[1]) & both)
+
+
+def beginnings(roads: Sequence[ClosedRoad]) -> NDArray[np.float64]:
+    """Return where roads cross themselves, shape (crossings, W) [m]."""
+    return np.array([[start for start, _ in road.crossings] for road in roads]).T

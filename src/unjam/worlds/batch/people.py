@@ -4,10 +4,11 @@ Sources: SUMO's MSCFModel_IDM (`_v`), MSCFModel (`finalizeSpeed`) and MSVehicle 
 """
 
 from collections.abc import Callable, Sequence
+from functools import reduce
 
 import numpy as np
 
-from unjam.physics.arrays import Array, at_least, at_most
+from unjam.physics.arrays import Array, at_least, at_most, namespace
 from unjam.physics.idm import (
     PARAMETER_NAMES,
     IDMParameters,
@@ -18,6 +19,7 @@ from unjam.physics.idm import (
 )
 from unjam.physics.kinematics import next_speed
 from unjam.scenarios.road import ClosedRoad
+from unjam.worlds.batch.lanes import Leader, end_of_lane, leaders
 from unjam.worlds.batch.noise import Numbers
 
 People = Callable[[Array, Array, Array], Array]
@@ -44,6 +46,29 @@ def people_speed(
     wanted = next_speed(speed, at_least(acceleration, -EMERGENCY_BRAKING), step)
     wanted = at_most(wanted, people.desired_speed)
     return wanted * (wanted > CREEPING * step)
+
+
+def speed_on_ring(
+    speed: Array,
+    position: Array,
+    ahead: Leader,
+    loop: Array,
+    people: IDMParameters | IDMRows,
+    step: float,
+) -> Array:
+    """Return the speeds after a step of people on a ring of four lanes, before noise is added [m/s].
+
+    Arguments as of `lanes.leaders`.
+    """
+    xp, seen = namespace(speed), leaders(speed, position, ahead, loop, people, step)
+    found = reduce(xp.minimum, (people_speed(speed, *each, people, step) for each in seen))
+    beyond = speed > people.desired_speed  # noise did it
+    if bool(beyond.any()):
+        end = end_of_lane(speed, position, loop, people)
+        slower = people_speed(speed, *end, without_gap(people), step)
+        slowest = speed - people.comfortable_deceleration * step
+        found = xp.where(beyond, xp.minimum(found, xp.maximum(slower, slowest)), found)
+    return found
 
 
 def without_gap(people: IDMParameters | IDMRows) -> IDMRows:

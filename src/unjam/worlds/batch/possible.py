@@ -1,8 +1,11 @@
-"""Which rings a batch steps exactly as SUMO does, and which of them together."""
+"""Which closed roads a batch steps as SUMO does, and which of them together."""
 
+from collections.abc import Sequence
 from dataclasses import fields
 
-from unjam.scenarios.ring import Ring
+from unjam.errors import InputError
+from unjam.scenarios.figure_eight import FigureEight
+from unjam.scenarios.ring import Loop, Ring
 from unjam.scenarios.scenario import Scenario
 
 LONGEST_STEP = 0.37
@@ -15,6 +18,29 @@ def why_not(scenario: Scenario) -> str:
         return f"{scenario.title}: it is no ring"
     if scenario.human_control != "native":
         return "human_control: people are commanded"
+    return _why_not_driven(scenario)
+
+
+def statistical_why_not(scenario: Scenario) -> str:
+    """Return why a scenario can be stepped in no batch; empty where it can, if only statistically.
+
+    Of a figure eight each step is SUMO's but for rounding, as far as that was tried. Its right of way is
+    decisions, which rounding may turn: whole episodes are alike in distribution alone.
+    """
+    if not isinstance(scenario, FigureEight):
+        return why_not(scenario)
+    if scenario.human_control != "commanded":
+        return "human_control: SUMO drives people"
+    if not scenario.right_of_way or not scenario.bounded:
+        return f"{'bounded' if scenario.right_of_way else 'right_of_way'}: false; allowed: true"
+    if scenario.population:
+        return "population: people are calibrated"
+    if scenario.actuation == "raw":
+        return "actuation: raw; allowed: shielded, with a safety filter that acts"
+    return _why_not_driven(scenario)
+
+
+def _why_not_driven(scenario: Scenario) -> str:
     exact = scenario.actuation == "raw" or (scenario.actuation == "shielded" and scenario.safety.active)
     if not exact:
         return "actuation: SUMO's own check decides what CAVs do; allowed: raw, or a safety filter that acts"
@@ -23,7 +49,17 @@ def why_not(scenario: Scenario) -> str:
     return ""
 
 
-def alike(one: Ring, other: Ring) -> bool:
-    """Return whether rings differ in their lengths alone, so that they can be stepped together."""
-    shared = (each.name for each in fields(one) if each.name != Ring.size)
+def alike(one: Loop, other: Loop) -> bool:
+    """Return whether roads differ in their sizes alone, so that they can be stepped together."""
+    shared = (each.name for each in fields(one) if each.name != one.size)
     return type(one) is type(other) and all(getattr(one, name) == getattr(other, name) for name in shared)
+
+
+def check_together(roads: Sequence[Loop], statistical: bool) -> None:
+    """Raise `InputError` where roads cannot be stepped together; exactly, or `statistical` too."""
+    why_none = statistical_why_not if statistical else why_not
+    for road in roads:
+        if why := why_none(road):
+            raise InputError(f"batch: {why}")
+        if not alike(road, roads[0]):
+            raise InputError("batch: the scenarios differ in more than their lengths")

@@ -1,16 +1,15 @@
 """What happened in a batch of rings: sums of each, and the whole record where it was kept."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from unjam.physics.arrays import Array
-from unjam.scenarios.ring import Ring
+from unjam.scenarios.ring import Loop
 from unjam.scenarios.road import ClosedRoad
 from unjam.scenarios.scenario import VEHICLE_LENGTH
-from unjam.worlds.batch.lanes import touching
 from unjam.worlds.closed import ClosedLog
 from unjam.worlds.record import Episode, Floats
 from unjam.worlds.world import Driven
@@ -44,6 +43,8 @@ class RingLog:
     """front bumpers as it began [m], shape (vehicles, W)"""
     speeds: list[Array]
     """with noise, that at the start being the first; (vehicles, W) each"""
+    touching: Callable[[Array, Array, Array], Array]
+    """which vehicles touch another one, of positions, gaps and the road's length [m]"""
     moved: list[Array] = field(default_factory=list)
     """speeds before noise; likewise"""
     wanted: list[Array] = field(default_factory=list)
@@ -55,7 +56,7 @@ class RingLog:
 
     def episodes(
         self,
-        scenarios: Sequence[Ring],
+        scenarios: Sequence[Loop],
         roads: Sequence[ClosedRoad],
         seeds: Sequence[Sequence[int]],
         decisions: Floats,
@@ -78,7 +79,7 @@ class RingLog:
 
     def _episode(
         self,
-        scenario: Ring,
+        scenario: Loop,
         road: ClosedRoad,
         seed: Sequence[int],
         number: int,
@@ -97,7 +98,7 @@ class RingLog:
         before = moments[1][:, -1]
         # Not wrapped: who touches the car ahead is a little before or beyond it.
         ahead = np.append(before[1:], before[0] + road.loop_length)
-        collided = touching(before, ahead - before - VEHICLE_LENGTH, road.loop_length)
+        collided = self.touching(before, ahead - before - VEHICLE_LENGTH, road.loop_length)
         facts = {
             "seed": tuple(seed),
             "status": "collision" if collided.any() else "completed",

@@ -8,11 +8,11 @@ import numpy as np
 from unjam.drivers.driver import Driver, Memory
 from unjam.drivers.residual import AGE
 from unjam.errors import InputError
-from unjam.scenarios.ring import Ring
+from unjam.scenarios.ring import Loop
 from unjam.tree import mapped
 from unjam.worlds.batch.begun import Begun, BegunRings
 from unjam.worlds.batch.noise import Numbers
-from unjam.worlds.batch.possible import alike, why_not
+from unjam.worlds.batch.possible import alike, statistical_why_not, why_not
 from unjam.worlds.batch.record import Rings
 from unjam.worlds.batch.world import RingBatch
 from unjam.worlds.drive import Drive, driven_to_the_end
@@ -21,7 +21,7 @@ from unjam.worlds.record import Episode
 from unjam.worlds.reward import make_reward
 from unjam.worlds.workers import EpisodeTask
 
-_Ring = tuple[Ring, tuple[int, ...], frozenset[str]]
+_Ring = tuple[Loop, tuple[int, ...], frozenset[str]]
 """a ring, an episode's seed, and what of all that is told drivers ask for"""
 BEGUN = BegunRings[_Ring]()
 MOST = 128
@@ -53,7 +53,10 @@ def begin(
 
 
 def run_batch(
-    tasks: Sequence[EpisodeTask], numbers: Numbers = np.asarray, coming: Sequence[EpisodeTask] = ()
+    tasks: Sequence[EpisodeTask],
+    numbers: Numbers = np.asarray,
+    coming: Sequence[EpisodeTask] = (),
+    statistical: bool = False,
 ) -> list[Episode]:
     """Return the episodes of tasks, as `run_episode` does in SUMO, but for rounding; all are stepped at once.
 
@@ -61,6 +64,7 @@ def run_batch(
         tasks: rings that differ in length and seed alone.
         numbers: makes the arrays that are stepped.
         coming: tasks that will follow, alike; they are warmed up beforehand where these have to be.
+        statistical: whether roads are allowed whose episodes are SUMO's in distribution alone.
 
     Raises:
         InputError: the tasks differ in more, or `batch.possible.why_not` says why they cannot be run so.
@@ -68,8 +72,8 @@ def run_batch(
     first = tasks[0]
     if any(_driven(each) != _driven(first) for each in tasks):
         raise InputError("batch: the tasks differ in driver, reward or exploration, or want fuel")
-    scenarios, seeds = [cast(Ring, each.scenario) for each in tasks], [each.seed for each in tasks]
-    world = RingBatch(scenarios, seeds, numbers, first.reward)
+    scenarios, seeds = [cast(Loop, each.scenario) for each in tasks], [each.seed for each in tasks]
+    world = RingBatch(scenarios, seeds, numbers, first.reward, statistical=statistical)
     if world.scenario.warmup > 0:
         world.begun = BEGUN.of([_ring(task) for task in tasks], [_ring(task) for task in coming], _warm_up)
     rings: Rings = driven_to_the_end(begin(world, first.driver, numbers, first.explore))
@@ -78,7 +82,7 @@ def run_batch(
 
 
 def _ring(task: EpisodeTask) -> _Ring:
-    return cast(Ring, task.scenario), task.seed, frozenset(task.driver.asks)
+    return cast(Loop, task.scenario), task.seed, frozenset(task.driver.asks)
 
 
 def _warm_up(rings: Sequence[_Ring]) -> dict[_Ring, Begun]:
@@ -86,16 +90,18 @@ def _warm_up(rings: Sequence[_Ring]) -> dict[_Ring, Begun]:
     found: dict[_Ring, Begun] = {}
     for some in (rings[first : first + MOST] for first in range(0, len(rings), MOST)):
         scenarios, seeds, (asked, *_) = zip(*some, strict=True)
-        world = RingBatch(scenarios, seeds, keep=False)
+        world = RingBatch(scenarios, seeds, keep=False, statistical=True)
         world.asked = asked
         found |= zip(some, world.warmed_up(), strict=True)
     return found
 
 
-def run_batches(tasks: Sequence[EpisodeTask], coming: Sequence[EpisodeTask] = ()) -> list[Episode]:
+def run_batches(
+    tasks: Sequence[EpisodeTask], coming: Sequence[EpisodeTask] = (), statistical: bool = False
+) -> list[Episode]:
     """Return the episodes of tasks on rings of any kinds, in their order; those that are alike at once.
 
-    `coming` are tasks that will follow, of any kinds: see `run_batch`.
+    `coming` are tasks that will follow, of any kinds; see `run_batch`, of `statistical` too.
     """
     batches: list[dict[int, EpisodeTask]] = []
     for index, task in enumerate(tasks):
@@ -108,7 +114,9 @@ def run_batches(tasks: Sequence[EpisodeTask], coming: Sequence[EpisodeTask] = ()
     for batch in batches:
         first = next(iter(batch.values()))
         later = [task for task in coming if _alike(task, first)]
-        found |= zip(batch, run_batch(list(batch.values()), coming=later), strict=True)
+        found |= zip(
+            batch, run_batch(list(batch.values()), coming=later, statistical=statistical), strict=True
+        )
     return [found[index] for index in range(len(tasks))]
 
 
@@ -116,16 +124,19 @@ def run_where_possible(
     tasks: Sequence[EpisodeTask],
     run: Callable[[Sequence[EpisodeTask]], list[Episode]],
     coming: Sequence[EpisodeTask] = (),
+    statistical: bool = False,
 ) -> list[Episode]:
     """Return the episodes of tasks, in their order: in batches where that can be, else what `run` answers.
 
-    `coming` are tasks that will follow: see `run_batch`.
+    `coming` are tasks that will follow: see `run_batch`, of `statistical` too.
     """
-    batched = [not why_not(task.scenario) for task in tasks]
-    quick = iter(run_batches([task for task, at_once in zip(tasks, batched, strict=True) if at_once], coming))
-    others = [task for task, at_once in zip(tasks, batched, strict=True) if not at_once]
+    why_none = statistical_why_not if statistical else why_not
+    batched = [not why_none(task.scenario) for task in tasks]
+    at_once = [task for task, possible in zip(tasks, batched, strict=True) if possible]
+    quick = iter(run_batches(at_once, coming, statistical))
+    others = [task for task, possible in zip(tasks, batched, strict=True) if not possible]
     slow = iter(run(others) if others else ())
-    return [next(quick if at_once else slow) for at_once in batched]
+    return [next(quick if possible else slow) for possible in batched]
 
 
 def _driven(task: EpisodeTask) -> tuple[Driver, str, bool]:
@@ -133,4 +144,4 @@ def _driven(task: EpisodeTask) -> tuple[Driver, str, bool]:
 
 
 def _alike(one: EpisodeTask, other: EpisodeTask) -> bool:
-    return _driven(one) == _driven(other) and alike(cast(Ring, one.scenario), cast(Ring, other.scenario))
+    return _driven(one) == _driven(other) and alike(cast(Loop, one.scenario), cast(Loop, other.scenario))

@@ -17,15 +17,18 @@ from unjam.drivers.safety import Ahead, Cars
 from unjam.errors import EpisodeError, InputError
 from unjam.physics.arrays import Array, at_least, at_most, namespace
 from unjam.physics.kinematics import gap_on_loop, next_position, next_speed
-from unjam.scenarios.ring import Ring
+from unjam.scenarios.ring import Loop
 from unjam.scenarios.road import ClosedRoad
 from unjam.scenarios.scenario import VEHICLE_LENGTH
 from unjam.worlds.audit import MOVING_SPEED
 from unjam.worlds.batch.begun import Begun
-from unjam.worlds.batch.lanes import CONTACT, Leader, end_of_lane, leaders, touching
+from unjam.worlds.batch.crossing import Memory
+from unjam.worlds.batch.eight import beginnings, touching_across
+from unjam.worlds.batch.lanes import CONTACT, Leader, touching
+from unjam.worlds.batch.movement import EightMovement
 from unjam.worlds.batch.noise import Noise, Numbers, QuickNoise, SeededNoise
-from unjam.worlds.batch.people import People, parameters_of, people_speed, without_gap
-from unjam.worlds.batch.possible import alike, why_not
+from unjam.worlds.batch.people import People, parameters_of, people_speed, speed_on_ring
+from unjam.worlds.batch.possible import check_together
 from unjam.worlds.batch.record import RingLog, Rings, as_numpy
 from unjam.worlds.batch.sensors import RingReadings
 from unjam.worlds.closed import HISTORY
@@ -34,7 +37,7 @@ from unjam.worlds.world import Driven, OnProgress
 
 
 class RingBatch:
-    """W rings of the same kind, each with a seed of its own; equal to SUMO's, but for rounding.
+    """W closed roads of the same kind, each with a seed of its own; rings equal SUMO's, but for rounding.
 
     With noise that is drawn quickly people follow the car ahead and nobody else. SUMO's also look at the last
     car of the next lane, and no farther than they must: see `unjam.worlds.batch.lanes`.
@@ -48,13 +51,14 @@ class RingBatch:
 
     def __init__(
         self,
-        scenarios: Sequence[Ring],
+        scenarios: Sequence[Loop],
         seeds: Sequence[Sequence[int]],
         numbers: Numbers = np.asarray,
         reward: str = "",
         keep: bool = True,
         draw: Callable[[tuple[int, ...]], Array] | None = None,
         people: People | None = None,
+        statistical: bool = False,
     ) -> None:
         """Put the vehicles on the roads; nothing moves yet.
 
@@ -66,16 +70,13 @@ class RingBatch:
             keep: whether all is kept for episodes, some 16 bytes for each vehicle and step in float64.
             draw: of all noise, for arrays of a shape; None: each ring draws what SUMO's episode would.
             people: how they drive, where it is not as SUMO's IDM does.
+            statistical: whether roads are allowed that equal SUMO's in distribution alone.
 
         Raises:
             InputError: a scenario cannot be stepped so, or they are not alike.
         """
         scenario = self.scenario = scenarios[0]
-        for each in scenarios:
-            if why := why_not(each):
-                raise InputError(f"batch: {why}")
-            if not alike(each, scenario):
-                raise InputError("batch: the scenarios differ in more than their lengths")
+        check_together(scenarios, statistical)
         drawn = [each.of_seed(seed) for each, seed in zip(scenarios, seeds, strict=True)]
         roads = self.roads = [cast(ClosedRoad, road) for road, _ in drawn]
         self._scenarios, self._seeds, self._keep, self._numbers = scenarios, seeds, keep, numbers
@@ -95,6 +96,10 @@ class RingBatch:
         self._position = numbers(start)
         self._speed = numbers(np.zeros((vehicles + 1, worlds)))
         self._people, self._drives = parameters_of(roads, scenario.humans, numbers), people
+        across = bool(roads[0].crossings)
+        self._eight = EightMovement(scenario, roads, self._places, numbers) if across else None
+        self._touching = touching_across if across else touching
+        self._crossings = [numbers(np.tile(each, cavs)) for each in beginnings(roads)]
         self._scale = numbers(np.full((vehicles, 1), scenario.noise_per_step * scenario.simulation_step))
         self._cars = Cars(scenario.safety, scenario.actuator, scenario.simulation_step)
         self._brakes = scenario.cav_brakes * scenario.simulation_step
@@ -111,7 +116,7 @@ class RingBatch:
 
     def _forget(self) -> None:
         """Begin the log and the sums anew."""
-        self._log = RingLog(as_numpy(self._position), [self._speed[:-1]])
+        self._log = RingLog(as_numpy(self._position), [self._speed[:-1]], self._touching)
         ring = self._loop * 0.0
         each_cav = self._loops.reshape(self._shape) * 0.0
         self._running, self._made = ring + 1.0, ring
@@ -140,6 +145,8 @@ class RingBatch:
         if controlled:
             self._scale[self._places] = 0.0
             self._noise.begin_anew()
+            if self._eight:
+                self._eight.hand_over()
         self._forget()
         return seen
 
@@ -164,16 +171,19 @@ class RingBatch:
         found = []
         for ring, noise in enumerate(states):
             crashed, remembered = bool(self._crashed[ring]), by_ring and by_ring.at(ring)
-            found.append(Begun(speed[ring], position[ring], gap[ring], crashed, noise, remembered))
+            waits = self._eight and Memory(*(as_numpy(each)[:, ring] for each in self._eight.memory))
+            found.append(Begun(speed[ring], position[ring], gap[ring], crashed, noise, remembered, waits))
         return found
 
     def _go_on(self, begun: Sequence[Begun]) -> LocalState | None:
         """Go on where rings had begun, and return what `start` does."""
-        speeds, positions, gaps, crashed, noise, seen = zip(*begun, strict=True)
+        speeds, positions, gaps, crashed, noise, seen, waits = zip(*begun, strict=True)
         self._speed, self._position, self._gap, self._crashed = (
             self._numbers(np.stack(each, -1)) for each in (speeds, positions, gaps, crashed)
         )
         cast(SeededNoise, self._noise).go_on(noise)
+        if self._eight:
+            self._eight.remember(waits)
         if seen[0] is None:
             return None
         return seen[0].each(lambda *values: np.stack(values, 1).reshape(self.rows, -1), *seen[1:])
@@ -190,13 +200,15 @@ class RingBatch:
     def _state(self) -> LocalState:
         """Return what exact sensors of the CAVs would read now."""
         speed, gap = self._speed, self._gap
-        share = self.roads[0].share_told(self.asked)
+        share, place = self.roads[0].share_told(self.asked), self._rows_at(self._position, self._places)
+        ways = [(start - place) % self._loops for start in self._crossings]
         return LocalState(
             *self._followed(),
             self._rows_at(speed, self._behind),
             self._rows_at(gap, self._behind),
-            self._rows_at(self._position, self._places) % self._loops,
+            place % self._loops,
             self._loops,
+            to_crossing=reduce(namespace(place).minimum, ways) if ways else None,
             cav_share=None if share is None else self._loops * 0.0 + share,
         )
 
@@ -251,45 +263,46 @@ class RingBatch:
             return self._drives(speed, *ahead)
         if self._quick:
             return people_speed(speed, *ahead, people, step)
-        seen = leaders(speed, self._position, ahead, self._loop, people, step)
-        xp = namespace(speed)
-        found = reduce(xp.minimum, (people_speed(speed, *each, people, step) for each in seen))
-        beyond = speed > people.desired_speed  # noise did it
-        if bool(beyond.any()):
-            end = end_of_lane(speed, self._position, self._loop, people)
-            slower = people_speed(speed, *end, without_gap(people), step)
-            slowest = speed - people.comfortable_deceleration * step
-            found = xp.where(beyond, xp.minimum(found, xp.maximum(slower, slowest)), found)
-        return found
+        return speed_on_ring(speed, self._position, ahead, self._loop, people, step)
 
     def _simulate(self, wanted: Array | None) -> Array:
         """Simulate one step, and return what CAVs were told; None: they are human."""
-        step, speed, own = self.scenario.simulation_step, self._speed, self._places
-        moved = self._people_speed(speed[:-1], Leader(speed[1:], self._gap))
-        cavs, told = self._followed(), None
+        step, speed = self.scenario.simulation_step, self._speed
+        cavs, told, commanded = self._followed(), None, None
         if wanted is not None:
             told, done = self._cars.carry_out("all", wanted, self._readings.of_filters(cavs))
             commanded = next_speed(cavs.speed, done, step)
-            obeyed = at_most(at_least(commanded, cavs.speed - self._brakes), self.scenario.top_speed)
-            moved[own] = obeyed.reshape(self._shape)
             if self._keep:
                 self._log.told.append(told)
                 self._log.commanded.append(commanded)
+        moved, speeds = self._moved(speed[:-1], Leader(speed[1:], self._gap), commanded)
         xp = namespace(moved)
         ahead = xp.concatenate([moved[1:], moved[:1]])
         self._gap = self._gap + (ahead - moved) * step
         self._position = next_position(self._position, moved, step)
-        if bool((self._gap < CONTACT).any()):
-            self._crashed = self._crashed | touching(self._position, self._gap, self._loop).any(0)
-        speeds = moved
-        if self.scenario.noise > 0:
-            speeds = at_least(moved + self._noise.of_people() * self._scale, 0.0)
+        if self._eight or bool((self._gap < CONTACT).any()):
+            self._crashed = self._crashed | self._touching(self._position, self._gap, self._loop).any(0)
         self._speed = xp.concatenate([speeds, speeds[:1]])
         if self._keep:
             self._log.moved.append(moved)
             self._log.speeds.append(speeds)
         self._sum_up(cavs)
         return told
+
+    def _moved(self, speed: Array, ahead: Leader, commanded: Array | None) -> tuple[Array, Array]:
+        """Return the speeds with which all move in this step, and those after it, (vehicles, W) each."""
+        told = None if commanded is None else commanded.reshape(self._shape)
+        if self._eight:
+            noise = self._noise.of_people() * self._scale if self.scenario.noise > 0 else 0.0
+            moved = self._eight.moved(speed, self._position, ahead, noise, told)
+            return moved, moved
+        moved = self._people_speed(speed, ahead)
+        if told is not None:
+            slowest = speed[self._places] - self._brakes
+            moved[self._places] = at_most(at_least(told, slowest), self.scenario.top_speed)
+        if self.scenario.noise > 0:
+            return moved, at_least(moved + self._noise.of_people() * self._scale, 0.0)
+        return moved, moved
 
     def _sum_up(self, before: Ahead) -> None:
         """Note how the CAVs follow at the beginning of a step, and how hard they brake in it."""
