@@ -110,3 +110,16 @@ class QuickNoise:
     def of_networks(self, decision: int) -> Array:
         """Return a number for each CAV, shape (CAVs * W,)."""
         return self._draw(self._networks)
+
+
+def noise_of(
+    seeds: Sequence[Sequence[np.random.SeedSequence]],
+    vehicles: int,
+    decisions: tuple[int, int],
+    numbers: Numbers,
+    draw: Callable[[tuple[int, ...]], Array] | None,
+) -> Noise:
+    """Return noise as SUMO's episodes draw it; where `draw` is given, quicker. Arguments as of both."""
+    if draw is None:
+        return SeededNoise(seeds, vehicles, decisions, numbers)
+    return QuickNoise(draw, vehicles, decisions[1], len(seeds))

@@ -7,14 +7,14 @@ ring of the first CAV, then of the second, and so on.
 
 from collections.abc import Callable, Collection, Sequence
 from functools import reduce
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 
 from unjam.drivers.command import Command
 from unjam.drivers.local_state import LocalState
 from unjam.drivers.safety import Ahead, Cars
-from unjam.errors import EpisodeError, InputError
+from unjam.errors import EpisodeError
 from unjam.physics.arrays import Array, at_least, at_most, namespace
 from unjam.physics.kinematics import gap_on_loop, next_position, next_speed
 from unjam.scenarios.ring import Loop
@@ -22,11 +22,12 @@ from unjam.scenarios.road import ClosedRoad
 from unjam.scenarios.scenario import VEHICLE_LENGTH
 from unjam.worlds.audit import MOVING_SPEED
 from unjam.worlds.batch.begun import Begun
+from unjam.worlds.batch.commands import checked
 from unjam.worlds.batch.crossing import Memory
 from unjam.worlds.batch.eight import beginnings, touching_across
 from unjam.worlds.batch.lanes import CONTACT, Leader, touching
 from unjam.worlds.batch.movement import EightMovement
-from unjam.worlds.batch.noise import Noise, Numbers, QuickNoise, SeededNoise
+from unjam.worlds.batch.noise import Numbers, SeededNoise, noise_of
 from unjam.worlds.batch.people import People, parameters_of, people_speed, speed_on_ring
 from unjam.worlds.batch.possible import check_together
 from unjam.worlds.batch.record import RingLog, Rings, as_numpy
@@ -105,11 +106,7 @@ class RingBatch:
         self._brakes = scenario.cav_brakes * scenario.simulation_step
         seeded = [others for _, others in drawn]
         self._readings = RingReadings(scenario, roads[0].cav_ids, seeded, numbers)
-        self._noise: Noise = (
-            SeededNoise(seeded, vehicles, (scenario.horizon, cavs), numbers)
-            if draw is None
-            else QuickNoise(draw, vehicles, cavs, worlds)
-        )
+        self._noise = noise_of(seeded, vehicles, (scenario.horizon, cavs), numbers, draw)
         self._reward = make_reward(reward or scenario.reward)
         self._controlled, self._quick = False, draw is not None
         self._forget()
@@ -226,7 +223,7 @@ class RingBatch:
     def advance(self, command: Command | None) -> None:
         """Simulate one decision, held over its simulation steps; None: the CAVs stay human."""
         each, before = self.scenario.steps_per_decision, self._rows_at(self._speed, self._places)
-        wanted = self._checked(command) if self._controlled else None
+        wanted = checked(command, self.rows, self.decisions, self.limits) if self._controlled else None
         log = self._log
         if wanted is not None and self._keep:
             log.wanted.append(wanted)
@@ -248,13 +245,6 @@ class RingBatch:
         self._made = self._made + self._running
         self._driven = self._driven + outcome.speeds.mean(-1) * self._running
         self._running = self._running * ~self._crashed
-
-    def _checked(self, command: Command | None) -> Array:
-        """Return what is wanted, within the limits; raise `InputError` where it is not finite numbers."""
-        found: Any = () if command is None else command.acceleration
-        if np.shape(found) != (self.rows,) or not bool(namespace(found).isfinite(found).all()):
-            raise InputError(f"driver: step {self.decisions}: not {self.rows} accelerations that are finite")
-        return self.limits.keep(found)
 
     def _people_speed(self, speed: Array, ahead: Leader) -> Array:
         """Return the speeds after this step of all vehicles, if people drive them, shape (vehicles, W)."""

@@ -1,0 +1,136 @@
+"""Does a batch of figures eight do what SUMO's episodes do, step by step and in the mean?"""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from unjam.drivers import Constant
+from unjam.drivers.registry import named_driver
+from unjam.errors import InputError
+from unjam.measures.metrics import measure
+from unjam.scenarios import FigureEight, Ring
+from unjam.training.config import RunConfig
+from unjam.worlds.batch.eight import touching_across
+from unjam.worlds.batch.possible import statistical_why_not, why_not
+from unjam.worlds.batch.run import BEGUN, run_batch
+from unjam.worlds.episode import run_episode
+from unjam.worlds.record import Floats
+from unjam.worlds.sumo.simulation import Simulation
+from unjam.worlds.workers import EpisodeTask
+
+SHORT = FigureEight(horizon=300)
+"""those who must yield have waited for some, gone before others, and stood"""
+
+
+def tasks(eight: FigureEight, expert: str, seeds: range) -> list[EpisodeTask]:
+    return [EpisodeTask(eight, named_driver(expert, eight.decision_step), (seed,)) for seed in seeds]
+
+
+EIGHTS: dict[str, tuple[FigureEight, str, int]] = {
+    "people alone": (SHORT, "human", 170),
+    "a CAV": (SHORT, "pi", 300),
+    "three CAVs": (replace(SHORT, cavs=3), "pi", 300),
+    "a CAV after a warm-up": (replace(SHORT, warmup=130, horizon=150), "idm", 40),
+    "few on a small one": (replace(SHORT, vehicles=5, radius=(20, 22), free_ahead=30.0), "idm", 100),
+    "patient people": (replace(SHORT, impatience=0.0), "pi", 150),
+    "commands that are held": (replace(SHORT, steps_per_decision=5, horizon=30), "pi", 30),
+}
+"""by what is special: road, driver, and for how many decisions it is to be SUMO's"""
+
+
+@pytest.mark.parametrize("name", EIGHTS)
+def test_it_begins_as_sumos_of_the_same_seed(name: str, simulation: Simulation) -> None:
+    eight, expert, until = EIGHTS[name]
+    for task, found in zip(
+        tasks(eight, expert, range(2)),
+        run_batch(tasks(eight, expert, range(2)), statistical=True),
+        strict=True,
+    ):
+        actual = run_episode(eight, task.driver, task.seed, simulation=simulation)
+        assert np.abs(found.speeds[:until] - actual.speeds[:until]).max() < 1e-3
+        assert np.abs(found.positions[:until] - actual.positions[:until]).max() < 1e-2
+        assert found.crossings == actual.crossings
+        states, expected = found.trajectories[0].states, actual.trajectories[0].states
+        assert states.to_crossing[:until] == pytest.approx(expected.to_crossing[:until], abs=1e-2)
+
+
+def test_whole_episodes_are_alike(simulation: Simulation) -> None:
+    eight, seeds = FigureEight(), range(3)
+    found = run_batch(tasks(eight, "idm", seeds), statistical=True)
+    driver = named_driver("idm", eight.decision_step)
+    for episode, seed in zip(found, seeds, strict=True):
+        actual = run_episode(eight, driver, seed, simulation=simulation)
+        assert episode.status == actual.status == "completed"
+        assert episode.speeds.mean() == pytest.approx(actual.speeds.mean(), rel=0.01)
+        assert measure(episode)["return"] == pytest.approx(measure(actual)["return"], rel=0.01)
+        stood = (episode.speeds < 0.1).mean(), (actual.speeds < 0.1).mean()
+        assert 0.0 < stood[1] == pytest.approx(stood[0], abs=0.002)
+
+
+def test_warmed_up_with_others_it_goes_on_to_the_same_bits() -> None:
+    eight = replace(SHORT, warmup=230, horizon=100)
+    BEGUN.clear()
+    (alone,) = run_batch(tasks(eight, "pi", range(1)), statistical=True)
+    BEGUN.clear()
+    run_batch(tasks(eight, "pi", range(2)), statistical=True)
+    (again,) = run_batch(tasks(eight, "pi", range(1)), statistical=True)
+    assert again.speeds.tobytes() == alone.speeds.tobytes()
+
+
+def test_tensors_do_what_arrays_do() -> None:
+    def doubles(values: Floats) -> Tensor:
+        return torch.as_tensor(values)
+
+    asked = tasks(replace(SHORT, horizon=150), "pi", range(2))
+    for one, other in zip(
+        run_batch(asked, statistical=True), run_batch(asked, doubles, statistical=True), strict=True
+    ):
+        assert np.abs(one.speeds - other.speeds).max() < 1e-6
+
+
+def test_who_covers_the_crossing_with_another_one_collides() -> None:
+    (road, _), places = FigureEight(radius=(32, 32)).of_seed((1,)), np.zeros(3)
+    (first, _), (second, _) = road.crossings
+    places[:] = first + 6.0, second + 6.0, second + 60.0
+    apart = np.full(3, 20.0)
+    assert touching_across(places, apart, road.loop_length).tolist() == [True, True, False]
+    places[1] = second + 1.0  # its front is not there yet
+    assert not touching_across(places, apart, road.loop_length).any()
+    touches = np.array([20.0, -0.1, 20.0])
+    places[:] = first - 20.0, first - 9.0, first - 4.1
+    assert touching_across(places, touches, road.loop_length).tolist() == [False, True, False]
+
+
+@pytest.mark.parametrize(
+    ("scenario", "why"),
+    [
+        (replace(SHORT, human_control="native"), "SUMO drives people"),
+        (replace(SHORT, right_of_way=False), "right_of_way"),
+        (replace(SHORT, bounded=False), "bounded"),
+        (replace(SHORT, actuation="raw"), "raw"),
+        (replace(SHORT, actuation="flow"), "SUMO's own check"),
+        (replace(SHORT, simulation_step=0.5), "simulation_step"),
+    ],
+)
+def test_what_was_never_compared_is_refused(scenario: Any, why: str) -> None:
+    assert why in statistical_why_not(scenario)
+    with pytest.raises(InputError, match="batch: "):
+        run_batch([EpisodeTask(scenario, Constant(), (1,))], statistical=True)
+
+
+def test_it_is_no_exact_road_and_driven_only_where_that_is_asked_for() -> None:
+    assert why_not(SHORT)
+    assert not statistical_why_not(SHORT)
+    assert not statistical_why_not(Ring())
+    with pytest.raises(InputError, match="it is no ring"):
+        run_batch(tasks(SHORT, "pi", range(1)))
+
+
+def test_a_training_on_it_may_be_batched() -> None:
+    assert RunConfig(scenario="figure-eight", world="batch").world == "batch"
+    with pytest.raises(ValueError, match="world"):
+        RunConfig(scenario="merge", world="batch")
