@@ -5,3 +5,4 @@ set -eu
 cd "$(dirname "$0")"
 python parity.py > parity.json
 unjam bench --json --rounds 5 > bench.json
+python parity-eight.py > parity-eight.json

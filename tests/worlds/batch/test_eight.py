@@ -35,8 +35,8 @@ EIGHTS: dict[str, tuple[FigureEight, str, int]] = {
     "a CAV": (SHORT, "pi", 300),
     "three CAVs": (replace(SHORT, cavs=3), "pi", 300),
     "a CAV after a warm-up": (replace(SHORT, warmup=130, horizon=150), "idm", 40),
-    "few on a small one": (replace(SHORT, vehicles=5, radius=(20, 22), free_ahead=30.0), "idm", 100),
-    "patient people": (replace(SHORT, impatience=0.0), "pi", 150),
+    "few on a small one": (replace(SHORT, vehicles=6, radius=(30, 31)), "idm", 60),
+    "patient people": (replace(SHORT, impatience=0.0), "pi", 80),
     "commands that are held": (replace(SHORT, steps_per_decision=5, horizon=30), "pi", 30),
 }
 """by what is special: road, driver, and for how many decisions it is to be SUMO's"""
@@ -111,6 +111,7 @@ def test_who_covers_the_crossing_with_another_one_collides() -> None:
         (replace(SHORT, human_control="native"), "SUMO drives people"),
         (replace(SHORT, right_of_way=False), "right_of_way"),
         (replace(SHORT, bounded=False), "bounded"),
+        (replace(SHORT, radius=(20, 22), vehicles=5, free_ahead=30.0), "radius"),
         (replace(SHORT, actuation="raw"), "raw"),
         (replace(SHORT, actuation="flow"), "SUMO's own check"),
         (replace(SHORT, simulation_step=0.5), "simulation_step"),

@@ -7,6 +7,7 @@ from unjam.errors import InputError
 from unjam.scenarios.figure_eight import FigureEight
 from unjam.scenarios.ring import Loop, Ring
 from unjam.scenarios.scenario import Scenario
+from unjam.worlds.batch.lanes import LOOK_AHEAD
 
 LONGEST_STEP = 0.37
 """simulation step up to which SUMO's IDM makes one step of it [s]"""
@@ -33,6 +34,8 @@ def statistical_why_not(scenario: Scenario) -> str:
         return "human_control: SUMO drives people"
     if not scenario.right_of_way or not scenario.bounded:
         return f"{'bounded' if scenario.right_of_way else 'right_of_way'}: false; allowed: true"
+    if scenario.radius[0] <= LOOK_AHEAD:
+        return f"radius: {scenario.radius[0]} m, where people look past a lane; allowed: > {LOOK_AHEAD:g} m"
     if scenario.population:
         return "population: people are calibrated"
     if scenario.actuation == "raw":
