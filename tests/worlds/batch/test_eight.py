@@ -8,6 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from tests.worlds.batch.one_step import errors
 from unjam.drivers import Constant
 from unjam.drivers.registry import named_driver
 from unjam.errors import InputError
@@ -56,6 +57,13 @@ def test_it_begins_as_sumos_of_the_same_seed(name: str, simulation: Simulation) 
         assert found.crossings == actual.crossings
         states, expected = found.trajectories[0].states, actual.trajectories[0].states
         assert states.to_crossing[:until] == pytest.approx(expected.to_crossing[:until], abs=1e-2)
+
+
+@pytest.mark.parametrize("expert", ["human", "pi"])
+def test_from_each_of_sumos_moments_a_step_is_sumos(expert: str, simulation: Simulation) -> None:
+    eight = replace(SHORT, horizon=900)
+    found = errors(eight, named_driver(expert, eight.decision_step), 3, simulation)
+    assert np.abs(found).max() < 1e-6
 
 
 def test_whole_episodes_are_alike(simulation: Simulation) -> None:

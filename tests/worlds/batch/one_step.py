@@ -1,0 +1,46 @@
+"""What a batch makes of each moment of a figure eight in SUMO, beside what SUMO made of it."""
+
+import numpy as np
+
+from unjam.drivers.driver import Driver
+from unjam.physics.idm import idm_acceleration
+from unjam.physics.kinematics import gap_on_loop
+from unjam.scenarios.figure_eight import FigureEight
+from unjam.scenarios.road import ClosedRoad
+from unjam.scenarios.scenario import VEHICLE_LENGTH
+from unjam.worlds.batch.crossing import Crossing
+from unjam.worlds.batch.lanes import Leader
+from unjam.worlds.batch.layer import layer_of
+from unjam.worlds.closed import NOISE_BLOCK
+from unjam.worlds.episode import run_episode
+from unjam.worlds.record import Floats
+from unjam.worlds.sumo.simulation import Simulation
+
+
+def errors(eight: FigureEight, driver: Driver, seed: int, simulation: Simulation) -> Floats:
+    """Return by how much each speed differs after one step from SUMO's own state, (steps, vehicles) [m/s]."""
+    episode = run_episode(eight, driver, (seed,), simulation=simulation)
+    road, others = eight.of_seed((seed,))
+    assert isinstance(road, ClosedRoad)
+    steps, vehicles = len(episode.speeds) - 1, len(road.vehicle_ids)
+    controlled = [road.vehicle_ids.index(name) for name in road.cav_ids] if episode.trajectories else []
+    applied = np.array([each.applied for each in episode.trajectories])
+    generator = np.random.default_rng(others[0])
+    blocks = [generator.standard_normal((NOISE_BLOCK, vehicles)) for _ in range(steps // NOISE_BLOCK + 1)]
+    step = eight.simulation_step
+    noise = np.concatenate(blocks) * eight.noise_per_step * step
+    layer, crossing = layer_of(eight, vehicles, controlled, np.asarray), Crossing(eight, [road], np.asarray)
+    found = np.empty((steps, vehicles))
+    for moment in range(steps):
+        speed, position = episode.speeds[moment][:, None], episode.positions[moment][:, None]
+        ahead = np.roll(speed, -1, 0)
+        gap = gap_on_loop(position, np.roll(position, -1, 0), road.loop_length, VEHICLE_LENGTH)
+        acceleration = idm_acceleration(speed, ahead, np.maximum(gap, 0.01), eight.humans)
+        wanted = np.maximum(speed + acceleration * step + noise[moment][:, None], 0.0)
+        commanded = ~crossing.inside(position)
+        if controlled:
+            wanted[controlled] = np.maximum(speed[controlled] + applied[:, [moment]] * step, 0.0)
+            commanded[controlled] = True
+        moved = crossing.moved(layer, speed, position, Leader(ahead, gap), wanted, commanded)
+        found[moment] = moved[:, 0] - episode.speeds[moment + 1]
+    return found
