@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from unjam.errors import InputError
-from unjam.physics.arrays import Array, clip
+from unjam.physics.arrays import Array, clip, namespace
 
 
 class Command(NamedTuple):
@@ -53,6 +53,18 @@ def as_rows(answer: Any, rows: int, where: str, what: str = "acceleration") -> N
         allowed = f"({rows},), one for each CAV"
         raise InputError(f"{where}: {what} has shape {array.shape}; allowed: {allowed}")
     return array
+
+
+def accelerations_of_many(command: Command | None, limits: Limits, rows: int, step: int) -> Array:
+    """Return what the vehicles of many roads are told, within the limits, shape (rows,) [m/s2].
+
+    Raises:
+        InputError: they are not finite numbers, one for each row.
+    """
+    found: Any = () if command is None else command.acceleration
+    if np.shape(found) != (rows,) or not bool(namespace(found).isfinite(found).all()):
+        raise InputError(f"driver: step {step}: not {rows} accelerations that are finite")
+    return limits.keep(found)
 
 
 def accelerations(command: Command | None, limits: Limits, names: Sequence[str], step: int) -> list[float]:

@@ -25,8 +25,8 @@ def why_not(scenario: Scenario) -> str:
 def statistical_why_not(scenario: Scenario) -> str:
     """Return why a scenario can be stepped in no batch; empty where it can, if only statistically.
 
-    Of a figure eight each step is SUMO's but for rounding, as far as that was tried. Its right of way is
-    decisions, which rounding may turn: whole episodes are alike in distribution alone.
+    Of a figure eight all but a few steps in a million are SUMO's, as far as that was tried. Its right of way
+    is decisions, and one that turns makes another queue: whole episodes are alike in distribution alone.
     """
     if not isinstance(scenario, FigureEight):
         return why_not(scenario)

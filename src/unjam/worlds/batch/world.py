@@ -11,7 +11,7 @@ from typing import cast
 
 import numpy as np
 
-from unjam.drivers.command import Command
+from unjam.drivers.command import Command, accelerations_of_many
 from unjam.drivers.local_state import LocalState
 from unjam.drivers.safety import Ahead, Cars
 from unjam.errors import EpisodeError
@@ -22,7 +22,6 @@ from unjam.scenarios.road import ClosedRoad
 from unjam.scenarios.scenario import VEHICLE_LENGTH
 from unjam.worlds.audit import MOVING_SPEED
 from unjam.worlds.batch.begun import Begun
-from unjam.worlds.batch.commands import checked
 from unjam.worlds.batch.crossing import Memory
 from unjam.worlds.batch.eight import beginnings, touching_across
 from unjam.worlds.batch.lanes import CONTACT, Leader, touching
@@ -223,7 +222,8 @@ class RingBatch:
     def advance(self, command: Command | None) -> None:
         """Simulate one decision, held over its simulation steps; None: the CAVs stay human."""
         each, before = self.scenario.steps_per_decision, self._rows_at(self._speed, self._places)
-        wanted = checked(command, self.rows, self.decisions, self.limits) if self._controlled else None
+        told_all = self.limits, self.rows, self.decisions
+        wanted = accelerations_of_many(command, *told_all) if self._controlled else None
         log = self._log
         if wanted is not None and self._keep:
             log.wanted.append(wanted)
