@@ -39,7 +39,7 @@ def gap_on_loop(position: Array, leader_position: Array, loop_length: Array, lea
     return (leader_position - position) % loop_length - leader_length
 
 
-def stopping_distance(speed: Array, braking: float, step: float) -> Array:
+def stopping_distance(speed: Array, braking: Array, step: float) -> Array:
     """Return how far a vehicle drives that brakes with `braking` from the next step on [m].
 
     With v_j = max(0, v - j b h) after j steps of length h that is h (v_1 + v_2 + ...), of which the n = floor

@@ -293,7 +293,7 @@ class Trainer:
         """Run `counts` episodes of the first seed, road by road; those of the others are to come."""
         all_of = partial(episodes_of, self.tasks, drivers, counts, spread=self.config.spread, explore=explore)
         now, *coming = map(all_of, seeds)
-        alone, later = len(self.tasks) == 1, list(chain(*coming))
+        alone, later = not self.config.tasks, list(chain(*coming))
         at_once = partial(run_where_possible, run=self.workers.run, coming=later, statistical=alone)
         episodes = (at_once if self.config.world == "batch" else self.workers.run)(now)
         raise_failure([measure(episode) for episode in episodes if not episode.ok])

@@ -3,14 +3,12 @@
 import numpy as np
 
 from unjam.drivers.driver import Driver
-from unjam.physics.idm import idm_acceleration
 from unjam.physics.kinematics import gap_on_loop
 from unjam.scenarios.figure_eight import FigureEight
 from unjam.scenarios.road import ClosedRoad
 from unjam.scenarios.scenario import VEHICLE_LENGTH
-from unjam.worlds.batch.crossing import Crossing
 from unjam.worlds.batch.lanes import Leader
-from unjam.worlds.batch.layer import layer_of
+from unjam.worlds.batch.movement import EightMovement
 from unjam.worlds.closed import NOISE_BLOCK
 from unjam.worlds.episode import run_episode
 from unjam.worlds.record import Floats
@@ -29,18 +27,15 @@ def errors(eight: FigureEight, driver: Driver, seed: int, simulation: Simulation
     blocks = [generator.standard_normal((NOISE_BLOCK, vehicles)) for _ in range(steps // NOISE_BLOCK + 1)]
     step = eight.simulation_step
     noise = np.concatenate(blocks) * eight.noise_per_step * step
-    layer, crossing = layer_of(eight, vehicles, controlled, np.asarray), Crossing(eight, [road], np.asarray)
-    found = np.empty((steps, vehicles))
+    movement, found = EightMovement(eight, [road], controlled, np.asarray), np.empty((steps, vehicles))
+    movement.hand_over()
     for moment in range(steps):
         speed, position = episode.speeds[moment][:, None], episode.positions[moment][:, None]
-        ahead = np.roll(speed, -1, 0)
         gap = gap_on_loop(position, np.roll(position, -1, 0), road.loop_length, VEHICLE_LENGTH)
-        acceleration = idm_acceleration(speed, ahead, np.maximum(gap, 0.01), eight.humans)
-        wanted = np.maximum(speed + acceleration * step + noise[moment][:, None], 0.0)
-        commanded = ~crossing.inside(position)
+        told = None
         if controlled:
-            wanted[controlled] = np.maximum(speed[controlled] + applied[:, [moment]] * step, 0.0)
-            commanded[controlled] = True
-        moved = crossing.moved(layer, speed, position, Leader(ahead, gap), wanted, commanded)
+            told = np.maximum(speed[controlled] + applied[:, [moment]] * step, 0.0)
+        ahead = Leader(np.roll(speed, -1, 0), gap)
+        moved = movement.moved(speed, position, ahead, noise[moment][:, None], told)
         found[moment] = moved[:, 0] - episode.speeds[moment + 1]
     return found

@@ -60,7 +60,7 @@ def leaders(
     yield where(ahead.gap <= seen, *ahead)
     fastest = at_most(speed + people.max_acceleration * step, people.desired_speed)
     braking, headway = people.comfortable_deceleration, people.time_headway
-    sight = fastest * (step + headway) + stopping_distance(fastest, braking, step)
+    farthest = sight(fastest, headway, braking, step)
     # A remainder takes longer than all else here; that of less than a loop is known.
     beyond = place - xp.arange(EDGES)[:, None, None] * lane_length
     beyond = xp.where(beyond < 0.0, beyond + loop, beyond)
@@ -76,7 +76,15 @@ def leaders(
         yield where(occupied, there, seen + front - VEHICLE_LENGTH)
         looked_at = looked_at + lane_length
         seen = seen + lane_length
-        sees = sees & ((seen <= sight) | (looked_at <= LOOK_AHEAD))
+        sees = sees & ((seen <= farthest) | (looked_at <= LOOK_AHEAD))
+
+
+def sight(fastest: Array, headway: Array, braking: Array, step: float) -> Array:
+    """Return how far vehicles look ahead that may be so fast after this step: to stand after a headway [m].
+
+    Shapes: any, broadcast together. Units: m/s, s, m/s2, s.
+    """
+    return fastest * (step + headway) + stopping_distance(fastest, braking, step)
 
 
 def end_of_lane(speed: Array, position: Array, loop: Array, people: IDMParameters | IDMRows) -> Leader:

@@ -13,6 +13,7 @@ from unjam.physics.arrays import Array, at_least, at_most, namespace, square_roo
 from unjam.physics.idm import IDMParameters, by_squaring, idm_acceleration
 from unjam.physics.kinematics import next_speed, speed_to_stop_within, stopping_distance
 from unjam.scenarios.scenario import Scenario
+from unjam.worlds.batch.lanes import sight
 from unjam.worlds.batch.noise import Numbers
 from unjam.worlds.batch.people import EMERGENCY_BRAKING, SMALLEST_GAP, without_gap
 from unjam.worlds.sumo.files import ACCELERATION, SMALLEST_CAV_GAP
@@ -97,14 +98,11 @@ class Layer:
 
     def brake_gap(self, speed: Array) -> Array:
         """Return the way in which each can stand, from the next step on [m]."""
-        change = self.braking * self.step
-        steps = namespace(speed).floor(speed / change)
-        return self.step * steps * (speed - change * (steps + 1.0) / 2.0)
+        return stopping_distance(speed, self.braking, self.step)
 
     def sight(self, speed: Array) -> Array:
         """Return how far each looks ahead: the way to stand after its headway, as fast as it may be [m]."""
-        fastest = self.fastest(speed)
-        return fastest * (self.step + self.headway) + self.brake_gap(fastest)
+        return sight(self.fastest(speed), self.headway, self.braking, self.step)
 
     def arrival(self, way: Array, speed: Array, arrival_speed: Array) -> Array:
         """Return the soonest time in which a way is driven that ends with a speed at most [s]."""
