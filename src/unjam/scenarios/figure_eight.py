@@ -9,6 +9,7 @@ from pydantic import Field, model_validator
 from pydantic.dataclasses import dataclass
 
 from unjam.parameters import STRICT, Count, NotNegative, OneOrRange
+from unjam.physics.arrays import Array
 from unjam.physics.idm import equilibrium_speed
 from unjam.scenarios.ring import Lap, Loop, Place
 from unjam.scenarios.road import Connection, Edge, Line, Node, RoadNetwork, as_line
@@ -32,6 +33,18 @@ MAJOR, MINOR = 78, 46
 def loop_length(radius: float) -> float:
     """Return the length of a lap of the figure eight [m], ways across the junctions included."""
     return _edge_length(radius) + 2 * (CROSSING_LINK + INNER_LINK + OUTER_LINK)
+
+
+def radius_of(loop: Array) -> Array:
+    """Return the radius of figures eight whose laps are so long [m]; the reverse of `loop_length`."""
+    return (loop - 2 * (CROSSING_LINK + INNER_LINK + OUTER_LINK)) / (4 + 3 * pi)
+
+
+def lane_lengths(radius: Array) -> tuple[Array, ...]:
+    """Return the lengths of all lanes in driving order [m]: an edge, the link behind it, and so on."""
+    arc = 1.5 * pi * radius
+    upper = radius, CROSSING_LINK, radius, INNER_LINK, arc, INNER_LINK
+    return *upper, radius, CROSSING_LINK, radius, OUTER_LINK, arc, OUTER_LINK
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -119,16 +132,10 @@ def _edge_length(radius: float) -> float:
 
 def _places(radius: float) -> list[Place]:
     """Return the edges in driving order; between them lie the links of the junctions."""
-    arc = 1.5 * pi * radius
+    names = "bottom", "top", "upper_ring", "right", "left", "lower_ring"
+    lengths = lane_lengths(radius)
     edges, start = [], 0.0
-    for name, length, link in (
-        ("bottom", radius, CROSSING_LINK),
-        ("top", radius, INNER_LINK),
-        ("upper_ring", arc, INNER_LINK),
-        ("right", radius, CROSSING_LINK),
-        ("left", radius, OUTER_LINK),
-        ("lower_ring", arc, OUTER_LINK),
-    ):
+    for name, length, link in zip(names, lengths[::2], lengths[1::2], strict=True):
         edges.append(Place(name, start, length))
         start += length + link
     return edges

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from unjam.physics.arrays import Array, namespace
-from unjam.scenarios.figure_eight import CROSSING_LINK, INNER_LINK, OUTER_LINK
+from unjam.scenarios.figure_eight import CROSSING_LINK, INNER_LINK, OUTER_LINK, lane_lengths, radius_of
 from unjam.scenarios.road import ClosedRoad
 from unjam.scenarios.scenario import VEHICLE_LENGTH
 from unjam.worlds.batch.lanes import CONTACT
@@ -77,31 +77,17 @@ def touching_across(position: Array, gap: Array, loop: Array) -> Array:
         loop: length of the road [m].
     """
     xp, place = namespace(position), position % loop
-    radius = (loop - 2 * (CROSSING_LINK + INNER_LINK + OUTER_LINK)) / (4 + 3 * pi)
-    arc, found = 1.5 * pi * radius, gap < CONTACT
-    lanes = (
-        radius,
-        CROSSING_LINK,
-        radius,
-        INNER_LINK,
-        arc,
-        INNER_LINK,
-        radius,
-        CROSSING_LINK,
-        radius,
-        OUTER_LINK,
-        arc,
-    )
+    lanes, found = lane_lengths(radius_of(loop)), gap < CONTACT
     if bool(found.any()):
         lane, end = 0.0 * place, 0.0
-        for length in lanes:
+        for length in lanes[:-1]:
             end = end + length
             lane = lane + (place > end)
         found = found & (lane == xp.concatenate([lane[1:], lane[:1]]))
     covers = [
         (fronts > CROSSING_LINK / 2 - CAR_WIDTH / 2)
         & (fronts < CROSSING_LINK / 2 + CAR_WIDTH / 2 + VEHICLE_LENGTH)
-        for start in (radius, sum(lanes[:7]))
+        for start in (lanes[0], sum(lanes[:7]))
         for fronts in [(place - start) % loop]
     ]
     both = covers[0].any(0) & covers[1].any(0)
