@@ -20,6 +20,7 @@ ORDER = (
 """each may import those before it, and none after it"""
 EVERYWHERE = {
     "",
+    "adam",
     "errors",
     "files",
     "kernels",
@@ -157,6 +158,7 @@ def test_sumo_is_imported_in_one_place() -> None:
 def test_learning_libraries_are_imported_only_where_we_learn() -> None:
     found = importers(TORCH)
     assert {part_of(module) for module in found} <= {
+        "adam",
         "controller",
         "following",
         "learners",

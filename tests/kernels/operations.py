@@ -14,6 +14,8 @@ import numpy as np
 import torch
 from torch import nn
 
+from unjam.adam import Adam
+
 ROWS = (1, 3, 16, 64, 300, 2000)
 """of the products: a look of one CAV, a batch, an iteration"""
 SIZES = ((9, 64, 64, 1), (11, 32, 32, 6), (6, 8, 1))
@@ -131,7 +133,7 @@ def torch_beginnings() -> list[torch.Tensor]:
 def torch_steps() -> list[torch.Tensor]:
     """Twenty steps of Adam, as all trainings use it: fused. The other one takes square roots from MKL."""
     parameter = torch.as_tensor(numbers(64, 9)).float().requires_grad_()
-    optimizer = torch.optim.Adam([parameter], lr=1e-3, fused=True)
+    optimizer = Adam([parameter], lr=1e-3, fused=True)
     for step in range(20):
         parameter.grad = torch.as_tensor(numbers(64, 9, low=-1.0 - step)).float() * parameter.detach()
         optimizer.step()

@@ -11,8 +11,6 @@ import sys
 import traceback
 from contextlib import nullcontext
 
-import torch._dynamo  # noqa: F401  # what the first optimiser of a process imports
-
 import unjam.cli
 import unjam.cli.output
 import unjam.training.evaluate

@@ -15,6 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from unjam.adam import Adam
 from unjam.drivers.network import Network
 from unjam.errors import UnjamError
 from unjam.following.open_loop import (
@@ -124,7 +125,7 @@ def fit_one_step(
         )
         for each in (moments, validation)
     )
-    optimizer = torch.optim.Adam(network.parameters(), lr=settings.rate, fused=True)
+    optimizer = Adam(network.parameters(), lr=settings.rate, fused=True)
     generator = torch.Generator().manual_seed(seed)
     losses, best, waited, kept = Losses(), float("inf"), 0, deepcopy(network.state_dict())
     while len(losses.training) < settings.epochs and waited < settings.patience:
@@ -195,7 +196,7 @@ def fit_multi_step(
         drove = open_loop(with_residual(base, on_rows(network.as_driver()), limits), judged)
         return float(np.sqrt(drove.gap_square).mean())
 
-    optimizer = torch.optim.Adam(network.parameters(), lr=settings.rate)
+    optimizer = Adam(network.parameters(), lr=settings.rate)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, settings.steps)
     generator = np.random.default_rng(seed)
     found, kept = [gap_error()], deepcopy(network.state_dict())

@@ -13,6 +13,7 @@ from stable_baselines3.sac.policies import Actor, SACPolicy
 from torch import Tensor, nn
 from torch.distributions import Normal
 
+from unjam.adam import Adam
 from unjam.drivers.network import Network
 from unjam.learners.experience import Experience, MixedReplayBuffer, add_to_replay_buffer, shifted_rewards
 from unjam.learners.learner import AgentSpec, Learner, Tensors, Update, network_layers
@@ -63,7 +64,11 @@ class OffPolicyResidual(BasePolicy):
         self.inputs = inputs
         self.authority = settings.authority * action_limit
         super().__init__(
-            *arguments, net_arch=list(settings.hidden), optimizer_kwargs={"fused": True}, **named
+            *arguments,
+            net_arch=list(settings.hidden),
+            optimizer_class=Adam,
+            optimizer_kwargs={"fused": True},
+            **named,
         )
         self.register_buffer("reward_offset", torch.zeros((), dtype=torch.float64))
 

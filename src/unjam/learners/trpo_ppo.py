@@ -11,6 +11,7 @@ from stable_baselines3.common.torch_layers import create_mlp
 from torch import Tensor, nn
 from torch.distributions import Normal
 
+from unjam.adam import Adam
 from unjam.drivers.network import Network
 from unjam.learners.experience import Experience, discounted_returns, fill_rollout_buffer, join
 from unjam.learners.learner import AgentSpec, Learner, Update, network_layers
@@ -86,7 +87,8 @@ class ResidualPolicy(ActorCriticPolicy):
         self.settings = settings
         self.inputs = inputs
         self.authority = settings.authority * action_limit
-        super().__init__(*arguments, log_std_init=math.log(settings.exploration_std * action_limit), **named)
+        noise = math.log(settings.exploration_std * action_limit)
+        super().__init__(*arguments, log_std_init=noise, optimizer_class=Adam, **named)
 
     def _build_mlp_extractor(self) -> None:
         critic_inputs = self.features_dim - self.inputs
@@ -113,7 +115,7 @@ class ResidualPolicy(ActorCriticPolicy):
         groups: dict[bool, list[nn.Parameter]] = {False: [], True: []}
         for name, parameter in self.named_parameters():
             groups["value" in name].append(parameter)
-        self.optimizer = torch.optim.Adam(
+        self.optimizer = Adam(
             [{"params": groups[False], "lr": actor}, {"params": groups[True], "lr": critic}],
             eps=1e-5,
             fused=True,  # see `unjam.kernels`

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn.functional import pad
 
+from unjam.adam import Adam
 from unjam.errors import UnjamError
 from unjam.virtual.settings import VirtualSettings
 from unjam.worlds.record import Floats
@@ -230,7 +231,7 @@ def _descend(
     seen, wanted = training
     device, rows = seen.device, seen.shape[1]
     parameters = [*ensemble.weights, *ensemble.biases]
-    optimizer = torch.optim.Adam(parameters, lr=settings.rate, fused=True)
+    optimizer = Adam(parameters, lr=settings.rate, fused=True)
     best = [parameter.detach().clone() for parameter in parameters]
     best_loss, waited, passes, last_loss = _losses(ensemble, *holdout), 0, 0, float("nan")
     while passes < settings.epochs and waited < settings.patience:
