@@ -66,16 +66,22 @@ def corridor(folder: Path, hours: float) -> Path:
 
 
 def used(command: list[str]) -> dict[str, Any]:
-    """Run a command; return its processor seconds, and the most memory of each of its processes [MB]."""
+    """Run a command; return its processor seconds, the most memory of each process, and of all at once [MB].
+
+    What processes share, libraries above all, counts in each of them.
+    """
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
     most: dict[int, float] = {}
+    together = [0.0]
 
     def watch() -> None:
         while process.poll() is None:
-            for pid in (process.pid, *_children(process.pid)):
-                most[pid] = max(most.get(pid, 0.0), _peak(pid))
-            time.sleep(0.2)
+            running = (process.pid, *_children(process.pid))
+            for pid in running:
+                most[pid] = max(most.get(pid, 0.0), _memory(pid, "VmHWM"))
+            together.append(sum(_memory(pid, "VmRSS") for pid in running))
+            time.sleep(0.05)
 
     watching = threading.Thread(target=watch)
     watching.start()
@@ -85,7 +91,7 @@ def used(command: list[str]) -> dict[str, Any]:
         raise SystemExit(f"{' '.join(command)} ended with code {process.returncode}")
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     cpu = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-    return {"cpu": cpu, "memory": sorted(most.values()), "said": said}
+    return {"cpu": cpu, "memory": sorted(most.values()), "together": max(together), "said": said}
 
 
 def _children(pid: int) -> list[int]:
@@ -97,12 +103,12 @@ def _children(pid: int) -> list[int]:
     return found
 
 
-def _peak(pid: int) -> float:
+def _memory(pid: int, what: str) -> float:
     try:
         lines = Path(f"/proc/{pid}/status").read_text().splitlines()
     except OSError:
         return 0.0
-    return sum(int(line.split()[1]) / 1000 for line in lines if line.startswith("VmHWM"))
+    return sum(int(line.split()[1]) / 1000 for line in lines if line.startswith(f"{what}:"))
 
 
 def main() -> None:
@@ -147,7 +153,7 @@ def main() -> None:
         "seconds_of_sumo_with_emissions": sumo,
         "seconds_of_unjam": driven["cpu"],
         "share_of_sumo": sumo / driven["cpu"],
-        "memory_mb": {"of each process": driven["memory"], "together": sum(driven["memory"])},
+        "memory_mb": {"of each process": driven["memory"], "together": driven["together"]},
         "written_mb": sizes,
         "load": os.getloadavg(),
         "manifest": manifest(),

@@ -8,6 +8,9 @@ import os
 import signal
 import sys
 import time
+from collections.abc import Callable
+from contextlib import ExitStack, suppress
+from functools import cache
 from typing import Any, BinaryIO
 
 from unjam.drivers.registry import driver_from_recipe
@@ -32,23 +35,26 @@ def main() -> None:
     answers = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # SUMO and user code may print: not into the answers
     gc.freeze()  # what the imports made stays; searching it for garbage would cost every episode
-    simulation = None
-    try:
+    with (
+        ExitStack() as at_the_end,
+        suppress(BrokenPipeError, EOFError),
+    ):  # the parent wants no more, or is gone
+        simulation = cache(lambda: at_the_end.enter_context(Simulation()))
         while True:
-            facts, arrays = read_message(sys.stdin.buffer)
-            try:
-                simulation = simulation or Simulation()
-                episode = _run(facts, arrays, simulation, answers)
-            except Exception as error:  # every requested episode has a row, also one that failed
-                known = in_own_words(error)
-                episode = failed_episode(tuple(facts["seed"]), str(known), type(known).__name__)
-            answer, answer_arrays = pack(episode)
-            write_message(answers, {"episode": answer}, answer_arrays)
-    except (BrokenPipeError, EOFError):
-        pass  # the parent is gone, or wants no more
-    finally:
-        if simulation is not None:
-            simulation.close()
+            _answer(*read_message(sys.stdin.buffer), simulation, answers)
+
+
+def _answer(
+    facts: dict[str, Any], arrays: Arrays, simulation: Callable[[], Simulation], answers: BinaryIO
+) -> None:
+    """Run an episode and send what happened; of hours of traffic nothing stays here."""
+    try:
+        episode = _run(facts, arrays, simulation(), answers)
+    except Exception as error:  # every requested episode has a row, also one that failed
+        known = in_own_words(error)
+        episode = failed_episode(tuple(facts["seed"]), str(known), type(known).__name__)
+    answer, answer_arrays = pack(episode)
+    write_message(answers, {"episode": answer}, answer_arrays)
 
 
 def _run(facts: dict[str, Any], arrays: Arrays, simulation: Simulation, answers: BinaryIO) -> Any:
