@@ -43,8 +43,10 @@ class Trickle(BytesIO):
 
 
 def frame(facts: dict[str, Any], arrays: Arrays | None = None) -> bytes:
-    pipe = BytesIO()
-    write_message(pipe, facts, arrays)
+    """What is written, arrays and all: none is left."""
+    pipe, left = BytesIO(), dict(arrays or {})
+    write_message(pipe, facts, left)
+    assert not left
     return pipe.getvalue()
 
 

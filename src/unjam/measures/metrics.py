@@ -1,6 +1,7 @@
 """What is measured of an episode. Each metric is defined here, once, with its unit and source."""
 
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from math import inf
 from typing import Any, Literal
@@ -53,20 +54,29 @@ def _over_cavs(values: Sequence[Any]) -> float:
     return float(np.mean(values)) if len(values) else float("nan")
 
 
-def _mean_there(speeds: Floats) -> float:
-    """Return the mean over all that are on the road; NaN where nobody ever was."""
-    there = speeds[~np.isnan(speeds)]
-    return float(there.mean()) if there.size else float("nan")
+def _parts(speeds: Floats) -> Iterator[Floats]:
+    """Return moments part by part: of hours of traffic there is no copy."""
+    rows = max(1, CELLS_AT_ONCE // max(1, math.prod(speeds.shape[1:])))
+    return (speeds[start : start + rows] for start in range(0, len(speeds), rows))
+
+
+def _mean_there(speeds: Floats, of: Callable[[Floats], Any] = np.asarray) -> float:
+    """Return the mean of what `of` makes of all that are on the road; NaN where nobody ever was."""
+    total, count = 0.0, 0
+    for part in _parts(speeds):
+        there = part[~np.isnan(part)]
+        total, count = total + float(of(there).sum()), count + there.size
+    return total / count if count else float("nan")
 
 
 def _of_moments(function: Callable[..., Floats], speeds: Floats) -> Floats:
-    """Return `np.nanmean` or the like of each moment, NaN where nobody is; hours of them part by part."""
-    found, rows = np.full(len(speeds), np.nan), max(1, CELLS_AT_ONCE // max(1, speeds.shape[1]))
-    for start in range(0, len(speeds), rows):
-        part = speeds[start : start + rows]
+    """Return `np.nanmean` or the like of each moment; NaN where nobody is."""
+    found = []
+    for part in _parts(speeds):
         there = ~np.isnan(part).all(axis=1)
-        found[start : start + rows][there] = function(part[there], axis=1)
-    return found
+        found.append(np.full(len(part), np.nan))
+        found[-1][there] = function(part[there], axis=1)
+    return np.concatenate([np.zeros(0), *found])
 
 
 def mean_speed(episode: Episode) -> float:
@@ -151,8 +161,7 @@ def mean_abs_jerk(episode: Episode) -> float:
 
 def share_standing(episode: Episode) -> float:
     """Share of vehicle-seconds spent below 0.1 m/s."""
-    speeds = episode.speeds[1:]
-    return _mean_there((speeds[~np.isnan(speeds)] < STANDING_SPEED).astype(np.float64))
+    return _mean_there(episode.speeds[1:], lambda there: there < STANDING_SPEED)
 
 
 def time_to_dissolve(episode: Episode) -> float:
@@ -192,7 +201,7 @@ def fuel_ml_per_km(episode: Episode) -> float:
 
     SUMO's emission model: https://sumo.dlr.de/docs/Models/Emissions.html
     """
-    driven = float(np.nansum(episode.speeds[1:])) * episode.step
+    driven = sum(float(np.nansum(part)) for part in _parts(episode.speeds[1:])) * episode.step
     if episode.fuel.size == 0 or driven == 0:
         return float("nan")
     return float(np.nansum(episode.fuel)) * episode.step / PETROL_DENSITY / (driven / 1000.0)

@@ -16,17 +16,19 @@ NUMBERS = "biuf"
 def write_message(pipe: IO[bytes], facts: dict[str, Any], arrays: Arrays | None = None) -> None:
     """Write one message: `facts` as JSON, and arrays of numbers by name.
 
-    An array is written from where it lies: hours of traffic are not in memory twice.
+    An array is written from where it lies, and then taken out of `arrays`: hours of traffic that nobody else
+    holds are not in memory twice, here and where they are read.
     """
-    made = {name: np.asarray(array, order="C") for name, array in (arrays or {}).items()}
+    made = {} if arrays is None else arrays
     for name, array in made.items():
+        made[name] = array = np.asarray(array, order="C")
         if array.dtype.kind not in NUMBERS:
             raise TypeError(f"{name}: an array of {array.dtype} cannot travel")
     shapes = [[name, array.dtype.str, array.shape] for name, array in made.items()]
     text, about = json.dumps(facts).encode(), json.dumps(shapes).encode()
     pipe.write(_LENGTHS.pack(len(text), len(about)) + text + about)
-    for array in made.values():
-        pipe.write(_bytes_of(array))
+    for name in list(made):
+        pipe.write(_bytes_of(made.pop(name)))
     pipe.flush()
 
 

@@ -49,12 +49,11 @@ def _answer(
 ) -> None:
     """Run an episode and send what happened; of hours of traffic nothing stays here."""
     try:
-        episode = _run(facts, arrays, simulation(), answers)
+        answer, found = pack(_run(facts, arrays, simulation(), answers))
     except Exception as error:  # every requested episode has a row, also one that failed
         known = in_own_words(error)
-        episode = failed_episode(tuple(facts["seed"]), str(known), type(known).__name__)
-    answer, answer_arrays = pack(episode)
-    write_message(answers, {"episode": answer}, answer_arrays)
+        answer, found = pack(failed_episode(tuple(facts["seed"]), str(known), type(known).__name__))
+    write_message(answers, {"episode": answer}, found)
 
 
 def _run(facts: dict[str, Any], arrays: Arrays, simulation: Simulation, answers: BinaryIO) -> Any:

@@ -195,7 +195,8 @@ class _Worker:
         guard = threading.Timer(self._silence, process.kill)  # a full pipe that nobody reads blocks for ever
         guard.start()
         try:
-            write_message(process.stdin, *task)
+            facts, arrays = task
+            write_message(process.stdin, facts, dict(arrays))
         finally:
             guard.cancel()
 
