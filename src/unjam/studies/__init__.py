@@ -5,7 +5,6 @@ from unjam.studies.comparison import FIGURE_5, comparison_of
 from unjam.studies.drivable import (
     DRIVABLE_EIGHT,
     DRIVABLE_JAMMED,
-    DRIVABLE_JAMMED_WHOLE,
     DRIVABLE_STUDY,
 )
 from unjam.studies.envelope import ENVELOPE
@@ -73,7 +72,6 @@ STUDIES: dict[str, Study] = {
     "drivable": DRIVABLE_STUDY,
     "drivable-eight": DRIVABLE_EIGHT,
     "drivable-jammed": DRIVABLE_JAMMED,
-    "drivable-jammed-whole": DRIVABLE_JAMMED_WHOLE,
     "envelope": ENVELOPE,
     "everywhere": EVERYWHERE_STUDY,
     "adaptation": ADAPTATION,

@@ -34,11 +34,18 @@ SEEDS = 10
 """of each length or radius"""
 PI_TUNED = "PI, tuned"
 FROM_GAP, FROM_GAP_JAMMED = "PI from its gap, tuned", "PI from its gap, tuned in a jam"
+FROM_GAP_JAMMED_LONG = f"{FROM_GAP_JAMMED}, twice as long"
 PI_LONG = (
     "pi:window=13.31,catch_up_speed=1.193,gap_lower=5.997,gap_upper=58.76,"
     "safe_gap=1.037,safe_gap_rule=closing,time_constant=0.8318,first_command=own-speed"
 )
 """what `unjam tune ring --expert pi --steps 12000000` finds; of the other it is `unjam:ring-gap-tuned`"""
+JAMMED_LONG = (
+    "pi-from-gap:window=23,catch_up_speed=2.916,gap_lower=6,gap_upper=80,safe_gap=2,"
+    "time_constant=2.976,fading=26,watched_share=0"
+)
+"""what `unjam tune ring-jammed --expert pi-from-gap --steps 12000000` finds within the bounds that were given
+for `unjam:ring-jammed-tuned`, which had half of these steps: results/tuned has both commands"""
 PACER_LONG = (
     "pacer:varying=true,gathering_speed=1.96,gathering_gap=0.319,regathering_gap=0.1595,time_constant=0.0966"
 )
@@ -100,7 +107,12 @@ OF_RINGS = JudgedRoad(
 )
 ROADS = {
     "ring": OF_RINGS,
-    "ring-jammed": replace(OF_RINGS, of_size=partial(_ring, GROWN)),
+    "ring-jammed": replace(
+        OF_RINGS,
+        of_size=partial(_ring, GROWN),
+        named={**OF_RINGS.named, FROM_GAP_JAMMED_LONG: JAMMED_LONG},
+        baselines=(FROM_GAP, FROM_GAP_JAMMED, FROM_GAP_JAMMED_LONG),
+    ),
     "figure-eight": JudgedRoad(
         sizes=(32, 33, 34, 35),
         of_size=lambda radius: FigureEight(radius=(radius, radius)),
@@ -207,12 +219,9 @@ DRIVABLE_STUDY = _study(
 DRIVABLE_EIGHT = _study(
     "what a drivable residual is worth beside the tuned expert, on the figure eight", ("figure-eight",), 5.0
 )
-DRIVABLE_JAMMED, DRIVABLE_JAMMED_WHOLE = (
-    _study(
-        f"what a residual that was searched {by} is worth beside the tuned expert, on the jammed ring",
-        ("ring-jammed",),
-        20.0,
-        variant,
-    )
-    for by, variant in (("by its first 150 s", "searched"), ("by whole episodes", "searched-whole"))
+DRIVABLE_JAMMED = _study(
+    "what a residual is worth beside the tuned expert that was trained on the first half of jammed episodes",
+    ("ring-jammed",),
+    20.0,
+    "by-150-seconds",
 )
