@@ -150,7 +150,7 @@ BEST: dict[str, dict[str, Any]] = {
         "virtual": {"virtual_ratio": 0.0},
         "evaluation": {"every": 5, "validation_episodes": 32},
     },
-    # A wave that has grown: what ends it sooner may leave a flow that is slower for minutes, so it takes whole
+    # A wave that has grown: what ends it sooner may leave a slower flow for minutes, so it takes whole
     # episodes, and hardly any noise. Settings that a search found: results/tried/ring-jammed-search.
     "ring-jammed": {
         "steps": 6_000_000,
