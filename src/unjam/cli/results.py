@@ -45,7 +45,6 @@ def evaluate(
     from unjam.reports.story import lead_of
     from unjam.training.evaluate import gain_of, judge, steps_to_judge
     from unjam.training.folder import read_config
-    from unjam.training.train import TrainResult
     from unjam.worlds.workers import Workers
 
     if humans is not None and out is None:
@@ -62,16 +61,16 @@ def evaluate(
     with owned(target):
         with counting_steps("evaluating", total) as steps, Workers(workers) as pool:
             found = judge(run, config, pool, list(DRIVERS), episodes, steps, out)
-        result = TrainResult(target, found.rows, gain_of(config, found.rows))
-        write_report([target], result.report)
+        page = write_report([target], target / "report.html")
     if json:
-        gain, means = asdict(result.gain) if result.gain else None, found.means()
+        beyond, means = gain_of(config, found.rows), found.means()
+        gain = asdict(beyond) if beyond else None
         drivers = [{"driver": one, "episodes": rows, "mean": means[one]} for one, rows in found.rows.items()]
         print_json({"run": str(run), "scenario": config.scenario, "gain": gain, "drivers": drivers})
         return
     print_metrics(found.rows)
     console.print(lead_of(read_results(target)), soft_wrap=True)
-    aside.print(f"report: {result.report}")
+    aside.print(f"report: {page}")
 
 
 def model(
