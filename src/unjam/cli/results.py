@@ -213,12 +213,13 @@ def certify(
     from unjam.controller.file import add_certificate, check_unsigned, controller_file, read_controller
     from unjam.drivers.wrappers import Filtered
     from unjam.files import check_folder
-    from unjam.reports.certificate import write_certificate
 
     controller, file = read_controller(file), controller_file(file)
     target = out or file.with_suffix(".html")
     check_folder(target)
     check_unsigned(controller)
+    from unjam.reports.certificate import write_certificate
+
     found = certificate_of(controller)
     add_certificate(file, controller, found)
     assert isinstance(controller.driver, Filtered)  # nothing else is certified

@@ -11,7 +11,6 @@ from statistics import NormalDist
 from typing import Any
 
 import numpy as np
-from scipy.special import stdtrit
 
 from unjam.measures.metrics import METRICS, SIGNED
 
@@ -66,8 +65,15 @@ def estimate(
     winsorised = np.clip(finite, kept.min(), kept.max())
     variance = float(winsorised.var()) * len(finite) if found.smallest < found.largest else 0.0
     error = sqrt(variance / (len(kept) * (len(kept) - 1)))
-    half = float(stdtrit(len(kept) - 1, 0.5 + confidence / 2)) * error
+    half = _student(len(kept) - 1, confidence) * error
     return replace(found, low=max(found.mean - half, bounds[0]), high=min(found.mean + half, bounds[1]))
+
+
+def _student(degrees: float, confidence: float = CONFIDENCE) -> float:
+    """Return the t of Student's distribution within which, to both sides, `confidence` of it lies."""
+    from scipy.special import stdtrit  # a third of what a command takes to start, and many have no interval
+
+    return float(stdtrit(degrees, 0.5 + confidence / 2))
 
 
 def digits_of(found: Estimate, digits: int) -> int:
@@ -164,7 +170,7 @@ def probability_of_improvement(differences: Any) -> Estimate:
     if trainings > 1:
         variance, degrees = _crossed_variance(better)
         episodes = share * (1 - share) / variance if variance else min(better.shape)
-        z = float(stdtrit(degrees, 0.5 + CONFIDENCE / 2))
+        z = _student(degrees)
     middle = share + z**2 / (2 * episodes)
     half = z * sqrt(share * (1 - share) / episodes + (z / episodes) ** 2 / 4)
     low, high = ((middle + side * half) / (1 + z**2 / episodes) for side in (-1, 1))
@@ -200,7 +206,7 @@ def crossed_estimate(values: Any) -> Estimate:
     if min(table.shape) < LEAST or two_modes(means):
         return found
     variance, degrees = _crossed_variance(table)
-    half = float(stdtrit(degrees, 0.5 + CONFIDENCE / 2)) * sqrt(variance)
+    half = _student(degrees) * sqrt(variance)
     return replace(found, low=mean - half, high=mean + half)
 
 

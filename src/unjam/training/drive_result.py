@@ -1,24 +1,28 @@
-"""What `unjam.drive` returns: rows of metrics by driver, as numbers, tables of pandas, and in a notebook."""
+"""What `unjam.drive` returns: rows of metrics by driver, as numbers, tables of pandas, and in a notebook.
+
+What makes tables and draws is imported where it does: a command that says what is wrong needs none of it.
+"""
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
-
-import pandas as pd
+from typing import TYPE_CHECKING, Any
 
 from unjam.measures.drivable import verdicts
 from unjam.measures.effect import Effect, beside_people
 from unjam.measures.metrics import METRICS
 from unjam.measures.statistics import Estimate, paired_difference, summarise
 from unjam.measures.table import Rows, baseline_of, headings_of, table_of
-from unjam.reports.figures import data_uri
-from unjam.reports.lanes import space_time_of
 from unjam.reports.results import shown_of
 from unjam.worlds.record import Episode
 
+if TYPE_CHECKING:
+    import pandas as pd
 
-def frame_of_rows(rows_by_driver: Rows) -> pd.DataFrame:
+
+def frame_of_rows(rows_by_driver: Rows) -> "pd.DataFrame":
     """Return a row per episode and driver: `driver`, `seed` in words, `status`, and every metric."""
+    import pandas as pd
+
     return pd.DataFrame(
         [
             {"driver": label, **row, "seed": str(row["seed"])}
@@ -51,11 +55,13 @@ class DriveResult:
         """Return mean and 95 % interval of every metric for a driver."""
         return summarise(self.rows[driver])
 
-    def table(self) -> pd.DataFrame:
+    def table(self) -> "pd.DataFrame":
         """Return a row per metric and, for each driver, its mean and both ends of its 95 % interval.
 
         `result.table().loc["mean_speed", ("pi", "mean")]` is one number.
         """
+        import pandas as pd
+
         numbers = {
             (label, part): [getattr(estimate, part) for estimate in self.summary(label).values()]
             for label in self.rows
@@ -64,12 +70,17 @@ class DriveResult:
         frame = pd.DataFrame(numbers, index=pd.Index(METRICS, name="metric"))
         return frame.rename_axis(columns=("driver", None))
 
-    def episodes(self) -> pd.DataFrame:
+    def episodes(self) -> "pd.DataFrame":
         """Return a row per episode and driver, with its seed, its status and every metric."""
         return frame_of_rows(self.rows)
 
     def _repr_html_(self) -> str:
         """What a notebook shows: every metric with its interval, and where each vehicle was at each time."""
+        import pandas as pd
+
+        from unjam.reports.figures import data_uri
+        from unjam.reports.lanes import space_time_of
+
         baseline = baseline_of(self.rows)
         cells = [
             [f"{row.label} [{row.unit}]" if row.unit else row.label, *map(str, row.cells)]

@@ -23,7 +23,6 @@ from unjam.files import make_folder, to_json, write_whole
 from unjam.manifest import manifest
 from unjam.measures.metrics import measure
 from unjam.measures.statistics import Estimate, paired_difference, summarise
-from unjam.reports.html import write_report
 from unjam.reports.results import ABOUT_SHOWN, packed, shown_of
 from unjam.scenarios import make_scenario, scenario_recipe
 from unjam.scenarios.scenario import Scenario
@@ -310,6 +309,8 @@ def drive(
             about = {"scenario": Path(scenario).name, "reward": reward or made.reward, "manifest": manifest()}
             named = {label: label for label in drivers}
             save_evaluation(folder, found, {**about, "controllers": _hashes(named), "notes": notes})
+            from unjam.reports.html import write_report  # draws: so late that what is wrong is told at once
+
             report = write_report([folder], folder / "report.html")
     kept = folder if ran else None  # there is nothing to look at
     return DriveResult(scenario, found.rows, kept, report, found.shown, notes)
