@@ -184,7 +184,11 @@ def _row(road: JudgedRoad, episodes: pd.DataFrame, label: str, members: list[str
     return {
         "driver": label,
         "return": f"{mean[road.metric]:.0f}",
-        **{f"beyond {baseline}": beyond(baseline, road.metric, 0) for baseline in road.baselines},
+        **{
+            f"beyond {baseline}": beyond(baseline, road.metric, 0)
+            for baseline in road.baselines
+            if (episodes["driver"] == baseline).any()
+        },
         "mean speed [m/s]": f"{mean['mean_speed']:.2f}",
         "beyond people [m/s]": beyond(PEOPLE, "mean_speed", 2),
         "flow [veh/h]": f"{mean['throughput_veh_per_h']:.0f}",
