@@ -10,14 +10,14 @@ from pathlib import Path
 from statistics import median
 
 from unjam.manifest import manifest
-from unjam.studies.imagined import COMPARED
+from unjam.studies.imagined import compared_with
 from unjam.studies.study import PlannedRun
 from unjam.training.train import train
 
 ROUNDS, ITERATIONS = 3, 5
 
-seconds: dict[str, list[float]] = {name: [] for name in COMPARED}
-planned = {name: PlannedRun("ring", name, 0).config for name in COMPARED}
+seconds: dict[str, list[float]] = {name: [] for name in compared_with("best")}
+planned = {name: PlannedRun("ring", name, 0).config for name in compared_with("best")}
 for seed in range(ROUNDS):
     for name, config in planned.items():
         unjudged = replace(config.evaluation, every=0, episodes=1)

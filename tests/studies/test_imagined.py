@@ -3,7 +3,7 @@
 import json
 from pathlib import Path
 
-from unjam.studies.imagined import COMPARED, imagined
+from unjam.studies.imagined import compared_with, imagined
 
 
 def test_returns_stand_beside_those_of_as_few_steps_and_of_three_times_as_many(tmp_path: Path) -> None:
@@ -15,9 +15,9 @@ def test_returns_stand_beside_those_of_as_few_steps_and_of_three_times_as_many(t
         "return_validation": [[1000.0, value] for value in (2e3, 2e3, 2e3)],
     }
     middle = {"steps": [24_000.0, 1_512_000.0], "return_validation": [[*end, 2100.0] for end in ends]}
-    curves = dict(zip(COMPARED, (modelled, few, middle, many), strict=True))
+    curves = dict(zip(compared_with("best"), (modelled, few, middle, many), strict=True))
     (tmp_path / "curves.json").write_text(json.dumps({"ring": curves}))
-    table = imagined("ring").tables["efficiency"](tmp_path).set_index("")
+    table = imagined("ring", "best").tables["efficiency"](tmp_path).set_index("")
     assert table.loc["ours, few steps and whole roads imagined", "750,000"] == "2125"
     assert table.loc["ours, few steps", "1,500,000"] == "–"
     assert table.loc["ours, all its steps", "380,000"] == "–"  # nobody had looked

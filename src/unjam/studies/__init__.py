@@ -62,7 +62,8 @@ STUDIES: dict[str, Study] = {
         ("best", "ours-with-model"),
         "ring-jammed",
     ),
-    "imagined": imagined("ring"),
+    "imagined": imagined("ring", "best"),
+    "imagined-jammed": imagined("ring-jammed", "jammed"),
     "eq16": comparison_of(
         "Eq. 16 as it is printed and as it is meant, on the ring",
         ("trpo-eq16", "trpo-as-printed", "proposed-eq16", "proposed-as-printed"),

@@ -187,7 +187,7 @@ def _row(road: JudgedRoad, episodes: pd.DataFrame, label: str, members: list[str
         **{
             f"beyond {baseline}": beyond(baseline, road.metric, 0)
             for baseline in road.baselines
-            if (episodes["driver"] == baseline).any()
+            if baseline in set(episodes["driver"])
         },
         "mean speed [m/s]": f"{mean['mean_speed']:.2f}",
         "beyond people [m/s]": beyond(PEOPLE, "mean_speed", 2),

@@ -4,6 +4,7 @@ The best method of a road, with the model and without it: on as few actual steps
 that it takes.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -17,20 +18,27 @@ from unjam.studies.comparison import comparison_of
 from unjam.studies.study import VARIANTS, PlannedRun, Study, read_part
 from unjam.worlds.record import Floats
 
-MODELLED, FEW, MIDDLE, MANY = COMPARED = ("best-imagined", "best-few", "best-middle", "best")
 LOOKS = (190_000, 380_000, 750_000, 1_500_000, 3_000_000, 6_000_000)
 """actual steps after which trainings are looked at"""
-TIMES = {FEW: 1, MIDDLE: 2, MANY: 3}
-"""how many times the actual steps the method may take without the model"""
+TIMES = (1, 2, 3)
+"""how many times the actual steps the method may take without the model: few, twice as many, all"""
 
 
-def efficiency(road: str, folder: Path) -> pd.DataFrame:
-    """Return what trainings earn on the validation seeds after so many actual steps, and what more it is."""
-    curves = read_part(folder, "curves")[road]
-    seen = {name: partial(_returns, curves[name], _first_look(road, name)) for name in COMPARED}
-    rows = [_row(VARIANTS[name].label, [seen[name](at) for at in LOOKS]) for name in COMPARED]
-    for name, times in TIMES.items():
-        beyond = [seen[MODELLED](at) - seen[name](times * at) for at in LOOKS]
+def compared_with(prefix: str) -> tuple[str, ...]:
+    """Return the variants whose names begin with `prefix`, the one with the model first, and `best`."""
+    return (*(f"{prefix}-{name}" for name in ("imagined", "few", "middle")), "best")
+
+
+def efficiency(road: str, compared: Sequence[str], folder: Path) -> pd.DataFrame:
+    """Return what trainings earn on the validation seeds after so many actual steps, and what more it is.
+
+    Of the variants that are compared the first has the model.
+    """
+    curves, (modelled, *others) = read_part(folder, "curves")[road], compared
+    seen = {name: partial(_returns, curves[name], _first_look(road, name)) for name in compared}
+    rows = [_row(VARIANTS[name].label, [seen[name](at) for at in LOOKS]) for name in compared]
+    for name, times in zip(others, TIMES, strict=True):
+        beyond = [seen[modelled](at) - seen[name](times * at) for at in LOOKS]
         rows.append(
             _row(f"with the model beyond “{VARIANTS[name].label}” after {times} times as many", beyond, "+")
         )
@@ -56,7 +64,8 @@ def _row(label: str, columns: list[Floats], sign: str = "") -> dict[str, str]:
     return {"": label, **dict(zip((f"{steps:,}" for steps in LOOKS), cells, strict=True))}
 
 
-def imagined(road: str) -> Study:
-    """Return the study of a road."""
-    compared = comparison_of(f"what a model of the whole road saves, on the {road}", COMPARED, road)
-    return replace(compared, tables={**compared.tables, "efficiency": partial(efficiency, road)})
+def imagined(road: str, prefix: str) -> Study:
+    """Return the study of a road and of its variants whose names begin with `prefix`."""
+    compared = compared_with(prefix)
+    study = comparison_of(f"what a model of the whole road saves, on the {road}", compared, road)
+    return replace(study, tables={**study.tables, "efficiency": partial(efficiency, road, compared)})

@@ -136,15 +136,22 @@ class Variant:
     """the variant whose numbers the paper gives for it, if it is another"""
 
 
-SMALL = {"trpo.batch_steps": 12_000}
-IMAGINED = {
-    **SMALL,
-    "virtual.virtual_ratio": 7.0,
-    "virtual.model": "road",
-    "virtual.begin": "first",
-    "virtual.k_max": 3000,
-}
-"""iterations as large as those of `best` on the ring, of which an eighth is actual"""
+_ROADS = {"virtual_ratio": 7.0, "model": "road", "begin": "first", "k_max": 3000}
+WHOLE_ROADS = {f"virtual.{key}": value for key, value in _ROADS.items()}
+"""iterations of which an eighth is actual, the rest imagined: whole roads, to their end"""
+
+
+def few_steps(prefix: str, batch: int, steps: int) -> dict[str, Variant]:
+    """Return `best` with an eighth of a road's steps: alone, with as many again, with roads imagined."""
+    few, twice = {"trpo.batch_steps": batch}, {"trpo.batch_steps": 2 * batch}
+    roads = Variant("ours, few steps and whole roads imagined", "best", {**few, **WHOLE_ROADS}, steps)
+    return {
+        f"{prefix}-few": Variant("ours, few steps", "best", few, steps),
+        f"{prefix}-middle": Variant("ours, twice as many", "best", twice, 2 * steps),
+        f"{prefix}-imagined": roads,
+    }
+
+
 ALONE = {"expert": "none", "virtual.virtual_ratio": 0.0}
 TO_THE_END = {"evaluation.converged": 0}
 TWO_EACH = {"evaluation.episodes": 2}
@@ -189,8 +196,8 @@ VARIANTS: dict[str, Variant] = {
     "ours-with-model": Variant("ours with model", "quick", {"virtual.virtual_ratio": 5.0}),
     "ours-on-pi": Variant("ours on PI", "quick", {"expert": "pi"}),
     "best": Variant("ours, all its steps", "best", {}, None),
-    "best-few": Variant("ours, few steps", "best", SMALL, 756_000),
-    "best-middle": Variant("ours, twice as many", "best", {"trpo.batch_steps": 24_000}, 1_512_000),
+    **few_steps("best", 12_000, 756_000),
+    **few_steps("jammed", 24_000, 768_000),
     "by-150-seconds": Variant("residual", "best", BY_150_SECONDS, None),
     "rings": Variant("residual", "rings", TWO_EACH, None),
     "shared-rings": Variant("residual", "shared-rings", TWO_EACH, None),
@@ -199,7 +206,6 @@ VARIANTS: dict[str, Variant] = {
     "everywhere": Variant("residual", "everywhere", TWO_EACH, None),
     "everywhere-trpo": Variant("TRPO", "everywhere", PLAIN, MILLION),
     "everywhere-ppo": Variant("PPO", "everywhere", {"agent": "ppo", **PLAIN}, MILLION),
-    "best-imagined": Variant("ours, few steps and whole roads imagined", "best", IMAGINED, 756_000),
 }
 """the paper's methods with the paper's settings, and what we make of them"""
 
