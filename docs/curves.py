@@ -19,27 +19,38 @@ IMAGINED = {
     "best-middle": "without, in iterations of 24,000",
     "best-few": "without, in small ones",
 }
+IMAGINED_JAMMED = {
+    "jammed-imagined": "whole roads imagined besides",
+    "best": "without, in large iterations",
+    "jammed-middle": "without, in iterations of 48,000",
+    "jammed-few": "without, in small ones",
+}
 COLOURS = ("#2b6cb0", "#e07a1f", "#3a8f5c", "#7b8794")
 
 
-def validations(variant: str, study: str = "table-2") -> tuple[np.ndarray, np.ndarray]:
+def validations(variant: str, study: str = "table-2", road: str = "ring") -> tuple[np.ndarray, np.ndarray]:
     """Return actual steps, shape (points,), and the returns on the validation seeds, shape (runs, points).
 
     Before a training was validated for the first time there is nothing.
     """
-    curves = json.loads((RESULTS / study / "curves.json").read_text())["ring"][variant]
+    curves = json.loads((RESULTS / study / "curves.json").read_text())[road][variant]
     steps, values = np.array(curves["steps"]), np.array(curves["return_validation"])
     first = int(np.argmax((values != values[:, :1]).any(0)))  # until then the first is all that is known
     return steps[max(0, first - 1) :], values[:, max(0, first - 1) :]
 
 
-def draw(labels: dict[str, str] = LABELS, study: str = "table-2", lowest: float | None = None) -> Image:
+def draw(
+    labels: dict[str, str] = LABELS,
+    study: str = "table-2",
+    lowest: float | None = None,
+    road: str = "ring",
+) -> Image:
     """Draw validation against actual steps: mean and range of the runs; from `lowest` on, steps by powers."""
     figure = Figure(figsize=(9, 3.6), layout="constrained")
     axes = figure.subplots()
     most = 0.0
     for (variant, label), colour in zip(labels.items(), COLOURS, strict=False):
-        steps, curves = validations(variant, study)
+        steps, curves = validations(variant, study, road)
         most = max(most, curves.max())
         axes.fill_between(steps / 1000, curves.min(0), curves.max(0), color=colour, alpha=0.15, lw=0)
         axes.plot(steps / 1000, curves.mean(0), color=colour, label=label)
