@@ -7,6 +7,7 @@ import numpy as np
 import pandas as pd
 from IPython.display import Image
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullLocator
 from tables import RESULTS
 
 from studies import rows_of
@@ -56,7 +57,9 @@ def draw(
         axes.plot(steps / 1000, curves.mean(0), color=colour, label=label)
     if lowest is not None:
         axes.set_xscale("log")
+        axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
         axes.xaxis.set_major_formatter("{x:,.0f}")
+        axes.xaxis.set_minor_locator(NullLocator())
         axes.set_ylim(lowest, most + 5.0)
     axes.set_xlabel("actual simulator steps [thousands]")
     axes.set_ylabel("return of an episode, validation")
