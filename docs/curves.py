@@ -12,21 +12,22 @@ from tables import RESULTS
 
 from studies import rows_of
 from unjam.studies.comparison import interval
+from unjam.studies.imagined import compared_with
+from unjam.studies.study import VARIANTS
 
 LABELS = {"ours": "with the virtual environment", "ours-without-model": "without"}
-IMAGINED = {
-    "best-imagined": "whole roads imagined besides",
-    "best": "without, in large iterations",
-    "best-middle": "without, in iterations of 24,000",
-    "best-few": "without, in small ones",
-}
-IMAGINED_JAMMED = {
-    "jammed-imagined": "whole roads imagined besides",
-    "best": "without, in large iterations",
-    "jammed-middle": "without, in iterations of 48,000",
-    "jammed-few": "without, in small ones",
-}
 COLOURS = ("#2b6cb0", "#e07a1f", "#3a8f5c", "#7b8794")
+
+
+def imagined(prefix: str) -> dict[str, str]:
+    """Return the labels of the variants that a study of imagined roads compares."""
+    modelled, few, middle, many = compared_with(prefix)
+    return {
+        modelled: "whole roads imagined besides",
+        many: "without, in large iterations",
+        middle: f"without, in iterations of {VARIANTS[middle].changes['trpo.batch_steps']:,}",
+        few: "without, in small ones",
+    }
 
 
 def validations(variant: str, study: str = "table-2", road: str = "ring") -> tuple[np.ndarray, np.ndarray]:

@@ -10,7 +10,7 @@ _adam = torch.optim.Adam
 
 
 class Adam(_adam):
-    """torch's Adam, the same to the bit, without torch's compiler: seconds of each process that learns.
+    """torch's Adam, the same to the bit, without torch's compiler: a second of each process that learns.
 
     What torch's own methods are wrapped in loads it, to tell it not to compile them. Not for `torch.compile`.
     """

@@ -40,9 +40,7 @@ def evaluate(
       unjam evaluate runs/ring-001 --humans drivers.json --out runs/among-others
     """
     from unjam.drivers.registry import DRIVERS
-    from unjam.reports.html import write_report
     from unjam.reports.results import read_results
-    from unjam.reports.story import lead_of
     from unjam.training.evaluate import gain_of, judge, steps_to_judge
     from unjam.training.folder import read_config
     from unjam.worlds.workers import Workers
@@ -55,6 +53,9 @@ def evaluate(
         raise InputError(f"run: {str(run)!r} is of several roads; allowed: the folder of one of them")
     if not (run / "controller.unjam").is_file():
         raise InputError(f"run: {str(run)!r} has no controller yet; go on with: unjam train --resume {run}")
+    from unjam.reports.html import write_report  # draws: so late that what is wrong is told at once
+    from unjam.reports.story import lead_of
+
     total = steps_to_judge(config, run, list(DRIVERS), episodes)
     target = out or run
     make_folder(target)
@@ -218,7 +219,7 @@ def certify(
     target = out or file.with_suffix(".html")
     check_folder(target)
     check_unsigned(controller)
-    from unjam.reports.certificate import write_certificate
+    from unjam.reports.certificate import write_certificate  # draws, too
 
     found = certificate_of(controller)
     add_certificate(file, controller, found)

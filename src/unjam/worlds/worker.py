@@ -35,10 +35,8 @@ def main() -> None:
     answers = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # SUMO and user code may print: not into the answers
     gc.freeze()  # what the imports made stays; searching it for garbage would cost every episode
-    with (
-        ExitStack() as at_the_end,
-        suppress(BrokenPipeError, EOFError),
-    ):  # the parent wants no more, or is gone
+    # Either error: the parent wants no more, or is gone.
+    with ExitStack() as at_the_end, suppress(BrokenPipeError, EOFError):
         simulation = cache(lambda: at_the_end.enter_context(Simulation()))
         while True:
             _answer(*read_message(sys.stdin.buffer), simulation, answers)
