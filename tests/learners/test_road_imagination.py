@@ -15,7 +15,8 @@ from unjam.drivers.sensors import Sensors
 from unjam.learners.imagination import full_policy
 from unjam.learners.road_imagination import RoadImagination
 from unjam.learners.settings import PolicySettings
-from unjam.scenarios import Ring
+from unjam.scenarios import FigureEight, Ring
+from unjam.scenarios.ring import Loop
 from unjam.virtual.comparison import Replayed
 from unjam.virtual.roads import known_speed
 from unjam.virtual.settings import VirtualSettings
@@ -26,6 +27,8 @@ from unjam.worlds.workers import EpisodeTask
 
 DECISIONS = 100
 RING = Ring(length=(220, 240), vehicles=20, cavs=2, horizon=400, warmup=0)
+EIGHT = FigureEight(cavs=2, horizon=400)
+"""those who must yield wait, and go"""
 WRONG = replace(
     RING, sensors=Sensors(0.5, 0.5, dropout=0.1), safety=SafetyFilter(gap_error=0.5, speed_error=0.5)
 )
@@ -43,20 +46,25 @@ def network_of(exploration_std: float) -> Network:
     return Network(tuple(layers), 1.0, exploration_std)
 
 
-def imagined(ring: Ring, network: Network) -> tuple[RoadImagination, list[Episode]]:
+def imagined(road: Loop, network: Network) -> tuple[RoadImagination, list[Episode]]:
     """What a virtual environment has learned from four episodes, and these."""
-    task = Task(ring, PISaturation())
+    task = Task(road, PISaturation())
     imagination = RoadImagination(VIRTUAL, task, POLICY, 0)
     driver = full_policy(task, POLICY, network)
-    episodes = run_batch([EpisodeTask(ring, driver, (seed,), explore=True) for seed in range(4)])
+    tasks = [EpisodeTask(road, driver, (seed,), explore=True) for seed in range(4)]
+    episodes = run_batch(tasks, statistical=True)
     imagination.learn(episodes, 1)
     return imagination, episodes
 
 
-@pytest.mark.parametrize("warmup", [0, 300])
-def test_without_noise_it_is_what_happened(warmup: int) -> None:
-    imagination, episodes = imagined(replace(RING, noise=0.0, warmup=warmup), network_of(0.0))
-    people = known_speed("idm", RING)
+@pytest.mark.parametrize(
+    "road",
+    [RING, replace(RING, warmup=300), EIGHT],
+    ids=["a ring", "a ring with a wave", "a figure eight"],
+)
+def test_without_noise_it_is_what_happened(road: Loop) -> None:
+    imagination, episodes = imagined(replace(road, noise=0.0), network_of(0.0))
+    people = known_speed("idm", road)
     memory = Replayed(np.zeros((0, 2))).initial_memory(2)
     for recording, decision in ((0, 0), (2, 130), (4, 20), (6, 290)):  # each with its neighbour, two CAVs
         did = [imagination.data.recordings[row].applied[decision:] for row in (recording, recording + 1)]
@@ -83,9 +91,11 @@ def test_the_policy_goes_on_with_what_it_remembered() -> None:
     assert same > 0.5 * len(found.starts)
 
 
-@pytest.mark.parametrize("ring", [RING, WRONG], ids=["exact sensors", "wrong sensors"])
-def test_with_noise_returns_are_those_of_the_road(ring: Ring) -> None:
-    imagination, _ = imagined(ring, network_of(0.05))
+@pytest.mark.parametrize(
+    "road", [RING, WRONG, EIGHT], ids=["exact sensors", "wrong sensors", "a figure eight"]
+)
+def test_with_noise_returns_are_those_of_the_road(road: Loop) -> None:
+    imagination, _ = imagined(road, network_of(0.05))
     found = imagination.imagine(network_of(0.05), 1, 0, 1, lambda drawn: drawn)
     assert found is not None
     assert len(found.rewards) == 2 * 4 * 400 / 10

@@ -6,7 +6,8 @@ import pytest
 
 from unjam.drivers import PISaturation
 from unjam.errors import InputError
-from unjam.scenarios import FigureEight, Ring
+from unjam.scenarios import FigureEight, Merge, Ring
+from unjam.scenarios.ring import Loop
 from unjam.virtual.fitting import Fit
 from unjam.virtual.roads import RoadModel, check_roads, fit_roads, moments_of
 from unjam.virtual.settings import VirtualSettings
@@ -15,6 +16,7 @@ from unjam.worlds.record import Episode
 from unjam.worlds.workers import EpisodeTask
 
 RING = Ring(length=(120, 130), vehicles=8, horizon=600, warmup=0)
+EIGHT = FigureEight(horizon=600, warmup=0)
 
 
 @pytest.fixture(scope="module")
@@ -22,11 +24,17 @@ def episodes() -> list[Episode]:
     return run_batch([EpisodeTask(RING, PISaturation(), (seed,)) for seed in range(10)])
 
 
-def fitted(episodes: list[Episode], **changes: Any) -> tuple[RoadModel, Fit]:
+@pytest.fixture(scope="module")
+def eights() -> list[Episode]:
+    tasks = [EpisodeTask(EIGHT, PISaturation(), (seed,)) for seed in range(10)]
+    return run_batch(tasks, statistical=True)
+
+
+def fitted(episodes: list[Episode], road: Loop = RING, **changes: Any) -> tuple[RoadModel, Fit]:
     settings = VirtualSettings(model="road", **changes)
     model = RoadModel(settings, (0,))
-    kept = [moments_of(episode, number) for number, episode in enumerate(episodes)]
-    return model, fit_roads(model, kept, settings, RING, (1,))
+    kept = [moments_of(episode, number, road) for number, episode in enumerate(episodes)]
+    return model, fit_roads(model, kept, settings, road, (1,))
 
 
 def test_where_people_are_known_only_their_noise_is_left(episodes: list[Episode]) -> None:
@@ -47,13 +55,29 @@ def test_what_a_base_does_not_know_the_networks_learn(episodes: list[Episode], b
     assert found.errors["unexplained"] == pytest.approx((step.model / step.change) ** 2)
 
 
+def test_on_a_figure_eight_the_right_of_way_is_known_and_noise_no_ignorance(eights: list[Episode]) -> None:
+    model, found = fitted(eights, EIGHT)
+    sigma = EIGHT.noise_per_step * EIGHT.simulation_step
+    assert found.one_step["speed"].base == pytest.approx(sigma, rel=0.05)
+    assert found.errors["unexplained"] < 0.02
+    assert float(model.noise) == sigma
+
+
+def test_on_a_figure_eight_the_networks_learn_what_a_base_does_not_know(eights: list[Episode]) -> None:
+    _, found = fitted(eights, EIGHT, base="none", epochs=20)
+    sigma, step = EIGHT.noise_per_step * EIGHT.simulation_step, found.one_step["speed"]
+    assert found.learned == ("speed",)
+    assert step.base > 2 * sigma
+    assert step.model == pytest.approx(sigma, rel=0.2)
+
+
 def test_too_few_episodes_are_held_out_in_part(episodes: list[Episode]) -> None:
     assert fitted(episodes[:1])[1].held_out > 0
 
 
 def test_moments_are_what_was_recorded_and_what_came_next(episodes: list[Episode]) -> None:
     episode = episodes[3]
-    kept = moments_of(episode, 7)
+    kept = moments_of(episode, 7, RING)
     assert (kept.episode, kept.every, kept.people.sum()) == (7, 1, 7)
     np.testing.assert_array_equal(kept.after, episode.speeds[1:])
     drivers = kept.people > 0
@@ -64,7 +88,7 @@ def test_moments_are_what_was_recorded_and_what_came_next(episodes: list[Episode
 
 @pytest.mark.parametrize(
     ("road", "why"),
-    [(FigureEight(), "it is no ring"), (replace(RING, steps_per_decision=2), "steps_per_decision is 2")],
+    [(Merge(), "it is no ring"), (replace(RING, steps_per_decision=2), "steps_per_decision is 2")],
 )
 def test_other_roads_are_refused_in_one_line(road: Any, why: str) -> None:
     with pytest.raises(InputError, match=f"virtual.model: road is not allowed; allowed: row, for .*{why}"):

@@ -22,7 +22,7 @@ from unjam.learners.imagination import (
     full_policy,
 )
 from unjam.learners.learner import under
-from unjam.scenarios.ring import Ring
+from unjam.scenarios.ring import Loop
 from unjam.tree import mapped, pack, unpack
 from unjam.virtual.comparison import Replayed
 from unjam.virtual.data import is_held_out, remembered
@@ -35,8 +35,10 @@ from unjam.virtual.roads import (
     fit_roads,
     known_speed,
     moments_of,
+    of_size,
     people_of,
 )
+from unjam.worlds.batch.crossing import Memory as Waits
 from unjam.worlds.batch.people import People
 from unjam.worlds.batch.run import begin
 from unjam.worlds.batch.world import RingBatch
@@ -49,7 +51,7 @@ MOMENTS = "moments/"
 
 
 class RoadImagination(Imagination[RoadModel]):
-    """The virtual environment of a run as whole rings, and the actual data that it learns from."""
+    """The virtual environment of a run as whole roads, and the actual data that it learns from."""
 
     def __init__(self, *arguments: Any) -> None:
         """Begin with the base alone, and without data; arguments are those of `Imagination`.
@@ -68,7 +70,8 @@ class RoadImagination(Imagination[RoadModel]):
     def learn(self, episodes: Sequence[Episode], iteration: int) -> None:
         """Add actual episodes to D_a, fit the model to it, and find the rollout length of Eq. 15."""
         first = self.data.episodes
-        self.moments += [moments_of(episode, first + place) for place, episode in enumerate(episodes)]
+        road = cast(Loop, self.scenario)
+        self.moments += [moments_of(episode, first + place, road) for place, episode in enumerate(episodes)]
         super().learn(episodes, iteration)
 
     def _fit(self, seed: Sequence[int]) -> Fit:
@@ -129,26 +132,29 @@ class RoadImagination(Imagination[RoadModel]):
             people: how they drive.
             seed: of all noise, and of what sensors misread.
         """
-        ring = cast(Ring, self.scenario)
+        road = cast(Loop, self.scenario)
         by_episode = {kept.episode: kept for kept in self.moments}
         kept = [by_episode[self.data.recordings[place].episode] for place, _ in choices]
         here = [(each, at // each.every) for each, (_, at) in zip(kept, choices, strict=True)]
-        noise = float(self.model.noise) / ring.simulation_step / replace(ring, noise=1.0).noise_per_step
+        noise = float(self.model.noise) / road.simulation_step / replace(road, noise=1.0).noise_per_step
         noise = noise if self.settings.noise else 0.0
-        common = replace(ring, horizon=decisions, warmup=0, noise=noise, population="")
+        common = replace(road, horizon=decisions, noise=noise, population="")
         world = RingBatch(
-            [replace(common, length=(round(each.length),) * 2) for each in kept],
+            [of_size(common, each.size) for each in kept],
             [(*seed, number) for number in range(len(kept))],  # of sensors alone: all else is given
             reward=self._task.reward,
             draw=np.random.default_rng(list(seed)).standard_normal,
             people=people,
+            statistical=True,
         )
+        waits = [each.waits and Waits(*(values[row] for values in each.waits)) for each, row in here]
         world.place(
             np.stack([each.speeds[row] for each, row in here], 1),
             np.stack([each.positions[row] for each, row in here], 1),
+            waits,
         )
         found = driven_to_the_end(begin(world, driver, explore=True, memory=memory))
-        earned = make_reward(self._task.reward or ring.reward)
+        earned = make_reward(self._task.reward or road.reward)
         return [rewarded(episode, earned) for episode in found.episodes]
 
     def waves(self) -> tuple[Moments, dict[str, Episode]]:

@@ -21,6 +21,10 @@ OBEDIENT = 20.0
 """accelerations of an obedient CAV's type [m/s2]: far beyond what it asks for, so that only safety clips"""
 VEHICLE_LENGTH = 5.0
 """[m], of every vehicle"""
+ACCELERATION = 2.6
+"""of commanded people and of cars, SUMO's own [m/s2]"""
+SMALLEST_CAV_GAP = 0.5
+"""gap that SUMO keeps for a CAV [m]"""
 
 Actuation = Literal["shielded", "raw", "flow", "cruise"]
 """How SUMO carries out a CAV's command.

@@ -2,23 +2,28 @@
 
 People differ from the base in the same way, whoever they are and wherever they drive: one ensemble learns it
 from all of them. Their noise is known from the record: it changes speeds after everybody has moved, so that
-the way that a vehicle made tells how fast it meant to drive. What is left of an error is ignorance.
+the way that a vehicle made tells how fast it meant to drive. What is left of an error is ignorance. Where
+people are commanded noise moves them too, and its strength is known, not its draws. The right of way is
+known: what people do where it binds them is not learned from.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from math import nan
+from typing import cast
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from unjam.drivers.local_state import LARGEST_GAP, LocalState
 from unjam.errors import InputError
 from unjam.physics.arrays import Array
 from unjam.physics.kinematics import gap_on_loop, next_speed
-from unjam.scenarios.ring import Ring
+from unjam.scenarios.ring import Loop
+from unjam.scenarios.road import ClosedRoad
 from unjam.scenarios.scenario import VEHICLE_LENGTH, Scenario
 from unjam.virtual.data import is_held_out
 from unjam.virtual.ensemble import SMALLEST_CHANGE, Ensemble, predict, random_members, teach
@@ -31,14 +36,18 @@ from unjam.virtual.fitting import (
 )
 from unjam.virtual.model import BASES
 from unjam.virtual.settings import VirtualSettings
+from unjam.worlds.batch.crossing import Memory
+from unjam.worlds.batch.movement import commanded_speed, heeded, waits_of
 from unjam.worlds.batch.people import People, people_speed
-from unjam.worlds.batch.possible import why_not
+from unjam.worlds.batch.possible import statistical_why_not
 from unjam.worlds.record import Episode, Floats
 
 INPUTS = 4
 """of the networks: speed, the leader's, the gap, and the speed after the step as the base has it"""
 MOVES = 0.5
 """speed from which noise is not cut off at standstill [m/s]"""
+LARGEST_NOISE = 3.0
+"""standard deviations of noise that the right of way must leave room for, where people are learned from"""
 
 
 @dataclass(frozen=True)
@@ -52,6 +61,8 @@ class Moments:
     """number of the episode"""
     every: int
     """decisions from one moment to the next"""
+    size: int
+    """that the episode drew: length of the ring, radius of the figure eight [m]"""
     length: float
     """of the road [m]"""
     people: Floats
@@ -64,30 +75,46 @@ class Moments:
     """how fast each moved in the decision that followed, before noise [m/s], shape (M, N)"""
     after: Floats
     """how fast each was then [m/s], shape (M, N)"""
+    waits: Memory | None
+    """where the road crosses itself: who waits, and who is on the crossing, shape (M, N) each"""
 
 
 def check_roads(scenario: Scenario) -> None:
     """Raise `InputError` where whole roads cannot be imagined on a scenario."""
-    why = why_not(scenario)
-    if isinstance(scenario, Ring) and scenario.steps_per_decision > 1:
+    why = statistical_why_not(scenario)
+    if isinstance(scenario, Loop) and scenario.steps_per_decision > 1:
         why = f"{scenario.title}: steps_per_decision is {scenario.steps_per_decision}"
     if why:
         raise InputError(f"virtual.model: road is not allowed; allowed: row, for {why}")
 
 
-def moments_of(episode: Episode, number: int) -> Moments:
-    """Return what is kept of an actual episode, the so many-th."""
-    every = episode.trajectories[0].hold
-    at = np.arange(0, episode.steps, every)
+def of_size(scenario: Loop, size: int) -> Loop:
+    """Return a scenario whose episodes all draw a size [m], and begin without a warm-up."""
+    return replace(scenario, **{scenario.size: (size, size)}, warmup=0)
+
+
+def _road_of(scenario: Loop, size: int) -> ClosedRoad:
+    return cast(ClosedRoad, of_size(scenario, size).of_seed((0,))[0])
+
+
+def moments_of(episode: Episode, number: int, scenario: Loop) -> Moments:
+    """Return what is kept of an actual episode, the so many-th, on a scenario."""
+    every, size = episode.trajectories[0].hold, round(episode.drawn[scenario.size])
+    at, waits = np.arange(0, episode.steps, every), None
+    if episode.crossings:
+        memory = waits_of(scenario, _road_of(scenario, size), episode.speeds, episode.positions)
+        waits = Memory(memory.waited[at], memory.entered[at])
     return Moments(
         episode=number,
         every=every,
+        size=size,
         length=episode.loop_length,
         people=np.array([float(name not in episode.cav_ids) for name in episode.vehicle_ids]),
         speeds=episode.speeds[at],
         positions=episode.positions[at],
         moved=(episode.positions[at + 1] - episode.positions[at]) / episode.step,
         after=episode.speeds[at + 1],
+        waits=waits,
     )
 
 
@@ -107,7 +134,8 @@ def known_speed(base: str, scenario: Scenario) -> People:
     """Return how people drive as far as a base in `BASES` knows."""
     make, step = BASES[base], scenario.simulation_step
     if base == "idm":
-        return partial(people_speed, people=scenario.humans, step=step)
+        follow = commanded_speed if scenario.human_control == "commanded" else people_speed
+        return partial(follow, people=scenario.humans, step=step)
     if make is None:
         return lambda speed, leader_speed, gap: speed
     person = make(scenario)
@@ -140,6 +168,14 @@ def people_of(model: RoadModel, scenario: Scenario, generator: torch.Generator) 
     return driven
 
 
+def _free(moments: Moments, scenario: Scenario, wanted: Floats) -> NDArray[np.bool_]:
+    """Return whether the right of way lets people drive so fast [m/s], shapes (M, N)."""
+    road, waits = _road_of(cast(Loop, scenario), moments.size), cast(Memory, moments.waits)
+    wanted = np.where(moments.people > 0.0, wanted, moments.after).clip(0.0)
+    places = np.flatnonzero(moments.people == 0.0).tolist()
+    return heeded(scenario, road, places, waits, (moments.speeds, moments.positions), wanted)
+
+
 def fit_roads(
     model: RoadModel,
     kept: Sequence[Moments],
@@ -151,26 +187,34 @@ def fit_roads(
 
     The errors, of the speed alone: `unexplained` is the squared error on the holdout over the variance of
     what there was to predict; `transitions` is between the next speed as a member has it and as it truly
-    was drawn, with the noise known from the record; `total_variation` between members.
+    was drawn, with the noise known from the record; `total_variation` between members. Where people are
+    commanded it is the mean square of the errors beyond the noise's variance that counts as ignorance.
 
     Raises:
         UnjamError: a loss is not finite.
     """
     generator = np.random.default_rng(np.random.SeedSequence(list(seed)))
     known, columns = known_speed(model.base, scenario), []
+    commanded = scenario.human_control == "commanded"
+    told = scenario.noise_per_step * scenario.simulation_step
     for moments in kept:
         ahead = np.roll(moments.positions, -1, 1)
         gap = gap_on_loop(moments.positions, ahead, moments.length, VEHICLE_LENGTH)
         seen = moments.speeds, np.roll(moments.speeds, -1, 1), gap
-        held = np.full(gap.shape, is_held_out(moments.episode, settings.holdout))
-        each = (*seen, known(*seen), moments.moved, moments.after, held)
-        columns.append(np.stack([values[:, moments.people > 0.0].ravel() for values in each]))
+        held, base = np.full(gap.shape, is_held_out(moments.episode, settings.holdout)), known(*seen)
+        counts = np.broadcast_to(moments.people > 0.0, gap.shape)
+        if moments.waits is not None:
+            counts = counts & _free(moments, scenario, base + LARGEST_NOISE * told)
+        each = (*seen, base, moments.moved, moments.after, held)
+        columns.append(np.stack([values[counts] for values in each]))
     speed, leader_speed, gaps, base, moved, after, held = np.concatenate(columns, 1)
     held_out = held > 0.0
     if held_out.all() or not held_out.any():  # too few episodes: the last part of what was seen
         held_out = np.arange(len(held)) >= (1.0 - settings.holdout) * len(held)
     moves = moved > MOVES
     sigma = float((after - moved)[moves].std()) if moves.any() else 0.0
+    if commanded:
+        sigma = told
     model.noise.fill_(sigma)
     targets = torch.from_numpy((moved - base)[:, None])
     found = teach(model, _inputs(speed, leader_speed, gaps, base), targets, held_out, settings, generator)
@@ -181,8 +225,10 @@ def fit_roads(
     wrong = found.wanted - found.predicted * model.learned.numpy()
     change = (moved - speed)[found.holdout]
     step = OneStep(root_mean_square(found.wanted), root_mean_square(wrong), float(change.std()))
+    if commanded:
+        wrong = np.sqrt((np.square(wrong).mean((0, 1)) - sigma**2).clip(0.0))
     errors = {
-        "unexplained": (step.model / max(step.change, SMALLEST_CHANGE)) ** 2,
+        "unexplained": (root_mean_square(wrong) / max(step.change, SMALLEST_CHANGE)) ** 2,
         "transitions": against_transitions(wrong, sigma),
         "total_variation": total_variation(found.predicted * model.learned.numpy(), np.array([sigma])),
         "released": found.loss,

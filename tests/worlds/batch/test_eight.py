@@ -17,6 +17,7 @@ from unjam.scenarios import FigureEight, Ring
 from unjam.scenarios.road import ClosedRoad
 from unjam.training.config import RunConfig
 from unjam.worlds.batch.eight import touching_across
+from unjam.worlds.batch.movement import EightMovement, waits_of
 from unjam.worlds.batch.possible import statistical_why_not, why_not
 from unjam.worlds.batch.run import BEGUN, run_batch
 from unjam.worlds.episode import run_episode
@@ -91,6 +92,24 @@ def test_warmed_up_with_others_it_goes_on_to_the_same_bits() -> None:
     run_batch(tasks(eight, "pi", range(2)), statistical=True)
     (again,) = run_batch(tasks(eight, "pi", range(1)), statistical=True)
     assert again.speeds.tobytes() == alone.speeds.tobytes()
+
+
+def test_who_waits_is_known_from_the_record(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen, moved = [], EightMovement.moved
+
+    def watched(movement: EightMovement, *arguments: Any) -> Any:
+        seen.append([each[:, 0] for each in movement.memory])
+        return moved(movement, *arguments)
+
+    monkeypatch.setattr(EightMovement, "moved", watched)
+    (episode,) = run_batch(tasks(SHORT, "human", range(1)), statistical=True)
+    road = cast(ClosedRoad, SHORT.of_seed((0,))[0])
+    waited, entered = np.stack(seen, 1)
+    assert waited.max() > 5.0
+    assert 0.0 > entered.min() > -SHORT.horizon
+    found = waits_of(SHORT, road, episode.speeds, episode.positions)
+    np.testing.assert_allclose(found.waited[:-1], waited, atol=1e-9)
+    np.testing.assert_array_equal(found.entered[:-1], entered)
 
 
 def test_tensors_do_what_arrays_do() -> None:

@@ -14,10 +14,10 @@ from unjam.drivers.road_experts import Pacer
 from unjam.drivers.safety import SafetyFilter
 from unjam.measures.metrics import measure
 from unjam.scenarios.figure_eight import FigureEight
+from unjam.scenarios.scenario import SMALLEST_CAV_GAP
 from unjam.worlds.episode import run_episode
 from unjam.worlds.sumo import make_traffic
 from unjam.worlds.sumo.closed import ClosedTraffic
-from unjam.worlds.sumo.files import SMALLEST_CAV_GAP
 from unjam.worlds.sumo.simulation import Simulation
 from unjam.worlds.workers import EpisodeTask, Workers
 

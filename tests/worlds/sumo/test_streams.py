@@ -12,8 +12,8 @@ from unjam.drivers.command import Command
 from unjam.errors import EpisodeError
 from unjam.scenarios import Merge
 from unjam.scenarios.road import Origin
+from unjam.scenarios.scenario import SMALLEST_CAV_GAP
 from unjam.worlds.sumo import make_traffic
-from unjam.worlds.sumo.files import SMALLEST_CAV_GAP
 from unjam.worlds.sumo.merging import FAR, MergingTraffic, Streams
 from unjam.worlds.sumo.simulation import Simulation
 

@@ -13,13 +13,12 @@ import numpy as np
 from unjam.physics.arrays import Array, at_least, at_most, namespace, square_root
 from unjam.scenarios.figure_eight import CROSSING_LINK
 from unjam.scenarios.road import ClosedRoad
-from unjam.scenarios.scenario import VEHICLE_LENGTH, Scenario
+from unjam.scenarios.scenario import ACCELERATION, VEHICLE_LENGTH, Scenario
 from unjam.worlds.batch.eight import Side, eights_of
 from unjam.worlds.batch.lanes import NOBODY, Leader
 from unjam.worlds.batch.layer import HALTING, Layer, speed_after
 from unjam.worlds.batch.noise import Numbers
 from unjam.worlds.batch.people import CREEPING, SMALLEST_GAP
-from unjam.worlds.sumo.files import ACCELERATION
 
 VISIBLE = 4.5
 """way before the crossing from which those who must yield see who comes [m]"""
@@ -142,6 +141,10 @@ class Crossing:
         moved = xp.where(commanded, layer.within_limits(speed, xp.minimum(wanted, safe)), finished)
         self._remember(speed, moved, on)
         return moved
+
+    def watch(self, speed: Array, moved: Array, position: Array) -> None:
+        """Remember a step in which vehicles moved so; arguments as of `moved`."""
+        self._remember(speed, moved, self._eights.beyond(position))
 
     def _seen(self, sight: Array, on: list[Array]) -> Array:
         """Return how far ahead each sees others [m]: to the end of a lane beyond those it must look at."""

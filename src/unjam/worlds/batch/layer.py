@@ -12,11 +12,10 @@ import numpy as np
 from unjam.physics.arrays import Array, at_least, at_most, namespace, square_root
 from unjam.physics.idm import IDMParameters, by_squaring, idm_acceleration
 from unjam.physics.kinematics import next_speed, speed_to_stop_within, stopping_distance
-from unjam.scenarios.scenario import Scenario
+from unjam.scenarios.scenario import ACCELERATION, SMALLEST_CAV_GAP, Scenario
 from unjam.worlds.batch.lanes import sight
 from unjam.worlds.batch.noise import Numbers
 from unjam.worlds.batch.people import EMERGENCY_BRAKING, SMALLEST_GAP, without_gap
-from unjam.worlds.sumo.files import ACCELERATION, SMALLEST_CAV_GAP
 
 PEOPLES_BRAKING = 4.5
 """of commanded people's layer [m/s2]"""

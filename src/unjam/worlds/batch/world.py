@@ -69,20 +69,21 @@ class RingBatch:
             reward: name; empty: the scenario's own.
             keep: whether all is kept for episodes, some 16 bytes for each vehicle and step in float64.
             draw: of all noise, for arrays of a shape; None: each ring draws what SUMO's episode would.
-            people: how they drive, where it is not as SUMO's IDM does.
+            people: how they drive where no junction binds them, if it is not as SUMO's IDM does.
             statistical: whether roads are allowed that equal SUMO's in distribution alone.
 
         Raises:
             InputError: a scenario cannot be stepped so, or they are not alike.
         """
-        scenario = self.scenario = scenarios[0]
         check_together(scenarios, statistical)
+        scenario = self.scenario = scenarios[0]
         drawn = [each.of_seed(seed) for each, seed in zip(scenarios, seeds, strict=True)]
-        roads = self.roads = [cast(ClosedRoad, road) for road, _ in drawn]
+        roads, seeded = [cast(ClosedRoad, road) for road, _ in drawn], [others for _, others in drawn]
         self._scenarios, self._seeds, self._keep, self._numbers = scenarios, seeds, keep, numbers
+        self.roads, self._controlled = roads, False
         worlds, vehicles, cavs = len(roads), len(roads[0].vehicle_ids), len(roads[0].cav_ids)
-        self.limits, self.rows, self.entered = scenario.limits, cavs * worlds, cavs * worlds
-        self.decisions = 0
+        self.limits, self.decisions = scenario.limits, 0
+        self.rows = self.entered = cavs * worlds
         places = np.array([roads[0].vehicle_ids.index(name) for name in roads[0].cav_ids])
         self._places, self._ahead, self._behind = (
             each.tolist() for each in (places, places + 1, (places - 1) % vehicles)
@@ -97,17 +98,15 @@ class RingBatch:
         self._speed = numbers(np.zeros((vehicles + 1, worlds)))
         self._people, self._drives = parameters_of(roads, scenario.humans, numbers), people
         across = bool(roads[0].crossings)
-        self._eight = EightMovement(scenario, roads, self._places, numbers) if across else None
+        self._eight = EightMovement(scenario, roads, self._places, numbers, people) if across else None
         self._touching = touching_across if across else touching
         self._crossings = [numbers(np.tile(each, cavs)) for each in beginnings(roads)]
-        self._scale = numbers(np.full((vehicles, 1), scenario.noise_per_step * scenario.simulation_step))
-        self._cars = Cars(scenario.safety, scenario.actuator, scenario.simulation_step)
-        self._brakes = scenario.cav_brakes * scenario.simulation_step
-        seeded = [others for _, others in drawn]
+        step = scenario.simulation_step
+        self._scale = numbers(np.full((vehicles, 1), scenario.noise_per_step * step))
+        self._cars, self._brakes = Cars(scenario.safety, scenario.actuator, step), scenario.cav_brakes * step
         self._readings = RingReadings(scenario, roads[0].cav_ids, seeded, numbers)
         self._noise = noise_of(seeded, vehicles, (scenario.horizon, cavs), numbers, draw)
-        self._reward = make_reward(reward or scenario.reward)
-        self._controlled, self._quick = False, draw is not None
+        self._reward, self._quick = make_reward(reward or scenario.reward), draw is not None
         self._forget()
 
     def _forget(self) -> None:
@@ -119,8 +118,10 @@ class RingBatch:
         self._sums, self._driven, self._crashed = dict[str, Array](), ring, ring > 0.0
         self._headway, self._braking = each_cav + np.inf, each_cav
 
-    def place(self, speeds: Array, positions: Array) -> None:
-        """Put the vehicles elsewhere before the start: speeds and positions [m/s, m], shape (vehicles, W)."""
+    def place(self, speeds: Array, positions: Array, waits: Sequence[Memory | None]) -> None:
+        """Put vehicles elsewhere before the start [m/s, m], (vehicles, W), on eights with those who wait."""
+        if self._eight:
+            self._eight.remember(cast(Sequence[Memory], waits))
         self._speed = self._numbers(np.concatenate([speeds, speeds[:1]]))
         self._position = self._numbers(positions)
         gap = gap_on_loop(positions, np.roll(positions, -1, 0), as_numpy(self._loop), VEHICLE_LENGTH)
@@ -284,8 +285,7 @@ class RingBatch:
         told = None if commanded is None else commanded.reshape(self._shape)
         if self._eight:
             noise = self._noise.of_people() * self._scale if self.scenario.noise > 0 else 0.0
-            moved = self._eight.moved(speed, self._position, ahead, noise, told)
-            return moved, moved
+            return (self._eight.moved(speed, self._position, ahead, noise, told),) * 2
         moved = self._people_speed(speed, ahead)
         if told is not None:
             slowest = speed[self._places] - self._brakes

@@ -6,15 +6,11 @@ from typing import Any, NamedTuple
 
 from unjam.physics.idm import IDMParameters
 from unjam.scenarios.road import BuiltRoad, MotorwayRoad, OwnRoad, Road
-from unjam.scenarios.scenario import OBEDIENT, VEHICLE_LENGTH, Scenario
+from unjam.scenarios.scenario import ACCELERATION, OBEDIENT, SMALLEST_CAV_GAP, VEHICLE_LENGTH, Scenario
 from unjam.worlds.sumo.networks import Attributes, document, element, network_file
 
-SMALLEST_CAV_GAP = 0.5
-"""gap that SUMO keeps for a CAV [m]"""
 CAV_COLOUR = "215,38,61"
 """red, in SUMO's window"""
-ACCELERATION = 2.6
-"""of commanded people and of cars, SUMO's own [m/s2]"""
 CAV_TYPES = "cav_of_{}"
 """the type of a CAV whose own type is `{}`"""
 CALIBRATED_TYPES = "{}_of_driver_{}"
