@@ -12,6 +12,7 @@ from unjam.drivers.command import Limits
 from unjam.drivers.driver import Driver, Memory
 from unjam.drivers.local_state import LocalState
 from unjam.errors import InputError
+from unjam.physics.arrays import Array
 from unjam.scenarios.scenario import Scenario
 from unjam.tree import Arrays, mapped, pack, unpack
 from unjam.worlds.drive import Drive
@@ -137,8 +138,8 @@ class ActualData:
         return _joined([recording.states for recording in self.recordings]).at(rows)
 
 
-def is_held_out(episode: int, share: float) -> bool:
-    """Return whether the networks may not learn from this episode; about `share` of them, evenly spread."""
+def is_held_out(episode: Array, share: float) -> Array:
+    """Return whether the networks may not learn from episodes; about `share` of them, evenly spread."""
     return (episode * GOLDEN_RATIO) % 1.0 < share
 
 

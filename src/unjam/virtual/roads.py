@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from math import nan
-from typing import cast
+from typing import NamedTuple, cast
 
 import numpy as np
 import torch
@@ -118,6 +118,30 @@ def moments_of(episode: Episode, number: int, scenario: Loop) -> Moments:
     )
 
 
+class PeopleRows(NamedTuple):
+    """What people did in steps of many episodes; R rows."""
+
+    speed: Floats
+    """[m/s], shape (R,)"""
+    leader_speed: Floats
+    """likewise"""
+    gap: Floats
+    """[m], likewise"""
+    base: Floats
+    """how fast each is after the step as the base has it [m/s], likewise"""
+    moved: Floats
+    """how fast each moved, before noise unless people are commanded [m/s], likewise"""
+    after: Floats
+    """how fast each was then [m/s], likewise"""
+    episode: Floats
+    """number of the episode, likewise"""
+
+    @property
+    def inputs(self) -> Tensor:
+        """What the networks see, shape (R, 4)."""
+        return _inputs(*self[:INPUTS])
+
+
 class RoadModel(Ensemble):
     """What people do beside the base, and how noisy they are."""
 
@@ -168,12 +192,33 @@ def people_of(model: RoadModel, scenario: Scenario, generator: torch.Generator) 
     return driven
 
 
+def _noise(scenario: Scenario) -> float:
+    """Return the standard deviation of what noise adds to people's speeds in a step [m/s]."""
+    return scenario.noise_per_step * scenario.simulation_step
+
+
 def _free(moments: Moments, scenario: Scenario, wanted: Floats) -> NDArray[np.bool_]:
     """Return whether the right of way lets people drive so fast [m/s], shapes (M, N)."""
     road, waits = _road_of(cast(Loop, scenario), moments.size), cast(Memory, moments.waits)
     wanted = np.where(moments.people > 0.0, wanted, moments.after).clip(0.0)
     places = np.flatnonzero(moments.people == 0.0).tolist()
     return heeded(scenario, road, places, waits, (moments.speeds, moments.positions), wanted)
+
+
+def people_in(kept: Sequence[Moments], base: str, scenario: Scenario) -> PeopleRows:
+    """Return what people did, a row each, where no right of way binds them."""
+    known, columns = known_speed(base, scenario), []
+    for moments in kept:
+        ahead = np.roll(moments.positions, -1, 1)
+        gap = gap_on_loop(moments.positions, ahead, moments.length, VEHICLE_LENGTH)
+        seen = moments.speeds, np.roll(moments.speeds, -1, 1), gap
+        based, episode = known(*seen), np.full(gap.shape, moments.episode)
+        counts = np.broadcast_to(moments.people > 0.0, gap.shape)
+        if moments.waits is not None:
+            counts = counts & _free(moments, scenario, based + LARGEST_NOISE * _noise(scenario))
+        each = (*seen, based, moments.moved, moments.after, episode)
+        columns.append(np.stack([values[counts] for values in each]))
+    return PeopleRows(*np.concatenate(columns, 1))
 
 
 def fit_roads(
@@ -194,36 +239,23 @@ def fit_roads(
         UnjamError: a loss is not finite.
     """
     generator = np.random.default_rng(np.random.SeedSequence(list(seed)))
-    known, columns = known_speed(model.base, scenario), []
-    commanded = scenario.human_control == "commanded"
-    told = scenario.noise_per_step * scenario.simulation_step
-    for moments in kept:
-        ahead = np.roll(moments.positions, -1, 1)
-        gap = gap_on_loop(moments.positions, ahead, moments.length, VEHICLE_LENGTH)
-        seen = moments.speeds, np.roll(moments.speeds, -1, 1), gap
-        held, base = np.full(gap.shape, is_held_out(moments.episode, settings.holdout)), known(*seen)
-        counts = np.broadcast_to(moments.people > 0.0, gap.shape)
-        if moments.waits is not None:
-            counts = counts & _free(moments, scenario, base + LARGEST_NOISE * told)
-        each = (*seen, base, moments.moved, moments.after, held)
-        columns.append(np.stack([values[counts] for values in each]))
-    speed, leader_speed, gaps, base, moved, after, held = np.concatenate(columns, 1)
-    held_out = held > 0.0
+    rows, commanded = people_in(kept, model.base, scenario), scenario.human_control == "commanded"
+    held_out = is_held_out(rows.episode, settings.holdout)
     if held_out.all() or not held_out.any():  # too few episodes: the last part of what was seen
-        held_out = np.arange(len(held)) >= (1.0 - settings.holdout) * len(held)
-    moves = moved > MOVES
-    sigma = float((after - moved)[moves].std()) if moves.any() else 0.0
+        held_out = np.arange(len(held_out)) >= (1.0 - settings.holdout) * len(held_out)
+    moves = rows.moved > MOVES
+    sigma = float((rows.after - rows.moved)[moves].std()) if moves.any() else 0.0
     if commanded:
-        sigma = told
+        sigma = _noise(scenario)
     model.noise.fill_(sigma)
-    targets = torch.from_numpy((moved - base)[:, None])
-    found = teach(model, _inputs(speed, leader_speed, gaps, base), targets, held_out, settings, generator)
+    targets = torch.from_numpy((rows.moved - rows.base)[:, None])
+    found = teach(model, rows.inputs, targets, held_out, settings, generator)
     if (
         settings.fall_back and root_mean_square(found.wanted) < SMALLEST_CHANGE
-    ):  # the base knows all: what is left is rounding
+    ):  # rounding: the base knows all
         model.learned.zero_()
     wrong = found.wanted - found.predicted * model.learned.numpy()
-    change = (moved - speed)[found.holdout]
+    change = (rows.moved - rows.speed)[found.holdout]
     step = OneStep(root_mean_square(found.wanted), root_mean_square(wrong), float(change.std()))
     if commanded:
         wrong = np.sqrt((np.square(wrong).mean((0, 1)) - sigma**2).clip(0.0))
