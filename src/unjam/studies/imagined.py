@@ -25,8 +25,12 @@ TIMES = (1, 2, 3)
 
 
 def compared_with(prefix: str) -> tuple[str, ...]:
-    """Return the variants whose names begin with `prefix`, the one with the model first, and `best`."""
-    return (*(f"{prefix}-{name}" for name in ("imagined", "few", "middle")), "best")
+    """Return the variants whose names begin with `prefix`, the one with the model first, and `best`.
+
+    On figures eight, which a batch steps in distribution alone, that is trained in batches, too.
+    """
+    every = "best-in-batches" if prefix == "eight" else "best"
+    return (*(f"{prefix}-{name}" for name in ("imagined", "few", "middle")), every)
 
 
 def efficiency(road: str, compared: Sequence[str], folder: Path) -> pd.DataFrame:

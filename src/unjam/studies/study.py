@@ -136,19 +136,18 @@ class Variant:
     """the variant whose numbers the paper gives for it, if it is another"""
 
 
-_ROADS = {"virtual_ratio": 7.0, "model": "road", "begin": "first", "k_max": 3000}
-WHOLE_ROADS = {f"virtual.{key}": value for key, value in _ROADS.items()}
-"""iterations of which an eighth is actual, the rest imagined: whole roads, to their end"""
+def few_steps(prefix: str, batch: int, steps: int, horizon: int = 3000) -> dict[str, Variant]:
+    """Return `best` with an eighth of a road's steps: alone, with as many again, with roads imagined.
 
-
-def few_steps(prefix: str, batch: int, steps: int) -> dict[str, Variant]:
-    """Return `best` with an eighth of a road's steps: alone, with as many again, with roads imagined."""
-    few, twice = {"trpo.batch_steps": batch}, {"trpo.batch_steps": 2 * batch}
-    roads = Variant("ours, few steps and whole roads imagined", "best", {**few, **WHOLE_ROADS}, steps)
+    Of the last an eighth of an iteration is actual, the rest are whole episodes of `horizon` decisions.
+    """
+    few, twice = ({"world": "batch", "trpo.batch_steps": times * batch} for times in (1, 2))
+    whole = {"virtual_ratio": 7.0, "model": "road", "begin": "first", "k_max": horizon}
+    imagined = {**few, **{f"virtual.{key}": value for key, value in whole.items()}}
     return {
         f"{prefix}-few": Variant("ours, few steps", "best", few, steps),
         f"{prefix}-middle": Variant("ours, twice as many", "best", twice, 2 * steps),
-        f"{prefix}-imagined": roads,
+        f"{prefix}-imagined": Variant("ours, few steps and whole roads imagined", "best", imagined, steps),
     }
 
 
@@ -198,6 +197,8 @@ VARIANTS: dict[str, Variant] = {
     "best": Variant("ours, all its steps", "best", {}, None),
     **few_steps("best", 12_000, 756_000),
     **few_steps("jammed", 24_000, 768_000),
+    **few_steps("eight", 6_000, 612_000, horizon=1500),
+    "best-in-batches": Variant("ours, all its steps", "best", {"world": "batch"}, None),
     "by-150-seconds": Variant("residual", "best", BY_150_SECONDS, None),
     "rings": Variant("residual", "rings", TWO_EACH, None),
     "shared-rings": Variant("residual", "shared-rings", TWO_EACH, None),
