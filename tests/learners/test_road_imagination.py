@@ -119,11 +119,25 @@ def test_a_model_that_is_not_trusted_imagines_nothing() -> None:
     assert imagination.imagine(network_of(0.0), 1, 0, 1, lambda drawn: drawn) is None
 
 
-def test_it_survives_a_stop() -> None:
-    one, _ = imagined(RING, network_of(0.05))
-    other = RoadImagination(VIRTUAL, Task(RING, PISaturation()), POLICY, 0)
+@pytest.mark.parametrize("road", [RING, EIGHT], ids=["a ring", "a figure eight"])
+def test_it_survives_a_stop(road: Loop) -> None:
+    one, _ = imagined(road, network_of(0.05))
+    other = RoadImagination(VIRTUAL, Task(road, PISaturation()), POLICY, 0)
     facts, tensors = one.state()
     other.restore(json.loads(json.dumps(facts)), tensors)
     assert len(other.moments) == 4
-    np.testing.assert_array_equal(other.moments[2].speeds, one.moments[2].speeds)
+    for restored, kept in zip(other.moments, one.moments, strict=True):
+        np.testing.assert_array_equal(restored.speeds, kept.speeds)
+        assert restored.size == kept.size
+        np.testing.assert_equal(restored.waits, kept.waits)
     assert float(other.model.noise) == float(one.model.noise) > 0.0
+
+
+def test_rings_that_an_earlier_version_kept_are_read() -> None:
+    one, episodes = imagined(RING, network_of(0.05))
+    facts, tensors = one.state()
+    for kept in facts["moments"]:
+        del kept["size"], kept["waits"]
+    one.restore(facts, tensors)
+    assert [kept.size for kept in one.moments] == [episode.drawn["length"] for episode in episodes]
+    assert all(kept.waits is None for kept in one.moments)

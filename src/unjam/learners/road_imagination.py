@@ -203,5 +203,7 @@ class RoadImagination(Imagination[RoadModel]):
     def restore(self, facts: dict[str, Any], tensors: dict[str, torch.Tensor]) -> None:
         """Go on from what `state` returned."""
         arrays = {name: tensor.numpy() for name, tensor in under(MOMENTS, tensors).items()}
-        self.moments = unpack(list[Moments], facts["moments"], arrays)
+        # Earlier versions imagined rings alone, where size is length and nobody waits.
+        kept = [{"size": round(each["length"]), "waits": None, **each} for each in facts["moments"]]
+        self.moments = unpack(list[Moments], kept, arrays)
         super().restore(facts, {n: t for n, t in tensors.items() if not n.startswith(MOMENTS)})
