@@ -9,6 +9,7 @@ CAVs' own, mean and standard deviation over time), by the gap that SUMO keeps be
 
 import itertools
 import sys
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -39,9 +40,9 @@ def main(folder: Path) -> None:
                 measure(run_episode(road, driver, seed, simulation=simulation)) for seed in held_out_seeds(20)
             ]
             row: dict[str, Any] = {"gap": gap, "standing": standing, "driver": label}
-            row |= {key: estimate([each[key] for each in found]) for key in KEPT}
+            row |= {key: asdict(estimate([each[key] for each in found])) for key in KEPT}
             rows.append(row)
-            print(gap, standing, label, {key: round(float(row[key].mean), 2) for key in KEPT}, flush=True)
+            print(gap, standing, label, {key: round(row[key]["mean"], 2) for key in KEPT}, flush=True)
     folder.mkdir(parents=True, exist_ok=True)
     write_whole(folder / "merge-level.json", to_json({"manifest": about, "rows": rows}, indent=1))
 
