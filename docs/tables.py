@@ -4,6 +4,7 @@ import json
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 from IPython.display import HTML
 
@@ -92,6 +93,36 @@ def knowledge_gain(roads: Sequence[str], columns: dict[str, str]) -> pd.DataFram
                 cells[heading] = f"{100 * less.mean():+.0f} % [{(less > 0).sum()} of {len(less)}]"
             table.append(cells)
     return pd.DataFrame(table)
+
+
+def roads_known(road: str) -> pd.DataFrame:
+    """Return how wrong imagined whole roads are by what is known of people and by the data, in the mean.
+
+    Of a step, and of whole episodes: speed of all, and how unlike speeds are in the second half, beyond the
+    actual ones, by who drives; in brackets the smallest and the largest of the seeds.
+    """
+    rows = json.loads((RESULTS / "model/whole_roads.json").read_text())["rows"]
+    (actual,) = (row for row in rows if row["road"] == road and not row["known"])
+    found = pd.DataFrame([row for row in rows if row["road"] == road and row["known"]])
+    table = []
+    for (known, steps), of in found.groupby(["known", "steps"], sort=False):
+        cells = {"what is known": known, "actual steps": f"{steps:,}" if steps else "none"}
+        cells["a step is wrong by [m/s]"] = f"{of['ignorance'].mean():.4f}"
+        for who in ("PI", "a CAV that follows as people do"):
+            for name, heading in (("speed", "speed"), ("wave", "spread")):
+                beyond = [np.mean(each[name]) - np.mean(actual[who][name]) for each in of[who]]
+                cells[f"{heading}, {who} [m/s]"] = _in_range(beyond)
+        crashed = sum(
+            each["collisions"] for who in ("PI", "a CAV that follows as people do") for each in of[who]
+        )
+        cells["collide"] = f"{crashed} of {2 * len(of) * len(actual['PI']['speed'])}"
+        table.append(cells)
+    return pd.DataFrame(table)
+
+
+def _in_range(values: Sequence[float]) -> str:
+    ends = f" [{min(values):+.2f}, {max(values):+.2f}]" if len(values) > 1 else ""
+    return f"{np.mean(values):+.2f}{ends}"
 
 
 def _steps_of(text: str) -> int:
