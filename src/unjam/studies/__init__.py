@@ -8,7 +8,7 @@ from unjam.studies.drivable import (
     DRIVABLE_STUDY,
 )
 from unjam.studies.envelope import ENVELOPE
-from unjam.studies.everywhere import EVERYWHERE_STUDY
+from unjam.studies.everywhere import EVERYWHERE_STUDY, JUDGING
 from unjam.studies.figure_6 import FIGURE_6
 from unjam.studies.imagined import imagined
 from unjam.studies.roads_together import (
@@ -92,7 +92,7 @@ STUDIES: dict[str, Study] = {
     "everywhere-trained": trained_together(
         "what one residual, and TRPO and PPO without an expert, gain on all roads of the family",
         {"everywhere": 10, "everywhere-trpo": 5, "everywhere-ppo": 5},
-        *(ALL_ROADS, BESIDE_EVERYWHERE),
+        *(ALL_ROADS, BESIDE_EVERYWHERE, None, JUDGING[:5]),  # of each of twenty trainings
     ),
 }
 """every study by name"""
