@@ -9,7 +9,7 @@ import pandas as pd
 from IPython.display import HTML
 
 from unjam.measures.metrics import METRICS
-from unjam.measures.statistics import estimate_of, paired_difference
+from unjam.measures.statistics import Estimate, estimate_of, paired_difference
 from unjam.measures.table import baseline_of, cell_of
 from unjam.reports.model import error_text
 
@@ -118,6 +118,27 @@ def roads_known(road: str) -> pd.DataFrame:
         cells["collide"] = f"{crashed} of {2 * len(of) * len(actual['PI']['speed'])}"
         table.append(cells)
     return pd.DataFrame(table)
+
+
+LEVELS = {
+    "return": ("return", 0),
+    "cav_mean_speed": ("CAV's speed [m/s]", 2),
+    "speed_std_cav": ("its std over time [m/s]", 2),
+}
+
+
+def levels(name: str, columns: dict[str, str], chosen: dict[str, tuple]) -> pd.DataFrame:
+    """Return what drivers that never learned earn, of `results/tried/NAME.json`.
+
+    `columns` has headings of what tells rows apart, `chosen` the values of them that are shown.
+    """
+    rows = json.loads((RESULTS / f"tried/{name}.json").read_text())["rows"]
+    return pd.DataFrame(
+        {heading: row[key] for key, heading in columns.items()}
+        | {heading: cell_of(Estimate(**row[key]), digits) for key, (heading, digits) in LEVELS.items()}
+        for row in rows
+        if all(row[key] in values for key, values in chosen.items())
+    )
 
 
 def _in_range(values: Sequence[float]) -> str:
