@@ -99,22 +99,20 @@ def roads_known(road: str) -> pd.DataFrame:
     """Return how wrong imagined whole roads are by what is known of people and by the data, in the mean.
 
     Of a step, and of whole episodes: speed of all, and how unlike speeds are in the second half, beyond the
-    actual ones, by who drives; in brackets the smallest and the largest of the seeds.
+    actual ones, where PI drives and where a CAV follows as people do; in brackets the range of the seeds.
     """
     rows = json.loads((RESULTS / "model/whole_roads.json").read_text())["rows"]
     (actual,) = (row for row in rows if row["road"] == road and not row["known"])
     found = pd.DataFrame([row for row in rows if row["road"] == road and row["known"]])
-    table = []
+    table, drivers = [], {"PI": "PI", "a CAV that follows as people do": "as people"}
     for (known, steps), of in found.groupby(["known", "steps"], sort=False):
         cells = {"what is known": known, "actual steps": f"{steps:,}" if steps else "none"}
         cells["a step is wrong by [m/s]"] = f"{of['ignorance'].mean():.4f}"
-        for who in ("PI", "a CAV that follows as people do"):
+        for who, words in drivers.items():
             for name, heading in (("speed", "speed"), ("wave", "spread")):
                 beyond = [np.mean(each[name]) - np.mean(actual[who][name]) for each in of[who]]
-                cells[f"{heading}, {who} [m/s]"] = _in_range(beyond)
-        crashed = sum(
-            each["collisions"] for who in ("PI", "a CAV that follows as people do") for each in of[who]
-        )
+                cells[f"{heading}, {words} [m/s]"] = _in_range(beyond)
+        crashed = sum(each["collisions"] for who in drivers for each in of[who])
         cells["collide"] = f"{crashed} of {2 * len(of) * len(actual['PI']['speed'])}"
         table.append(cells)
     return pd.DataFrame(table)
