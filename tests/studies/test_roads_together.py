@@ -8,7 +8,7 @@ import pytest
 
 from unjam.drivers.by_road import SEVERAL
 from unjam.studies.everywhere import JUDGING
-from unjam.studies.roads_together import BESIDE, FRESH, RINGS, SHARED, _on_road, table
+from unjam.studies.roads_together import BESIDE, FRESH, RINGS, SHARED, _on_road, controller_for, table
 from unjam.studies.study import PlannedRun, StudyFolder
 from unjam.training.family import FAMILY, family_roads
 from unjam.training.presets import RINGS_TUNED
@@ -64,6 +64,16 @@ def test_a_training_on_several_roads_is_finished_when_all_are_judged(tmp_path: P
         name for name, ring in family_roads(RINGS).items() if ring.part == "seen"
     }
     assert not studies.has(run)
+
+
+def test_each_kind_of_road_is_driven_with_its_own_limits_and_decisions(tmp_path: Path) -> None:
+    studies, run = StudyFolder(tmp_path), PlannedRun("everywhere", "everywhere", 0)
+    for name, of in (
+        ("ring-88-grown", "ring-22-standing"),
+        ("figure-eight-wide", "figure-eight-14"),
+        ("one-lane-10", "on-ramp-5"),
+    ):
+        assert controller_for(FAMILY[name], run, studies) == studies.folder_of(run) / of
 
 
 def test_a_ring_is_driven_by_all_on_the_same_seeds(monkeypatch: pytest.MonkeyPatch) -> None:

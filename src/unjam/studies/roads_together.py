@@ -26,7 +26,7 @@ from unjam.studies.everywhere import (
     driven,
     gains_of,
 )
-from unjam.studies.study import VARIANTS, PlannedRun, Study, StudyFolder, measure_parts
+from unjam.studies.study import VARIANTS, Part, PlannedRun, Study, StudyFolder, measure_parts
 from unjam.training.family import (
     GROWING,
     GROWN,
@@ -91,15 +91,13 @@ def trained_together(
         ]
 
     def write(studies: StudyFolder, seeds: int, folder: Path, workers: int) -> None:
-        trained = {
-            f"{VARIANTS[run.variant].label} {run.seed}": str(studies.controller_of(run))
-            for run in runs(seeds)
-        }
-        drivers = {**beside, **trained}
-        parts = {
-            f"{number:02d}": (_on_road, (name, road, drivers, list(seeds_that_judge)))
-            for number, (name, road) in enumerate(judged_on.items())
-        }
+        parts: dict[str, Part] = {}
+        for number, (name, road) in enumerate(judged_on.items()):
+            trained = {
+                f"{VARIANTS[run.variant].label} {run.seed}": str(controller_for(road, run, studies))
+                for run in runs(seeds)
+            }
+            parts[f"{number:02d}"] = _on_road, (name, road, {**beside, **trained}, list(seeds_that_judge))
         measure_parts(folder, parts, workers)
 
     labels = [VARIANTS[name].label for name in variants]
@@ -108,6 +106,16 @@ def trained_together(
         "held out": partial(table, labels, HELD_OUT, beside),
     }
     return Study(title, runs, write, minutes=25.0, goes_on=True, tables=tables)
+
+
+def controller_for(road: FamilyRoad, run: PlannedRun, studies: StudyFolder) -> Path:
+    """Return where the controller of a training is that drives a road.
+
+    One network drives all, but limits and the length of decisions are those of a kind of road: that of the
+    first such road is taken.
+    """
+    roads, kind = run.config.roads(), KINDS[road.scenario]
+    return studies.folder_of(run) / next(name for name, each in roads.items() if KINDS[each.scenario] == kind)
 
 
 def _on_road(
