@@ -71,15 +71,14 @@ def driven(
     scenario: Scenario, drivers: dict[str, str], seeds: list[tuple[int, ...]], run: Run
 ) -> dict[str, Rows]:
     """Return what is kept of each driver's episodes, by label; `drivers` are names of drivers by label."""
-    made = [make_driver(name, scenario.decision_step) for name in drivers.values()]  # one each: networks
-    tasks = [
-        EpisodeTask(scenario.part(index, len(seeds)), driver, seed)
-        for driver in made
-        for index, seed in enumerate(seeds)
-    ]
-    rows = [{key: row[key] for key in KEPT} for row in map(measure, run(tasks))]
-    count = len(seeds)
-    return {label: rows[n * count : (n + 1) * count] for n, label in enumerate(drivers)}
+    found: dict[str, Rows] = {}
+    for label, name in drivers.items():  # one after the other: a motorway's episode is 80 MB
+        driver = make_driver(name, scenario.decision_step)
+        tasks = [
+            EpisodeTask(scenario.part(index, len(seeds)), driver, seed) for index, seed in enumerate(seeds)
+        ]
+        found[label] = [{key: row[key] for key in KEPT} for row in map(measure, run(tasks))]
+    return found
 
 
 def _write(studies: StudyFolder, seeds: int, folder: Path, workers: int) -> None:
