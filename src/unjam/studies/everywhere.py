@@ -5,7 +5,7 @@ decide than those that judge.
 """
 
 import json
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from hashlib import sha256
 from pathlib import Path
@@ -35,8 +35,8 @@ EPISODES = 10
 """of each driver on each road"""
 CHOOSING, JUDGING = tuning_seeds(EPISODES, 1000), held_out_seeds(EPISODES)
 """seeds that choose the best tuned expert of a road, and those that judge"""
-Run = Callable[[list[EpisodeTask]], Iterable[Episode]]
-"""drives tasks, in their order"""
+Run = Callable[[list[EpisodeTask]], Rows]
+"""drives tasks, and returns what `kept_of` makes of their episodes, in their order"""
 TUNED: dict[str, tuple[str, ...]] = {
     "rings": (
         *("pi", "unjam:ring-tuned", "unjam:ring-gap-tuned", "unjam:ring-jammed-tuned", "unjam:rings-tuned"),
@@ -71,14 +71,20 @@ def driven(
     scenario: Scenario, drivers: dict[str, str], seeds: list[tuple[int, ...]], run: Run
 ) -> dict[str, Rows]:
     """Return what is kept of each driver's episodes, by label; `drivers` are names of drivers by label."""
-    found: dict[str, Rows] = {}
-    for label, name in drivers.items():  # one after the other: a motorway's episode is 80 MB
-        driver = make_driver(name, scenario.decision_step)
-        tasks = [
-            EpisodeTask(scenario.part(index, len(seeds)), driver, seed) for index, seed in enumerate(seeds)
-        ]
-        found[label] = [{key: row[key] for key in KEPT} for row in map(measure, run(tasks))]
-    return found
+    made = [make_driver(name, scenario.decision_step) for name in drivers.values()]  # one each: networks
+    tasks = [
+        EpisodeTask(scenario.part(index, len(seeds)), driver, seed)
+        for driver in made
+        for index, seed in enumerate(seeds)
+    ]
+    rows, count = run(tasks), len(seeds)
+    return {label: rows[n * count : (n + 1) * count] for n, label in enumerate(drivers)}
+
+
+def kept_of(index: int, episode: Episode) -> dict[str, Any]:
+    """Return what is kept of an episode, for `Workers.run_each`: a motorway's whole one takes 80 MB."""
+    measured = measure(episode)
+    return {key: measured[key] for key in KEPT}
 
 
 def _write(studies: StudyFolder, seeds: int, folder: Path, workers: int) -> None:
@@ -90,7 +96,7 @@ def _write(studies: StudyFolder, seeds: int, folder: Path, workers: int) -> None
             found |= {"tried": {}, "drove": {}, "rows": {}}
             if file.is_file():
                 found |= json.loads(file.read_text())
-            _go_on(scenario, TUNED[KINDS[road.scenario]], found, pool.run)
+            _go_on(scenario, TUNED[KINDS[road.scenario]], found, partial(pool.run_each, keep=kept_of))
             write_whole(file, to_json(found))
 
 

@@ -6,6 +6,7 @@ SUMO's but for rounding.
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ import numpy as np
 import pandas as pd
 
 from unjam.measures.drivable import DRIVABLE
+from unjam.measures.gain import Rows
 from unjam.measures.statistics import crossed_estimate, estimate, signed
 from unjam.measures.table import PEOPLE
 from unjam.physics.arrays import Floats
@@ -25,6 +27,7 @@ from unjam.studies.everywhere import (
     best_of,
     driven,
     gains_of,
+    kept_of,
 )
 from unjam.studies.study import VARIANTS, Part, PlannedRun, Study, StudyFolder, measure_parts
 from unjam.training.family import (
@@ -40,8 +43,8 @@ from unjam.training.family import (
 )
 from unjam.training.presets import RINGS_TUNED, SHARED_RINGS_TUNED
 from unjam.training.seeds import held_out_seeds
-from unjam.worlds.batch.run import run_where_possible
-from unjam.worlds.record import Episode
+from unjam.worlds.batch.possible import why_not
+from unjam.worlds.batch.run import run_batches
 from unjam.worlds.workers import EpisodeTask, Workers
 
 RINGS = "rings"
@@ -124,15 +127,20 @@ def _on_road(
     """Return what everybody did on a road on the seeds that judge; others choose its best."""
     scenario = road.make()
     tried = {driver: driver for driver in (PEOPLE, *TUNED[KINDS[road.scenario]])}
-    best = best_of(driven(scenario, tried, CHOOSING, _run))
-    drivers = {PEOPLE: PEOPLE, best: best, **judged}
-    rows = driven(scenario, drivers, seeds, _run)
+    with Workers() as workers:
+        run = partial(_measured, workers)
+        best = best_of(driven(scenario, tried, CHOOSING, run))
+        drivers = {PEOPLE: PEOPLE, best: best, **judged}
+        rows = driven(scenario, drivers, seeds, run)
     return {"road": name, "part": road.part, "best": best, "rows": rows}
 
 
-def _run(tasks: list[EpisodeTask]) -> list[Episode]:
-    with Workers() as workers:
-        return run_where_possible(tasks, workers.run)
+def _measured(workers: Workers, tasks: list[EpisodeTask]) -> Rows:
+    """Return what is kept of the episodes of one road, which may have several drivers."""
+    if why_not(tasks[0].scenario):
+        return workers.run_each(tasks, kept_of)
+    by_driver = groupby(tasks, key=lambda task: id(task.driver))
+    return [kept_of(*each) for _, some in by_driver for each in enumerate(run_batches(list(some)))]
 
 
 def table(
