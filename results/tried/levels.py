@@ -3,9 +3,9 @@
     python results/tried/levels.py FOLDER
 
 writes FOLDER/constant-level.json, a CAV that accelerates evenly on ring and figure eight, and
-FOLDER/merge-level.json, the merge by the gap that SUMO keeps beneath the commands (its `minGap`) and the number
-of people who stand on the road at the start. Return of the released code's reward, and the paper's convention
-of speed: the CAVs' own, mean and standard deviation over time. Twenty held-out seeds each.
+FOLDER/merge-level.json, the merge by the gap that SUMO keeps beneath the commands (its `minGap`) and the
+number of people who stand on the road at the start. Return of the released code's reward, and the paper's
+convention of speed: the CAVs' own, mean and standard deviation over time. Twenty held-out seeds each.
 """
 
 import itertools
