@@ -140,8 +140,8 @@ def levels(name: str, columns: dict[str, str], chosen: dict[str, tuple]) -> pd.D
 
 
 def _in_range(values: Sequence[float]) -> str:
-    ends = f" [{min(values):+.2f}, {max(values):+.2f}]" if len(values) > 1 else ""
-    return f"{np.mean(values):+.2f}{ends}"
+    mean, low, high = (f"{round(each, 2) + 0.0:+.2f}" for each in (np.mean(values), min(values), max(values)))
+    return mean if low == high else f"{mean} [{low}, {high}]"
 
 
 def _steps_of(text: str) -> int:
