@@ -144,3 +144,17 @@ def test_on_several_roads_the_mean_gain_is_maximised_and_the_worst_road_named(tm
     written = json.loads((tmp_path / TUNED).read_text())
     assert written["reward"] == MEAN_GAIN
     assert set(written["scenario"]) == set(roads)
+
+
+def test_of_roads_of_all_kinds_those_are_screened_that_a_batch_can_step(tmp_path: Path) -> None:
+    roads = {"ring": SMALL, "eight": FigureEight(horizon=80)}
+    each = OF_EACH * (60 + 80)
+    final = each * ((FINALISTS + 1) * 2 + 3)
+    with Workers(1) as workers:
+        found, driven = (
+            tune(roads, "pi", SPACE, final + 2 * each, tmp_path / str(screen), workers, screen=screen)
+            for screen in (True, False)
+        )
+    assert (found.actual_steps, found.imagined_steps) == (final + 2 * OF_EACH * 80, 2 * OF_EACH * 60)
+    assert (driven.actual_steps, driven.imagined_steps) == (final + 2 * each, 0)
+    assert [one.score for one in found.settings] == pytest.approx([one.score for one in driven.settings])

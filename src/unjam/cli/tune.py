@@ -45,7 +45,7 @@ def tune(
         bool | None,
         typer.Option(
             help="Try settings on batches of imagined rings, equal to SUMO's, and only finalists in SUMO "
-            "itself; without it, where the road is such a ring."
+            "itself; without it, where there is such a ring."
         ),
     ] = None,
     workers: WorkersOption = DEFAULT_WORKERS,
@@ -64,7 +64,7 @@ def tune(
 
       unjam tune figure-eight --expert pacer --vary gathering_speed=1..3 --steps 300000
 
-      unjam tune rings --expert pi                   (a family: also shared-rings, figure-eights, motorways)
+      unjam tune rings --expert pi         (also shared-rings, figure-eights, motorways, or everywhere)
     """
     from unjam.scenarios import make_scenario
     from unjam.training.family import FAMILY, GROUPS, roads_of
@@ -95,7 +95,7 @@ def tune(
         found = run(
             *(roads, expert, space, steps, folder, pool, reward, seed),
             (lambda line: None) if json else aside.print,
-            not any(map(why_not, roads.values())) if screen is None else screen,
+            not all(map(why_not, roads.values())) if screen is None else screen,
         )
     best, default = found.best, found.default
     steps_of = {"actual_steps": found.actual_steps, "imagined_steps": found.imagined_steps}

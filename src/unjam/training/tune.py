@@ -77,7 +77,7 @@ class Tuned:
     actual_steps: int
     """driven in SUMO"""
     imagined_steps: int
-    """driven in batches of rings, where settings were screened"""
+    """driven in batches of rings, where settings were screened there"""
     file: Path
     """the tuned expert as a controller"""
 
@@ -148,11 +148,11 @@ def tune(
         reward: what is maximised on one road; empty: the scenario's own.
         seed: of the proposals.
         on_line: gets a line for each setting.
-        screen: whether settings are tried in batches of rings, which are SUMO's but for rounding, and only
-            the finalists, and the expert as it is, in SUMO.
+        screen: whether settings are tried in batches where a road is a ring, which are SUMO's but for
+            rounding, and there only the finalists, and the expert as it is, in SUMO.
 
     Raises:
-        InputError: the steps are too few, a parameter is wrong, a road cannot be stepped in a batch, or the
+        InputError: the steps are too few, a parameter is wrong, no road can be stepped in a batch, or the
             folder holds something else.
         UnjamError: no car could drive any of the settings.
         MissingPartError: Optuna is not installed.
@@ -164,18 +164,23 @@ def tune(
     trials = (steps - final) // each
     if trials < 2:
         raise InputError(f"steps: {steps} is not allowed; allowed: >= {final + 2 * each} for two settings")
-    for scenario in roads.values() if screen else ():
-        if why := why_not(scenario):
-            raise InputError(f"screen: {why}")
+    reasons = {road: why_not(scenario) for road, scenario in roads.items()}
+    if screen and all(reasons.values()):
+        raise InputError(f"screen: {next(iter(reasons.values()))}")
+    screened = [road for road, why in reasons.items() if screen and not why]
     recipes = {road: scenario_recipe(scenario) for road, scenario in roads.items()}
     wanted = {"roads": recipes, "expert": expert, "space": repr(space), "steps": steps, "reward": reward}
-    tried, run = Tried(folder, wanted | {"seed": seed, "screen": screen}), partial(_in_sumo, workers)
+    tried = Tried(folder, wanted | {"seed": seed, "screen": screen})
+    in_sumo = dict.fromkeys(roads, partial(_in_sumo, workers))
+    trying = in_sumo | dict.fromkeys(screened, _in_batch)
 
     @cache
     def alone(first: int, count: int) -> dict[str, Rows]:
-        return _driven(roads, ["human"], first, count, reward, run)[0] if len(roads) > 1 else {}
+        return _driven(roads, ["human"], first, count, reward, in_sumo)[0] if len(roads) > 1 else {}
 
-    def judged(all_values: list[dict[str, Any]], first: int, count: int, run: Run) -> list[Setting]:
+    def judged(
+        all_values: list[dict[str, Any]], first: int, count: int, run: Mapping[str, Run]
+    ) -> list[Setting]:
         texts = [labelled(expert, values) for values in all_values]
         scores: dict[str, Verdict] = {text: (None, why) for text in texts if (why := _not_made(text))}
         new = [text for text in texts if text not in scores and (first, text) not in tried.known]
@@ -194,7 +199,7 @@ def tune(
             for key, values in space.items():
                 values.suggest(trial, key)
         proposed = [{key: _rounded(value) for key, value in trial.params.items()} for trial in asked]
-        found = judged(proposed, 0, episodes, _in_batch if screen else run)
+        found = judged(proposed, 0, episodes, trying)
         for trial, setting in zip(asked, found, strict=True):
             failed = None if setting.score is not None else optuna.trial.TrialState.FAIL
             study.tell(trial, setting.score, state=failed)
@@ -203,14 +208,14 @@ def tune(
             on_line(f"{len(settings)} of {trials}: {setting.driver}: {said}")
     ranked = sorted(settings, key=lambda one: -inf if one.score is None else one.score, reverse=True)
     best_values = [one.values for one in ranked[:FINALISTS]]
-    *again, default = judged([*best_values, {}], episodes, 2 * episodes, run)
+    *again, default = judged([*best_values, {}], episodes, 2 * episodes, in_sumo)
     finalists = [one for one in (*again, default) if one.score is not None]
     if not finalists:
         raise UnjamError(f"no car could drive any of {trials} settings of {expert}: {default.verdict}")
     best = max(finalists, key=lambda one: -inf if one.score is None else one.score)
     file = folder / f"{expert}{SUFFIX}"
-    actual, imagined = (final, trials * each) if screen else (trials * each + final, 0)
-    tuned = Tuned(best, default, settings, actual, imagined, file)
+    imagined = trials * episodes * sum(roads[road].horizon for road in screened)
+    tuned = Tuned(best, default, settings, trials * each + final - imagined, imagined, file)
     _write(roads, expert, tuned, folder, reward, seed, tried.starts)
     return tuned
 
@@ -225,9 +230,17 @@ def _not_made(driver: str) -> str:
 
 
 def _driven(
-    roads: Mapping[str, Scenario], drivers: Sequence[str], first: int, count: int, reward: str, run: Run
+    roads: Mapping[str, Scenario],
+    drivers: Sequence[str],
+    first: int,
+    count: int,
+    reward: str,
+    run: Mapping[str, Run],
 ) -> list[dict[str, Rows]]:
-    """Return the rows of each driver, road by road, on tuning seeds from number `first` on."""
+    """Return the rows of each driver, road by road, on tuning seeds from number `first` on.
+
+    Each road is driven by its own of `run`.
+    """
     found: list[dict[str, Rows]] = [{} for _ in drivers]
     seeds = tuning_seeds(count, first)
     for road, scenario in roads.items() if drivers else ():
@@ -238,7 +251,7 @@ def _driven(
             ]
             for made in (named_driver(driver, scenario.decision_step) for driver in drivers)
         ]
-        for rows, episodes in zip(found, run(tasks), strict=True):
+        for rows, episodes in zip(found, run[road](tasks), strict=True):
             rows[road] = [measure(episode) for episode in episodes]
             raise_failure(rows[road])
     return found
