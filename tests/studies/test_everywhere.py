@@ -12,7 +12,7 @@ from unjam.measures.gain import MOST, WORST
 from unjam.measures.table import PEOPLE
 from unjam.scenarios import Ring
 from unjam.studies import everywhere
-from unjam.studies.everywhere import HELD_OUT, JUDGED, best_of, gains_of, picture, table
+from unjam.studies.everywhere import HELD_OUT, JUDGED, LAWS, best_of, drivers, gains_of, picture, table
 from unjam.training.family import FAMILY
 
 RESULTS = Path(__file__).parents[2] / "results/everywhere"
@@ -27,6 +27,20 @@ def test_each_road_has_a_row_and_the_mean_and_the_worst_follow() -> None:
         assert list(shown["road"]) == [*names, "mean", "mean, where there is something to gain", "worst"]
         worst = min(roads[name]["gains"]["unjam:best"].mean for name in names)
         assert shown["unjam:best"].iloc[-1] == f"{worst:+.2f}"
+
+
+def test_each_driver_has_its_means_and_what_the_first_gains_more() -> None:
+    shown = drivers(RESULTS).set_index("")
+    assert list(shown.index) == list(JUDGED)
+    for heading, parts in {"seen": ("seen",), "held out": HELD_OUT}.items():
+        laws = table(parts, RESULTS).set_index("road")
+        for label in LAWS:
+            assert shown.loc[label, heading] == laws.loc["mean", label]
+            assert shown.loc[label, f"worst, {heading}"] == laws.loc["worst", label]
+        mean = shown[heading].str.split().str[0].astype(float)
+        more = shown[f"unjam:best beyond it, {heading}"].iloc[1:].str.split().str[0].astype(float)
+        assert list(mean.iloc[0] - mean.iloc[1:]) == pytest.approx(list(more), abs=0.011)
+    assert shown.iloc[0]["unjam:best beyond it, seen"] == ""
 
 
 def test_the_best_of_a_road_gains_what_its_one_says() -> None:

@@ -5,7 +5,7 @@ decide than those that judge.
 """
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from hashlib import sha256
 from pathlib import Path
@@ -37,26 +37,42 @@ CHOOSING, JUDGING = tuning_seeds(EPISODES, 1000), held_out_seeds(EPISODES)
 """seeds that choose the best tuned expert of a road, and those that judge"""
 Run = Callable[[list[EpisodeTask]], Rows]
 """drives tasks, and returns what `kept_of` makes of their episodes, in their order"""
+PI_ON_RINGS = "pi:window=23,catch_up_speed=0.5994,gap_lower=3,gap_upper=50,time_constant=0.9775,safe_gap=4"
+"""what `unjam tune rings --expert pi` finds"""
+GAP_ON_ALL = (
+    "pi-from-gap:window=70.13,catch_up_speed=0.5547,gap_lower=5.578,gap_upper=14.74,safe_gap=1.398,"
+    "safe_gap_rule=closing,time_constant=1.159,first_command=zero,people_headway=1.933,"
+    "people_gap=0.5038,fading=12.94,watched_share=1.242"
+)
+JAM_ON_ALL = (
+    "jam-ahead:first=2,last=3,margin=-2.086,margin_by_share=19.15,lowest=3.369,slowing=0.5985,"
+    "all_lanes=False,time_constant=1.678,jam=0.652"
+)
+"""what `unjam tune everywhere` finds for two experts, results/tuned"""
 TUNED: dict[str, tuple[str, ...]] = {
     "rings": (
         *("pi", "unjam:ring-tuned", "unjam:ring-gap-tuned", "unjam:ring-jammed-tuned", "unjam:rings-tuned"),
-        *("unjam:shared-rings-tuned", "follower-stopper"),
+        *("unjam:shared-rings-tuned", "follower-stopper", GAP_ON_ALL),
     ),
     "figure-eights": ("unjam:figure-eight-tuned", "pacer:varying=true"),
-    "motorways": ("jam-ahead", "unjam:on-ramp-tuned", "cruise", "adaptive-acc"),
+    "motorways": ("jam-ahead", "unjam:on-ramp-tuned", "cruise", "adaptive-acc", JAM_ON_ALL),
 }
 """experts of which the best on a road is its 1"""
-PI_ON_RINGS = "pi:window=23,catch_up_speed=0.5994,gap_lower=3,gap_upper=50,time_constant=0.9775,safe_gap=4"
-"""what `unjam tune rings --expert pi` finds"""
 HELD_OUT = ("combination", "axis")
 """parts of the family that nobody has trained or tuned on"""
-JUDGED: dict[str, str] = {
+LAWS: dict[str, str] = {
     "unjam:best": "unjam:best",
+    "PI from its gap, tuned on all": GAP_ON_ALL,
+    "jam-ahead, tuned on all": JAM_ON_ALL,
     "PI, tuned on the rings": PI_ON_RINGS,
-    "FollowerStopper": "follower-stopper",
+}
+"""one law for every road, or one file that has several: each has a column of its own"""
+SPECIALISTS = ("unjam:ring-best", "unjam:ring-jammed-best", "unjam:figure-eight-best", "unjam:on-ramp-tuned")
+JUDGED: dict[str, str] = {
+    **LAWS,
     "jam-ahead": "jam-ahead",
-    "unjam:ring-best": "unjam:ring-best",
-    "unjam:figure-eight-best": "unjam:figure-eight-best",
+    "FollowerStopper": "follower-stopper",
+    **dict(zip(SPECIALISTS, SPECIALISTS, strict=True)),
 }
 """who is judged on every road, by label"""
 KEPT = (
@@ -164,33 +180,38 @@ def gains_of(folder: Path) -> dict[str, dict[str, Any]]:
 
 
 def table(parts: tuple[str, ...], folder: Path) -> pd.DataFrame:
-    """Return what each driver gains on each road of some parts of the family, with the mean and the worst."""
-    roads = {name: road for name, road in gains_of(folder).items() if road["part"] in parts}
+    """Return what each law gains on each road of some parts of the family, with the mean and the worst."""
+    roads = _of_parts(folder, parts)
     rows = [{"road": name, **_cells(road)} for name, road in roads.items()]
     mean, worst = {"road": "mean"}, {"road": "worst"}
     gainful = {"road": "mean, where there is something to gain"}
-    for label in JUDGED:
-        by_seed = {name: road["by_seed"][label] for name, road in roads.items()}
-        mean[label] = _mean([*by_seed.values()])
-        gainful[label] = _mean([values for name, values in by_seed.items() if roads[name]["counts"]])
-        worst[label] = f"{min(road['gains'][label].mean for road in roads.values()):+.2f}"
+    for label in LAWS:
+        mean[label] = _mean([road["by_seed"][label] for road in roads.values()])
+        gainful[label] = _mean([road["by_seed"][label] for road in roads.values() if road["counts"]])
+        worst[label] = _worst(roads, label)
     rows += [mean, gainful, worst]
     return pd.DataFrame(rows).fillna("")
 
 
-def beyond(folder: Path) -> pd.DataFrame:
-    """Return by how much the first driver gains more than each single law, over the roads of each part."""
-    first, *others = JUDGED
-    roads, rows = gains_of(folder).values(), []
-    for label in others:
-        row = {"": f"{first} beyond {label}"}
-        for heading, parts in {"seen": ("seen",), "held out": HELD_OUT}.items():
-            by_road = [
-                road["by_seed"][first] - road["by_seed"][label] for road in roads if road["part"] in parts
-            ]
-            row[heading] = _mean(by_road)
-        rows.append(row)
-    return pd.DataFrame(rows)
+def drivers(folder: Path) -> pd.DataFrame:
+    """Return what each driver gains over the roads of each part, and what the first gains more than it."""
+    (first, *_), rows = JUDGED, {label: {"": label} for label in JUDGED}
+    for heading, parts in {"seen": ("seen",), "held out": HELD_OUT}.items():
+        roads = _of_parts(folder, parts)
+        for label, row in rows.items():
+            more = [road["by_seed"][first] - road["by_seed"][label] for road in roads.values()]
+            row[heading] = _mean([road["by_seed"][label] for road in roads.values()])
+            row[f"worst, {heading}"] = _worst(roads, label)
+            row[f"{first} beyond it, {heading}"] = "" if label == first else _mean(more)
+    return pd.DataFrame([*rows.values()])
+
+
+def _of_parts(folder: Path, parts: tuple[str, ...]) -> dict[str, dict[str, Any]]:
+    return {name: road for name, road in gains_of(folder).items() if road["part"] in parts}
+
+
+def _worst(roads: Mapping[str, dict[str, Any]], label: str) -> str:
+    return f"{min(road['gains'][label].mean for road in roads.values()):+.2f}"
 
 
 def _mean(by_road: list[Floats]) -> str:
@@ -198,7 +219,7 @@ def _mean(by_road: list[Floats]) -> str:
 
 
 def _cells(road: dict[str, Any]) -> dict[str, str]:
-    cells = {label: signed(road["gains"][label], 2) for label in JUDGED}
+    cells = {label: signed(road["gains"][label], 2) for label in LAWS}
     return {"best expert there": road["best"].removeprefix("unjam:"), **cells}
 
 
@@ -229,6 +250,6 @@ EVERYWHERE_STUDY = Study(
     tables={
         "seen": partial(table, ("seen",)),
         "held out": partial(table, HELD_OUT),
-        "beyond": beyond,
+        "drivers": drivers,
     },
 )
