@@ -39,6 +39,10 @@ Run = Callable[[list[EpisodeTask]], Rows]
 """drives tasks, and returns what `kept_of` makes of their episodes, in their order"""
 PI_ON_RINGS = "pi:window=23,catch_up_speed=0.5994,gap_lower=3,gap_upper=50,time_constant=0.9775,safe_gap=4"
 """what `unjam tune rings --expert pi` finds"""
+PI_ON_ALL = (
+    "pi:window=24.09,catch_up_speed=0.9343,gap_lower=2.263,gap_upper=88.15,safe_gap=4.505,"
+    "safe_gap_rule=closing,time_constant=1.18,first_command=zero"
+)
 GAP_ON_ALL = (
     "pi-from-gap:window=70.13,catch_up_speed=0.5547,gap_lower=5.578,gap_upper=14.74,safe_gap=1.398,"
     "safe_gap_rule=closing,time_constant=1.159,first_command=zero,people_headway=1.933,"
@@ -48,11 +52,11 @@ JAM_ON_ALL = (
     "jam-ahead:first=2,last=3,margin=-2.086,margin_by_share=19.15,lowest=3.369,slowing=0.5985,"
     "all_lanes=False,time_constant=1.678,jam=0.652"
 )
-"""what `unjam tune everywhere` finds for two experts, results/tuned"""
+"""what `unjam tune everywhere` finds for three experts, results/tuned"""
 TUNED: dict[str, tuple[str, ...]] = {
     "rings": (
         *("pi", "unjam:ring-tuned", "unjam:ring-gap-tuned", "unjam:ring-jammed-tuned", "unjam:rings-tuned"),
-        *("unjam:shared-rings-tuned", "follower-stopper", GAP_ON_ALL),
+        *("unjam:shared-rings-tuned", "follower-stopper", PI_ON_ALL, GAP_ON_ALL),
     ),
     "figure-eights": ("unjam:figure-eight-tuned", "pacer:varying=true"),
     "motorways": ("jam-ahead", "unjam:on-ramp-tuned", "cruise", "adaptive-acc", JAM_ON_ALL),
@@ -62,6 +66,7 @@ HELD_OUT = ("combination", "axis")
 """parts of the family that nobody has trained or tuned on"""
 LAWS: dict[str, str] = {
     "unjam:best": "unjam:best",
+    "PI, tuned on all": PI_ON_ALL,
     "PI from its gap, tuned on all": GAP_ON_ALL,
     "jam-ahead, tuned on all": JAM_ON_ALL,
     "PI, tuned on the rings": PI_ON_RINGS,
@@ -220,7 +225,8 @@ def _mean(by_road: list[Floats]) -> str:
 
 def _cells(road: dict[str, Any]) -> dict[str, str]:
     cells = {label: signed(road["gains"][label], 2) for label in LAWS}
-    return {"best expert there": road["best"].removeprefix("unjam:"), **cells}
+    best = {driver: label for label, driver in JUDGED.items()}.get(road["best"], road["best"])
+    return {"best expert there": best.removeprefix(SHIPPED), **cells}
 
 
 def picture(folder: Path) -> Figure:
