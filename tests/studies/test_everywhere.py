@@ -12,7 +12,17 @@ from unjam.measures.gain import MOST, WORST
 from unjam.measures.table import PEOPLE
 from unjam.scenarios import Ring
 from unjam.studies import everywhere
-from unjam.studies.everywhere import HELD_OUT, JUDGED, LAWS, best_of, drivers, gains_of, picture, table
+from unjam.studies.everywhere import (
+    HELD_OUT,
+    JUDGED,
+    LAWS,
+    TWO_LAWS,
+    best_of,
+    drivers,
+    gains_of,
+    picture,
+    table,
+)
 from unjam.training.family import FAMILY
 
 RESULTS = Path(__file__).parents[2] / "results/everywhere"
@@ -31,7 +41,7 @@ def test_each_road_has_a_row_and_the_mean_and_the_worst_follow() -> None:
 
 def test_each_driver_has_its_means_and_what_the_first_gains_more() -> None:
     shown = drivers(RESULTS).set_index("")
-    assert list(shown.index) == list(JUDGED)
+    assert set(shown.index) == {*JUDGED, TWO_LAWS}
     for heading, parts in {"seen": ("seen",), "held out": HELD_OUT}.items():
         laws = table(parts, RESULTS).set_index("road")
         for label in LAWS:
@@ -41,6 +51,16 @@ def test_each_driver_has_its_means_and_what_the_first_gains_more() -> None:
         more = shown[f"unjam:best beyond it, {heading}"].iloc[1:].str.split().str[0].astype(float)
         assert list(mean.iloc[0] - mean.iloc[1:]) == pytest.approx(list(more), abs=0.011)
     assert shown.iloc[0]["unjam:best beyond it, seen"] == ""
+
+
+def test_two_laws_have_what_each_has_on_its_kind_of_road() -> None:
+    shown, laws = drivers(RESULTS).set_index(""), gains_of(RESULTS)
+    seen = {name: road["by_seed"] for name, road in laws.items() if road["part"] == "seen"}
+    mean = sum(
+        of["jam-ahead, tuned on all" if name.startswith("on-ramp") else "PI, tuned on all"].mean()
+        for name, of in seen.items()
+    ) / len(seen)
+    assert float(shown.loc[TWO_LAWS, "seen"].split()[0]) == pytest.approx(mean, abs=0.005)
 
 
 def test_the_best_of_a_road_gains_what_its_one_says() -> None:

@@ -80,6 +80,8 @@ JUDGED: dict[str, str] = {
     **dict(zip(SPECIALISTS, SPECIALISTS, strict=True)),
 }
 """who is judged on every road, by label"""
+TWO_LAWS = "the two best tuned on all: PI, on motorways jam-ahead"
+"""what a choice by the kind of road makes of two single laws: their own rows"""
 KEPT = (
     *("seed", "status", "travel_time", "delay", "mean_speed", "mean_speed_second_half", "speed_limit_ratio"),
     *("throughput_veh_per_h", "fuel_ml_per_km", "floor", "lanes", "collisions", "min_headway", "cav_min_ttc"),
@@ -200,7 +202,8 @@ def table(parts: tuple[str, ...], folder: Path) -> pd.DataFrame:
 
 def drivers(folder: Path) -> pd.DataFrame:
     """Return what each driver gains over the roads of each part, and what the first gains more than it."""
-    (first, *_), rows = JUDGED, {label: {"": label} for label in JUDGED}
+    first, *others = JUDGED
+    rows = {label: {"": label} for label in (first, TWO_LAWS, *others)}
     for heading, parts in {"seen": ("seen",), "held out": HELD_OUT}.items():
         roads = _of_parts(folder, parts)
         for label, row in rows.items():
@@ -212,7 +215,13 @@ def drivers(folder: Path) -> pd.DataFrame:
 
 
 def _of_parts(folder: Path, parts: tuple[str, ...]) -> dict[str, dict[str, Any]]:
-    return {name: road for name, road in gains_of(folder).items() if road["part"] in parts}
+    """Return what `gains_of` finds on the roads of some parts, with what two laws would gain."""
+    roads = {name: road for name, road in gains_of(folder).items() if road["part"] in parts}
+    for name, road in roads.items():
+        motorway = KINDS[FAMILY[name].scenario] == "motorways"
+        for found in (road["gains"], road["by_seed"]):
+            found[TWO_LAWS] = found["jam-ahead, tuned on all" if motorway else "PI, tuned on all"]
+    return roads
 
 
 def _worst(roads: Mapping[str, dict[str, Any]], label: str) -> str:
@@ -225,7 +234,8 @@ def _mean(by_road: list[Floats]) -> str:
 
 def _cells(road: dict[str, Any]) -> dict[str, str]:
     cells = {label: signed(road["gains"][label], 2) for label in LAWS}
-    best = {driver: label for label, driver in JUDGED.items()}.get(road["best"], road["best"])
+    best: str = road["best"]
+    best = {driver: label for label, driver in JUDGED.items()}.get(best, best)
     return {"best expert there": best.removeprefix(SHIPPED), **cells}
 
 
