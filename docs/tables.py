@@ -1,6 +1,7 @@
 """Tables of the documentation, made from the measured files under results/: no number is typed in."""
 
 import json
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -10,7 +11,7 @@ from IPython.display import HTML
 
 from unjam.measures.metrics import METRICS
 from unjam.measures.statistics import Estimate, estimate_of, paired_difference
-from unjam.measures.table import baseline_of, cell_of
+from unjam.measures.table import baseline_of, cell_of, unbroken
 from unjam.reports.model import error_text
 
 RESULTS = Path(__file__).parent.parent / "results"
@@ -190,7 +191,7 @@ def soak_origin() -> str:
 
 
 def show(table: pd.DataFrame, index: bool = False, digits: int = 3) -> HTML:
-    """Return a table in the style of the site; names in its index break after a comma."""
+    """Return a table in the style of the site: names in its index break after a comma, intervals nowhere."""
     html = table.rename(
         index=lambda name: name.replace(",", ", ") if isinstance(name, str) else name
     ).to_html(
@@ -200,4 +201,5 @@ def show(table: pd.DataFrame, index: bool = False, digits: int = 3) -> HTML:
         classes="docutils align-default",
         float_format=f"{{:.{digits}f}}".format,
     )
-    return HTML(f'<div class="table-wrapper">{html}</div>')
+    whole = re.sub(r"\[[^\[\]<>]*\]", lambda found: unbroken(found[0]), html)
+    return HTML(f'<div class="table-wrapper">{whole}</div>')

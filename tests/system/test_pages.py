@@ -1,5 +1,6 @@
 """How the cells of the documentation are run and kept."""
 
+import re
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
@@ -54,3 +55,17 @@ def test_pages_share_a_kernel_and_know_nothing_of_each_other(cells: ModuleType, 
     assert first == second
     assert of_one == [str(tmp_path / "one"), "False", "True"]
     assert of_other == [str(tmp_path / "other"), "False", "True"]
+
+
+def test_every_picture_that_a_cell_draws_is_told_in_words() -> None:
+    """Without them a reader who does not see it is read the name of a file."""
+    drawn = [
+        (page.name, cell)
+        for page in (ROOT / "docs").glob("*.md")
+        for cell in re.findall(
+            r"^```{code-cell} ipython3\n(.*?)^```$", page.read_text(), re.DOTALL | re.MULTILINE
+        )
+        if re.search(r"^(Image|draw)\(", cell, re.MULTILINE)
+    ]
+    assert len(drawn) > 20
+    assert [page for page, cell in drawn if not re.search(r"^    alt: .{20}", cell, re.MULTILINE)] == []

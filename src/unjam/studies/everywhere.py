@@ -249,7 +249,7 @@ def picture(folder: Path) -> Figure:
     shown = axes.imshow(values, cmap="RdYlGn", vmin=-2 * MOST, vmax=2 * MOST, aspect="auto")
     for (row, column), value in np.ndenumerate(values):
         axes.text(column, row, f"{value:+.2f}", ha="center", va="center", color=INK, fontsize=8)
-    axes.set_xticks(range(len(JUDGED)), list(JUDGED), rotation=20, ha="right")
+    axes.set_xticks(range(len(JUDGED)), list(JUDGED), rotation=40, ha="right", rotation_mode="anchor")
     marks = {"seen": "", "combination": " (new combination)", "axis": " (new)"}
     axes.set_yticks(range(len(roads)), [f"{name}{marks[road['part']]}" for name, road in roads.items()])
     axes.grid(visible=False)
