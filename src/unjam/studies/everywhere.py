@@ -58,7 +58,7 @@ TUNED: dict[str, tuple[str, ...]] = {
         *("pi", "unjam:ring-tuned", "unjam:ring-gap-tuned", "unjam:ring-jammed-tuned", "unjam:rings-tuned"),
         *("unjam:shared-rings-tuned", "follower-stopper", PI_ON_ALL, GAP_ON_ALL),
     ),
-    "figure-eights": ("unjam:figure-eight-tuned", "pacer:varying=true"),
+    "figure-eights": ("unjam:figure-eight-tuned", "pacer:varying=true", PI_ON_ALL),
     "motorways": ("jam-ahead", "unjam:on-ramp-tuned", "cruise", "adaptive-acc", JAM_ON_ALL),
 }
 """experts of which the best on a road is its 1"""
