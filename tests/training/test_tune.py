@@ -68,8 +68,10 @@ def test_a_tuning_that_was_stopped_goes_on_where_it_was(
 
         with pytest.raises(KeyboardInterrupt):
             tune({"ring": SMALL}, "pi", SPACE, STEPS, folder, workers, on_line=stop)
-        run = Workers.run
-        monkeypatch.setattr(Workers, "run", lambda pool, tasks: driven.append(len(tasks)) or run(pool, tasks))
+        run = Workers.run_each
+        monkeypatch.setattr(
+            Workers, "run_each", lambda pool, tasks, keep: driven.append(len(tasks)) or run(pool, tasks, keep)
+        )
         with (folder / TRIED).open("a") as file:
             file.write('{"first": 0, "driver": "cut sho')
         found = tune({"ring": SMALL}, "pi", SPACE, STEPS, folder, workers)

@@ -73,7 +73,6 @@ def tune(
     from unjam.training.tried import ASKED
     from unjam.training.tune import space_around
     from unjam.training.tune import tune as run
-    from unjam.worlds.batch.possible import why_not
     from unjam.worlds.reward import make_reward
     from unjam.worlds.workers import Workers
 
@@ -95,7 +94,7 @@ def tune(
         found = run(
             *(roads, expert, space, steps, folder, pool, reward, seed),
             (lambda line: None) if json else aside.print,
-            not all(map(why_not, roads.values())) if screen is None else screen,
+            screen,
         )
     best, default = found.best, found.default
     steps_of = {"actual_steps": found.actual_steps, "imagined_steps": found.imagined_steps}

@@ -72,12 +72,14 @@ LAWS: dict[str, str] = {
     "PI, tuned on the rings": PI_ON_RINGS,
 }
 """one law for every road, or one file that has several: each has a column of its own"""
-SPECIALISTS = ("unjam:ring-best", "unjam:ring-jammed-best", "unjam:figure-eight-best", "unjam:on-ramp-tuned")
 JUDGED: dict[str, str] = {
     **LAWS,
     "jam-ahead": "jam-ahead",
     "FollowerStopper": "follower-stopper",
-    **dict(zip(SPECIALISTS, SPECIALISTS, strict=True)),
+    "unjam:ring-best": "unjam:ring-best",
+    "unjam:ring-jammed-best": "unjam:ring-jammed-best",
+    "unjam:figure-eight-best": "unjam:figure-eight-best",
+    "unjam:on-ramp-tuned": "unjam:on-ramp-tuned",
 }
 """who is judged on every road, by label"""
 TWO_LAWS = "the two best tuned on all: PI, on motorways jam-ahead"
@@ -188,7 +190,7 @@ def gains_of(folder: Path) -> dict[str, dict[str, Any]]:
 
 def table(parts: tuple[str, ...], folder: Path) -> pd.DataFrame:
     """Return what each law gains on each road of some parts of the family, with the mean and the worst."""
-    roads = _of_parts(folder, parts)
+    roads = _of_parts(gains_of(folder), parts)
     rows = [{"road": name, **_cells(road)} for name, road in roads.items()]
     mean, worst = {"road": "mean"}, {"road": "worst"}
     gainful = {"road": "mean, where there is something to gain"}
@@ -202,10 +204,14 @@ def table(parts: tuple[str, ...], folder: Path) -> pd.DataFrame:
 
 def drivers(folder: Path) -> pd.DataFrame:
     """Return what each driver gains over the roads of each part, and what the first gains more than it."""
-    first, *others = JUDGED
+    (first, *others), every = JUDGED, gains_of(folder)
+    for name, road in every.items():
+        motorway = KINDS[FAMILY[name].scenario] == "motorways"
+        for found in (road["gains"], road["by_seed"]):
+            found[TWO_LAWS] = found["jam-ahead, tuned on all" if motorway else "PI, tuned on all"]
     rows = {label: {"": label} for label in (first, TWO_LAWS, *others)}
     for heading, parts in {"seen": ("seen",), "held out": HELD_OUT}.items():
-        roads = _of_parts(folder, parts)
+        roads = _of_parts(every, parts)
         for label, row in rows.items():
             more = [road["by_seed"][first] - road["by_seed"][label] for road in roads.values()]
             row[heading] = _mean([road["by_seed"][label] for road in roads.values()])
@@ -214,14 +220,8 @@ def drivers(folder: Path) -> pd.DataFrame:
     return pd.DataFrame([*rows.values()])
 
 
-def _of_parts(folder: Path, parts: tuple[str, ...]) -> dict[str, dict[str, Any]]:
-    """Return what `gains_of` finds on the roads of some parts, with what two laws would gain."""
-    roads = {name: road for name, road in gains_of(folder).items() if road["part"] in parts}
-    for name, road in roads.items():
-        motorway = KINDS[FAMILY[name].scenario] == "motorways"
-        for found in (road["gains"], road["by_seed"]):
-            found[TWO_LAWS] = found["jam-ahead, tuned on all" if motorway else "PI, tuned on all"]
-    return roads
+def _of_parts(roads: Mapping[str, dict[str, Any]], parts: tuple[str, ...]) -> dict[str, dict[str, Any]]:
+    return {name: road for name, road in roads.items() if road["part"] in parts}
 
 
 def _worst(roads: Mapping[str, dict[str, Any]], label: str) -> str:

@@ -32,7 +32,6 @@ from unjam.training.seeds import tuning_seeds
 from unjam.training.tried import Tried, Verdict
 from unjam.worlds.batch.possible import why_not
 from unjam.worlds.batch.run import run_batch
-from unjam.worlds.record import Episode
 from unjam.worlds.workers import EpisodeTask, Workers
 
 TUNED = "tuned.json"
@@ -49,8 +48,8 @@ WIDTH = 4.0
 TO_ONE = 1.0
 """upper end for a parameter that is zero by default"""
 
-Run = Callable[[list[list[EpisodeTask]]], list[list[Episode]]]
-"""runs the tasks of each driver on one road, in SUMO or in a batch"""
+Run = Callable[[list[list[EpisodeTask]]], list[Rows]]
+"""runs the tasks of each driver on one road, in SUMO or in a batch, and measures their episodes"""
 
 
 @dataclass(frozen=True)
@@ -129,7 +128,7 @@ def tune(
     reward: str = "",
     seed: int = 0,
     on_line: Callable[[str], None] = lambda line: None,
-    screen: bool = False,
+    screen: bool | None = False,
 ) -> Tuned:
     """Search an expert's parameters, and write `tuned.json` and the expert as `EXPERT.unjam` into a folder.
 
@@ -149,7 +148,7 @@ def tune(
         seed: of the proposals.
         on_line: gets a line for each setting.
         screen: whether settings are tried in batches where a road is a ring, which are SUMO's but for
-            rounding, and there only the finalists, and the expert as it is, in SUMO.
+            rounding, and there only the finalists, and the expert as it is, in SUMO; None: if there is one.
 
     Raises:
         InputError: the steps are too few, a parameter is wrong, no road can be stepped in a batch, or the
@@ -167,10 +166,10 @@ def tune(
     reasons = {road: why_not(scenario) for road, scenario in roads.items()}
     if screen and all(reasons.values()):
         raise InputError(f"screen: {next(iter(reasons.values()))}")
-    screened = [road for road, why in reasons.items() if screen and not why]
+    screened = [road for road, why in reasons.items() if screen is not False and not why]
     recipes = {road: scenario_recipe(scenario) for road, scenario in roads.items()}
     wanted = {"roads": recipes, "expert": expert, "space": repr(space), "steps": steps, "reward": reward}
-    tried = Tried(folder, wanted | {"seed": seed, "screen": screen})
+    tried = Tried(folder, wanted | {"seed": seed, "screen": bool(screened)})
     in_sumo = dict.fromkeys(roads, partial(_in_sumo, workers))
     trying = in_sumo | dict.fromkeys(screened, _in_batch)
 
@@ -251,18 +250,20 @@ def _driven(
             ]
             for made in (named_driver(driver, scenario.decision_step) for driver in drivers)
         ]
-        for rows, episodes in zip(found, run[road](tasks), strict=True):
-            rows[road] = [measure(episode) for episode in episodes]
-            raise_failure(rows[road])
+        for rows, measured in zip(found, run[road](tasks), strict=True):
+            rows[road] = measured
+            raise_failure(measured)
     return found
 
 
-def _in_sumo(workers: Workers, tasks: list[list[EpisodeTask]]) -> list[list[Episode]]:
-    episodes = iter(workers.run([task for each in tasks for task in each]))
-    return [[next(episodes) for _ in each] for each in tasks]
+def _in_sumo(workers: Workers, tasks: list[list[EpisodeTask]]) -> list[Rows]:
+    # Measured as they end: a motorway's whole episode takes 80 MB.
+    every = [task for each in tasks for task in each]
+    rows = iter(workers.run_each(every, lambda index, episode: measure(episode)))
+    return [[next(rows) for _ in each] for each in tasks]
 
 
-def _in_batch(tasks: list[list[EpisodeTask]]) -> list[list[Episode]]:
+def _in_batch(tasks: list[list[EpisodeTask]]) -> list[Rows]:
     import torch
 
     # Rings go round the drivers as CAVs do in a mixture: a ring's CAVs all have the same one.
@@ -270,7 +271,8 @@ def _in_batch(tasks: list[list[EpisodeTask]]) -> list[list[Episode]]:
     together = drivers[0] if len(drivers) == 1 else Mixed(tuple(drivers))
     mixed = [replace(task, driver=together) for part in zip(*tasks, strict=True) for task in part]
     episodes = run_batch(mixed, torch.as_tensor if together.tensors else np.asarray)
-    return [episodes[number :: len(drivers)] for number in range(len(drivers))]
+    rows = [measure(episode) for episode in episodes]
+    return [rows[number :: len(drivers)] for number in range(len(drivers))]
 
 
 def _score(found: Mapping[str, Rows], people: Mapping[str, Rows]) -> tuple[float | None, str]:
