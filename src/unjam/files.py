@@ -14,6 +14,8 @@ from safetensors import SafetensorError
 
 from unjam.errors import DISK_ERRNOS, DiskError, InputError, disk_error
 
+SHIPPED = "unjam:"
+"""what the names of controllers and of people that are part of the package begin with"""
 DAMAGED = (
     *(OSError, ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RecursionError),
     SafetensorError,

@@ -105,13 +105,10 @@ def test_none_is_undrivable_on_roads_it_was_never_trained_on(name: str, simulati
 def test_each_law_of_the_controller_for_all_closed_roads_is_certified(kind: str) -> None:
     best = load_controller(shipped_file("best"))
     assert isinstance(best, ByRoad)
-    ships = kind == "crossing"
-    file = shipped_file("figure-eight-best") if ships else EVERYWHERE / f"certified/{kind}.unjam"
-    controller = read_controller(file)
+    controller = read_controller(EVERYWHERE / f"certified/{kind}.unjam")
     assert isinstance(controller.driver, Filtered)
     assert controller.driver.safety == Ring().safety, "the filter that every road has, too"
-    held = controller.driver if ships else controller.driver.driver
-    (recipe, arrays), (other, others) = recipe_of(best.inner[kind]), recipe_of(held)
+    (recipe, arrays), (other, others) = recipe_of(best.inner[kind]), recipe_of(controller.driver.driver)
     assert recipe == other
     assert arrays.keys() == others.keys()
     assert all(np.array_equal(array, others[name]) for name, array in arrays.items())

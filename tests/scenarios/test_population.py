@@ -4,12 +4,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from unjam.cli.options import scenario_changes
 from unjam.drivers.network import Network
 from unjam.errors import InputError
 from unjam.physics.idm import PAPER_IDM, IDMParameters
 from unjam.scenarios import make_scenario, scenario_from_recipe, scenario_recipe
 from unjam.scenarios.population import Population, read_population, write_population
-from unjam.scenarios.road import BuiltRoad
+from unjam.scenarios.road import BuiltRoad, MotorwayRoad
 from unjam.worlds.sumo.files import files_of
 
 DRIVERS = (
@@ -100,6 +101,41 @@ def test_a_road_draws_its_people_from_it(tmp_path: Path, name: str) -> None:
     assert isinstance(roads[0], BuiltRoad)
     own_types = files_of(scenario, roads[0]).traffic.count('<vType id="of_')
     assert own_types == (22 if name == "ring" else 0)
+
+
+@pytest.mark.parametrize(("name", "drivers"), [("unjam:ngsim", 100), ("unjam:astazero", 8)])
+def test_people_who_were_recorded_are_part_of_the_package(name: str, drivers: int) -> None:
+    found = read_population(name)
+    assert len(found.drivers) == drivers
+    assert {found.typical, *found.drivers} != {found.typical}
+    assert scenario_changes(humans=name) == {"population": name}
+    assert (
+        f"{drivers} calibrated drivers of {name}"
+        in make_scenario("ring", {"population": name}).people_in_words
+    )
+
+
+def test_an_unknown_population_of_the_package_is_refused_with_those_that_are_there() -> None:
+    with pytest.raises(
+        InputError, match=r"'unjam:nobody' is not allowed; allowed: unjam:astazero, unjam:ngsim"
+    ):
+        read_population("unjam:nobody")
+
+
+def test_on_a_motorway_people_follow_as_they_were_calibrated_and_want_to_drive_as_others_do(
+    tmp_path: Path,
+) -> None:
+    with pytest.raises(
+        InputError, match="population: one with a residual network is not allowed on the on-ramp"
+    ):
+        make_scenario("on-ramp", {"population": str(written(tmp_path, NETWORK))})
+    road = make_scenario("on-ramp", {"population": str(written(tmp_path))}).draw(np.random.default_rng(0))
+    assert isinstance(road, MotorwayRoad)
+    kinds = road.kinds
+    follows = {(one.time_headway, one.max_acceleration, one.comfortable_deceleration) for one in DRIVERS}
+    assert {(one.time_headway, one.acceleration, one.deceleration) for one in kinds.values()} == follows
+    assert {one.model for one in kinds.values()} == {"IDM"}
+    assert all(0.8 <= one.speed_factor <= 1.2 for one in kinds.values())
 
 
 def test_without_a_population_roads_are_as_they_were() -> None:

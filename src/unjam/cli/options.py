@@ -12,6 +12,7 @@ from typing import Annotated, Any, NamedTuple
 import typer
 
 from unjam.errors import wrong, wrong_name
+from unjam.files import SHIPPED
 from unjam.learners.settings import AGENTS
 from unjam.parameters import parse_assignments
 from unjam.training.executors import EXECUTORS, Executor
@@ -40,8 +41,11 @@ OutOption = Annotated[
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON document and nothing else.")]
 HumansOption = Annotated[
-    Path | None,
-    typer.Option("--humans", help="Calibrated drivers, of `unjam fit-drivers`: the people on the road."),
+    str | None,
+    typer.Option(
+        "--humans",
+        help="The people on the road: a file of `unjam fit-drivers`, unjam:ngsim or unjam:astazero.",
+    ),
 ]
 BeginOption = Annotated[float | None, typer.Option(help="When your own network begins [s].")]
 EndOption = Annotated[float | None, typer.Option(help="When it ends [s].")]
@@ -131,7 +135,8 @@ def people_changes(
     begin: BeginOption = None, end: EndOption = None, humans: HumansOption = None
 ) -> dict[str, Any]:
     """Return the changes to a scenario that say when, and who the people are."""
-    asked = {"begin": begin, "end": end, "population": str(humans.absolute()) if humans else None}
+    file = humans if humans is None or humans.startswith(SHIPPED) else str(Path(humans).absolute())
+    asked = {"begin": begin, "end": end, "population": file}
     return {name: value for name, value in asked.items() if value is not None}
 
 

@@ -16,6 +16,7 @@ from unjam.drivers.from_file import is_file_reference
 from unjam.drivers.registry import DRIVERS, named_driver
 from unjam.drivers.wrappers import Mixed
 from unjam.errors import wrong_name
+from unjam.files import SHIPPED
 
 __all__ = [
     "BEST",
@@ -28,8 +29,6 @@ __all__ = [
     "shipped_names",
 ]
 
-SHIPPED = "unjam:"
-"""what the name of a controller begins with that is part of the package"""
 BEST = "unjam:best"
 """who drives where nobody is named: the controller for every road"""
 SHIPPED_FOLDER = Path(str(files("unjam") / "controllers"))

@@ -21,6 +21,7 @@ from unjam.drivers.pi_saturation import PIFromGap, PISaturation
 from unjam.drivers.residual import EXPERT, ResidualDriver
 from unjam.drivers.road_experts import Cruise, GapMaker, JamAbsorber, JamAhead, Pacer
 from unjam.drivers.safety import SafetyFilter
+from unjam.drivers.while_gathered import LEADING, OTHERWISE, WhileGathered
 from unjam.drivers.wrappers import INNER, Filtered, Impaired, Mixed, Remembering
 from unjam.errors import InputError, did_you_mean, wrong
 from unjam.parameters import STRICT, Count, NotNegative, Positive, build, split_parameters
@@ -166,6 +167,11 @@ RECIPES: dict[str, Callable[[Recipe, Arrays, Held], Driver]] = {
     "filtered": _filtered,
     "by-road": lambda recipe, arrays, held: ByRoad(
         **{kind: held(recipe["drivers"][kind], kind) for kind in KINDS_OF_ROAD if kind in recipe["drivers"]},
+    ),
+    "while-gathered": lambda recipe, arrays, held: WhileGathered(
+        held(recipe["drivers"][LEADING], LEADING),
+        held(recipe["drivers"][OTHERWISE], OTHERWISE),
+        float(recipe["time_step"]),
     ),
     "remembering": lambda recipe, arrays, held: Remembering(
         held(recipe["driver"], INNER), float(recipe["time_step"])

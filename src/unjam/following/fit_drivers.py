@@ -134,10 +134,12 @@ def fit_from_files(
     for name, value in (only or {}).items():
         if name not in FILTERS:
             raise wrong_name("only", name, FILTERS)
-        there = sorted({str(getattr(pair, name)) for pair in pairs})
+        there = sorted({str(getattr(pair, name)) for pair in pairs} - {""})
         pairs = [pair for pair in pairs if getattr(pair, name) == value]
         if not pairs:
-            raise InputError(f"only: no trajectory has {name} {value!r}; there are: {', '.join(there)}")
+            raise InputError(
+                f"only: no trajectory has {name} {value!r}; there are: {', '.join(there) or 'none'}"
+            )
     words += doubts_about_units(pairs)
     population = fit_drivers(pairs, settings, on_progress)
     made = manifest()

@@ -119,11 +119,13 @@ class OnRamp(Scenario):
         for name, flow in (("ramp_flow", self.ramp_flow), ("calm_ramp_flow", self.calm_ramp_flow)):
             if flow >= 3600.0 / RAMP_HEADWAY:
                 raise ValueError(f"{name}: {flow:g} is not allowed; allowed: < {3600.0 / RAMP_HEADWAY:.0f}")
-        if self.human_control != "native" or self.population:
-            which = "human_control" if self.human_control != "native" else "population"
+        if self.calibrated and self.calibrated.residual is not None:
             raise ValueError(
-                f"{which}: {getattr(self, which)!r} is not allowed on the on-ramp, where SUMO drives people"
+                "population: one with a residual network is not allowed on the on-ramp: SUMO's own "
+                "IDM drives people there"
             )
+        if self.human_control != "native":
+            raise ValueError("human_control: 'commanded' is not allowed on the on-ramp; allowed: 'native'")
         return self
 
     def draw(self, generator: np.random.Generator) -> MotorwayRoad:
@@ -162,13 +164,24 @@ class OnRamp(Scenario):
         def between(interval: tuple[float, float]) -> float:
             return round(float(generator.uniform(*interval)), 4)
 
-        return Person(
+        drawn = Person(
             model=self.following,
             time_headway=between(self.time_headways),
             acceleration=between(self.accelerations),
             deceleration=between(self.decelerations),
             gap=between(self.gaps),
             speed_factor=round(float(np.clip(generator.normal(1.0, self.speed_spread), 0.8, 1.2)), 4),
+        )
+        if self.calibrated is None:
+            return drawn
+        (one,) = self.calibrated.draw(1, generator)
+        # They follow as they were calibrated; how fast people want to be no recording of a jam tells.
+        return drawn._replace(
+            model="IDM",
+            time_headway=one.time_headway,
+            acceleration=one.max_acceleration,
+            deceleration=one.comfortable_deceleration,
+            gap=one.minimum_gap,
         )
 
     def _arrivals(self, generator: np.random.Generator) -> Iterator[Arrival]:
@@ -202,7 +215,8 @@ class OnRamp(Scenario):
     @property
     def people_in_words(self) -> str:
         """How people drive."""
-        return f"{KINDS} different people, {self.following} with SUMO's lane changes"
+        who = f"as {self.calibrated_in_words}" if self.calibrated else self.following
+        return f"{KINDS} different people, {who}, with SUMO's lane changes"
 
     def possible_cavs(self) -> tuple[str, ...]:
         """Return the ids that CAVs may have: any vehicle's."""

@@ -9,6 +9,7 @@ import json
 import os
 from dataclasses import asdict, dataclass, field
 from functools import lru_cache
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -17,12 +18,14 @@ from safetensors.numpy import load, save
 
 from unjam import __version__
 from unjam.drivers.network import Network, network_arrays, network_from_arrays
-from unjam.errors import InputError, wrong
-from unjam.files import DAMAGED, to_json, write_whole
+from unjam.errors import InputError, wrong, wrong_name
+from unjam.files import DAMAGED, SHIPPED, to_json, write_whole
 from unjam.parameters import build
 from unjam.physics.arrays import Array, clip, namespace
 from unjam.physics.idm import PARAMETER_NAMES, IDMParameters
 
+SHIPPED_PEOPLE = Path(str(files("unjam") / "scenarios/people"))
+"""populations that are part of the package, results/field/measure.sh: five parameters of each driver's own"""
 FORMAT = 1
 RESIDUAL_INPUTS = ("speed", "leader's speed minus own", "gap")
 """what the residual sees [m/s, m/s, m]"""
@@ -121,13 +124,27 @@ def write_population(path: Path, population: Population) -> None:
     write_whole(path, to_json(content, indent=1))
 
 
-def read_population(path: Path | str) -> Population:
-    """Return the population of a file.
+def population_file(name: Path | str) -> Path:
+    """Return the file of a population: `unjam:ngsim` and the like are part of the package, others are paths.
+
+    Raises:
+        InputError: none of that name is part of the package.
+    """
+    if not str(name).startswith(SHIPPED):
+        return Path(name)
+    known = {f"{SHIPPED}{path.stem}": path for path in sorted(SHIPPED_PEOPLE.glob("*.json"))}
+    if name not in known:
+        raise wrong_name("population", str(name), known)
+    return known[str(name)]
+
+
+def read_population(name: Path | str) -> Population:
+    """Return the population of a file, or a shipped one.
 
     Raises:
         InputError: there is none, or it is damaged, or not a population.
     """
-    path = Path(path)
+    path = population_file(name)
     if not os.path.exists(path):
         raise InputError(f"population: {str(path)!r} does not exist")
     if not os.path.isfile(path):  # a device would be read without end

@@ -108,8 +108,8 @@ class Scenario:
     humans: IDMParameters = field(default_factory=IDMParameters)
     """how people drive"""
     population: str = ""
-    """file of calibrated drivers, of `unjam fit-drivers`, each of whom drives in its own way; empty: all
-    drive as `humans` says"""
+    """calibrated drivers, each of whom drives in its own way: a file of `unjam fit-drivers`, `unjam:ngsim` or
+    `unjam:astazero`; empty: all drive as `humans` says"""
     human_control: HumanControl = "native"
     """who computes how people drive: `native` SUMO's own IDM; `commanded` the same IDM as a speed command in
     every step, as in Flow"""
@@ -177,10 +177,16 @@ class Scenario:
         return dict(zip(names, population.draw(len(names), generator), strict=True)) if population else {}
 
     @property
+    def calibrated_in_words(self) -> str:
+        """Who the people of `population` are."""
+        drivers = self.calibrated.drivers if self.calibrated else ()
+        return f"{len(drivers)} calibrated drivers of {self.population}"
+
+    @property
     def people_in_words(self) -> str:
         """How people drive."""
         if self.calibrated:
-            return f"{len(self.calibrated.drivers)} calibrated drivers of {self.population}"
+            return self.calibrated_in_words
         return f"IDM with acceleration noise of std {self.noise_per_step:.3f} m/s2 a step"
 
     def draw(self, generator: np.random.Generator) -> Road:

@@ -2,7 +2,8 @@
 
 Each road draws its size, its people and their noise from the seed. Held out are whole axes (a density, a
 number of vehicles, people, a demand, a radius) and new combinations of what is seen; which, was fixed before
-anything was trained or tuned on them. Wrong sensors and very late cars came last, and are held out.
+anything was trained or tuned on them. Wrong sensors, very late cars and calibrated people came last, and are
+held out.
 """
 
 from dataclasses import dataclass, field
@@ -31,6 +32,9 @@ LATE, VERY_LATE = {"lag": 0.3, "delay": 0.2}, {"lag": 0.5, "delay": 0.5}
 WRONG = {"gap_error": 0.5, "speed_error": 0.3}
 UNSURE: dict[str, Any] = {"sensors": {**WRONG, "dropout": 0.1}, "safety": WRONG}
 """sensors that err, and lose a tenth of the readings; the filter allows for it"""
+NGSIM: dict[str, Any] = {"population": "unjam:ngsim"}
+ASTAZERO: dict[str, Any] = {"population": "unjam:astazero"}
+"""people each of whom drives as somebody did who was recorded; on the on-ramp with what they can carry"""
 
 
 @dataclass(frozen=True)
@@ -88,6 +92,16 @@ FAMILY: dict[str, FamilyRoad] = {
     "one-lane-10": FamilyRoad("on-ramp-1", {"cav_share": 0.1}, "axis"),
     "ring-22-very-late": FamilyRoad("ring", ring_changes(22, 1, GROWN, actuator=VERY_LATE), "axis"),
     "ring-22-unsure": FamilyRoad("ring", ring_changes(22, 1, GROWN, **UNSURE), "axis"),
+    "ring-22-ngsim": FamilyRoad("ring", ring_changes(22, 1, GROWN, **NGSIM), "axis"),
+    "ring-22-astazero": FamilyRoad("ring", ring_changes(22, 1, GROWN, **ASTAZERO), "axis"),
+    "figure-eight-ngsim": FamilyRoad("figure-eight", NGSIM, "axis"),
+    "figure-eight-astazero": FamilyRoad("figure-eight", ASTAZERO, "axis"),
+    "on-ramp-10-ngsim": FamilyRoad(
+        "on-ramp", {"cav_share": 0.1, "inflow": 2600.0, "ramp_flow": 400.0, **NGSIM}, "axis"
+    ),
+    "on-ramp-10-astazero": FamilyRoad(
+        "on-ramp", {"cav_share": 0.1, "inflow": 2200.0, "ramp_flow": 350.0, **ASTAZERO}, "axis"
+    ),
 }
 """every road by name"""
 

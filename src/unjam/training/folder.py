@@ -22,6 +22,7 @@ from unjam.manifest import manifest, package_versions
 from unjam.processes import LOCK, owned
 from unjam.reports.results import read_progress
 from unjam.scenarios import scenario_recipe
+from unjam.scenarios.population import population_file
 from unjam.scenarios.scenario import Scenario
 from unjam.training.config import RunConfig, load_config, read_toml, to_toml
 from unjam.worlds.reward import make_reward
@@ -317,5 +318,5 @@ def _files(road: RunConfig, task: Task) -> dict[str, str]:
         own = read_sumo_files(Path(scenario.file))
         paths += [own.path, own.network, *own.additional_files, *own.route_files]
     if scenario.population:
-        paths.append(Path(scenario.population))
+        paths.append(population_file(scenario.population))
     return found | {str(path): hash_of(path.read_bytes()) for path in paths}
