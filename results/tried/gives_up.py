@@ -1,8 +1,8 @@
 """Who shall drive on a figure eight where no queue holds: laws beside each other among other people.
 
-`python results/tried/gives_up.py` writes gives-up.json beside itself, in some ten minutes: for each road the
-mean speed of all in the second half of the episode with people alone, with who leads a queue, and with each law
-that follows when the queue did not hold; and in how many episodes it did not. Seeds are tuning ones.
+`python results/tried/gives_up.py` writes gives-up.json beside itself, in some ten minutes: for each road
+the mean speed of all in the second half of the episode with people alone, with who leads a queue, and with
+each law that follows when the queue did not hold; and in how many episodes it did not. Tuning seeds.
 """
 
 from pathlib import Path
