@@ -11,6 +11,7 @@ from rich.console import Console
 from unjam.cli import output
 from unjam.cli.train import _Progress
 from unjam.measures.metrics import METRICS
+from unjam.measures.statistics import estimate
 from unjam.training import evaluate
 from unjam.training.config import RunConfig
 
@@ -49,6 +50,31 @@ def test_where_there_is_room_all_drivers_stand_in_one_table(monkeypatch: pytest.
 
 def test_a_driver_by_itself_is_compared_with_nobody(monkeypatch: pytest.MonkeyPatch) -> None:
     assert printed(monkeypatch, 120, ("pi",))[0].split() == ["metric", "unit", "pi"]
+
+
+def test_of_several_roads_the_one_is_named_on_which_a_training_gains_least(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    text = StringIO()
+    monkeypatch.setattr(output, "aside", Console(file=text, width=200))
+    monkeypatch.setattr(sys.modules[_Progress.__module__], "aside", output.aside)
+    row = {"iteration": 1, "actual_steps": 10, "return_mean": 5.0, "return_expert": 4.0}
+    roads = {"ring": {"return_validation": 9.0, "return_expert": 3.0}, "eight": {"return_validation": 1.0}}
+    roads["eight"]["return_expert"] = 4.4
+    with _Progress(RunConfig(steps=30), Path("run")) as shown:
+        shown.iteration({**row, "return_validation": 6.0, "tasks": roads})
+        shown.iteration({**row, "iteration": 11, "return_validation": None, "tasks": {}})
+    said = "return 5, validation 6 (expert 4; least beyond it on eight: -3)"
+    assert [line.partition("steps, ")[2] for line in text.getvalue().splitlines()] == [said, said]
+
+
+def test_after_a_training_of_several_roads_it_is_the_whole_run_that_goes_on(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    text = StringIO()
+    monkeypatch.setattr(output, "aside", Console(file=text, width=200))
+    output.after_training(Path("runs/all/ring"), estimate([0.0, 0.0]), 100, Path("runs/all"))
+    assert "unjam train --resume runs/all --steps 200" in text.getvalue()
 
 
 def test_the_judgement_after_a_training_shows_how_far_it_is(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -177,10 +177,13 @@ def _command_without_out() -> list[str]:
     return [word for word in words if not word.startswith("--out=")]
 
 
-def after_training(folder: Path, gain: "Estimate | None", steps: int) -> None:
-    """Ship what gained, train on what did not; a single held-out seed shows nothing."""
+def after_training(folder: Path, gain: "Estimate | None", steps: int, run: Path) -> None:
+    """Ship what gained, train on what did not; a single held-out seed shows nothing.
+
+    `folder` is a road's, `run` that of the training: the same, where it is of one road.
+    """
     if gain is not None and not gain.low > 0:
-        say_next("no gain is shown; train longer", "train", "--resume", folder, "--steps", 2 * steps)
+        say_next("no gain is shown; train longer", "train", "--resume", run, "--steps", 2 * steps)
     else:
         say_next("ship it", "export", folder, "--to", f"{folder.name}.unjam")
 

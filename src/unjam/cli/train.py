@@ -126,7 +126,8 @@ def train(
         judged = read_results(of.folder)
         console.print(lead_of(judged), soft_wrap=True)
         aside.print(f"controller: {of.controller}")
-        after_training(of.folder, of.gain, max(config.steps, judged.progress[-1]["actual_steps"]))
+        steps = max(config.steps, judged.progress[-1]["actual_steps"])
+        after_training(of.folder, of.gain, steps, result.folder)
     aside.print(f"report: {result.report}")
 
 
@@ -137,7 +138,7 @@ class _Progress(Counted):
         super().__init__(f"training into {folder}", "steps", config.steps)
         self._config, self._folder = config, folder
         self._steps = config.steps
-        self._validated = "-"
+        self._validated, self._worst = "-", ""
         self._judged: dict[tuple[str, int], int] = {}
         self._to_judge = 0
 
@@ -145,8 +146,9 @@ class _Progress(Counted):
         """Show a row of progress."""
         if row["return_validation"] is not None:
             self._validated = f"{row['return_validation']:.0f}"
+            self._worst = _worst_of(row.get("tasks", {}))
         expert = f"expert {row['return_expert']:.0f}"
-        words = f"return {row['return_mean']:.0f}, validation {self._validated} ({expert})"
+        words = f"return {row['return_mean']:.0f}, validation {self._validated} ({expert}{self._worst})"
         steps = row["actual_steps"]
         self._bar.update(self._task, completed=steps, description=words)
         if self._plain and (row["iteration"] % LINE_EVERY == 1 or steps >= self._steps):
@@ -165,6 +167,15 @@ class _Progress(Counted):
                 aside.print(JUDGING)
         self._judged[episode] = steps
         self(sum(self._judged.values()), self._to_judge)
+
+
+def _worst_of(roads: dict[str, dict[str, Any]]) -> str:
+    """Return in words on which of several roads a validation is least beyond the expert; nothing of one."""
+    beyond = {road: row["return_validation"] - row["return_expert"] for road, row in roads.items()}
+    if not beyond:
+        return ""
+    worst = min(beyond, key=beyond.__getitem__)
+    return f"; least beyond it on {worst}: {beyond[worst]:+.0f}"
 
 
 @with_options(asked=asked_run)
