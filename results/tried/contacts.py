@@ -1,7 +1,7 @@
 """How often people of NGSIM run into each other on a figure eight: alone, and with whom among them.
 
 `python results/tried/contacts.py` writes contacts.json beside itself, in a minute: for each driver in how
-many episodes of tuning seeds anybody touched, of how many, and the mean speed of all in the second half [m/s].
+many episodes of tuning seeds anybody touched, of how many, and the mean speed in the second half [m/s].
 """
 
 from functools import partial
