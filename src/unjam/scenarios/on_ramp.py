@@ -119,13 +119,7 @@ class OnRamp(Scenario):
         for name, flow in (("ramp_flow", self.ramp_flow), ("calm_ramp_flow", self.calm_ramp_flow)):
             if flow >= 3600.0 / RAMP_HEADWAY:
                 raise ValueError(f"{name}: {flow:g} is not allowed; allowed: < {3600.0 / RAMP_HEADWAY:.0f}")
-        if self.calibrated and self.calibrated.residual is not None:
-            raise ValueError(
-                "population: one with a residual network is not allowed on the on-ramp: SUMO's own "
-                "IDM drives people there"
-            )
-        if self.human_control != "native":
-            raise ValueError("human_control: 'commanded' is not allowed on the on-ramp; allowed: 'native'")
+        self.check_people_are_native("on the on-ramp")
         return self
 
     def draw(self, generator: np.random.Generator) -> MotorwayRoad:

@@ -79,17 +79,9 @@ class OwnNetwork(Scenario):
                 raise ValueError("cav_share: 0.0 is not allowed without cav_types; allowed: > 0, <= 1")
             if not any(is_car(files.types.get(name, {})) for name in files.used_types):
                 raise ValueError(f"cav_share: no vehicle is a car; its types are {known}; name cav_types")
-        if self.calibrated and self.calibrated.residual is not None:
-            raise ValueError(
-                "population: one with a residual network is not allowed on your own network: SUMO's "
-                "own IDM drives them there"
-            )
+        self.check_people_are_native("on your own network")
         if self.population and not passenger_types(files):
             raise ValueError(f"population: no vehicle is a passenger car; its types are {known}")
-        if self.human_control != "native":
-            raise ValueError(
-                "human_control: 'commanded' is not allowed on your own network; allowed: 'native'"
-            )
         return self
 
     def draw(self, generator: np.random.Generator) -> OwnRoad:

@@ -171,6 +171,16 @@ class Scenario:
         population = self.calibrated
         return population.fastest if population else self.humans.desired_speed
 
+    def check_people_are_native(self, where: str) -> None:
+        """Raise `ValueError` unless SUMO itself can drive these people, as it must `where` this is."""
+        if self.calibrated and self.calibrated.residual is not None:
+            raise ValueError(
+                f"population: one with a residual network is not allowed {where}: SUMO's own IDM drives them "
+                "there"
+            )
+        if self.human_control != "native":
+            raise ValueError(f"human_control: 'commanded' is not allowed {where}; allowed: 'native'")
+
     def draw_people(self, names: Sequence[str], generator: np.random.Generator) -> dict[str, IDMParameters]:
         """Return who drives which vehicle; nobody where all drive as `humans` says."""
         population = self.calibrated
