@@ -12,7 +12,8 @@ import numpy as np
 
 from unjam.controller import make_driver
 from unjam.drivers.driver import Driver
-from unjam.drivers.while_gathered import BROKEN, GATHERED, WhileGathered
+from unjam.drivers.road_experts import BROKEN, GATHERED
+from unjam.drivers.while_gathered import WhileGathered
 from unjam.files import to_json, write_whole
 from unjam.manifest import manifest
 from unjam.measures.metrics import measure

@@ -11,7 +11,8 @@ from unjam.drivers import Constant, PISaturation, check_driver
 from unjam.drivers.driver import single_row
 from unjam.drivers.local_state import EVERYWHERE, LocalState, like_ones
 from unjam.drivers.registry import driver_from_recipe, recipe_of
-from unjam.drivers.while_gathered import BROKEN, GATHERED, PATIENCE, WhileGathered
+from unjam.drivers.road_experts import BROKEN, GATHERED
+from unjam.drivers.while_gathered import PATIENCE, WhileGathered
 from unjam.measures.metrics import measure
 from unjam.physics.idm import IDMParameters
 from unjam.scenarios import FigureEight

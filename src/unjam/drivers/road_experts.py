@@ -17,6 +17,8 @@ from unjam.physics.arrays import Array, as_column, at_least, namespace
 
 Harmonics = tuple[float, ...]
 Share = Annotated[float, Field(ge=0, lt=1)]
+GATHERED, BROKEN = 0.5, 0.45
+"""shares of the lap that are free ahead: once all have gathered behind, and when their queue is broken"""
 SLOWEST_PACE = 1.0
 """[m/s]: whoever stands still never gathers anybody"""
 SEEN = 60.0
@@ -33,7 +35,7 @@ Section = Annotated[int, Field(ge=0, lt=SECTIONS_AHEAD)]
 
 def _tuned(harmonics: Harmonics, gain: float, wanted_gap: float) -> dict[str, Any]:
     """Return the fields of a tuned pacer; all gather until half the lap is free."""
-    gathering = {"gathering_gap": 0.5, "regathering_gap": 0.45}
+    gathering = {"gathering_gap": GATHERED, "regathering_gap": BROKEN}
     return {"harmonics": harmonics, "gain": gain, "wanted_gap": wanted_gap, **gathering}
 
 

@@ -7,13 +7,12 @@ import numpy as np
 
 from unjam.drivers.driver import Driver, Memory, Recipe
 from unjam.drivers.local_state import LocalState
+from unjam.drivers.road_experts import BROKEN, GATHERED
 from unjam.drivers.wrappers import Wrapper
 from unjam.parameters import Positive
 from unjam.physics.arrays import Array, namespace
 from unjam.tree import mapped
 
-GATHERED, BROKEN = 0.5, 0.45
-"""shares of the lap that are free ahead: once all have gathered behind, and when their queue is broken"""
 PATIENCE = 30.0
 """time in which all gather, where their queue fits [s]"""
 LEADING, OTHERWISE = "leading", "otherwise"
