@@ -130,6 +130,12 @@ def test_the_verdict_names_what_is_better_and_what_is_worse() -> None:
     assert later.endswith("and more wrong in gap of the follower (by 200\u00a0%).")
 
 
+def test_a_base_that_knows_a_number_exactly_is_left_behind_by_no_share() -> None:
+    facts = facts_of()
+    facts["one_step"]["speed"] = {"base": 0.0, "model": 0.002, "change": 0.01}
+    assert f"more wrong in {NUMBERS['speed'][0]}, " in verdict_of(facts)
+
+
 def test_a_model_that_is_its_base_is_as_wrong() -> None:
     facts = facts_of()
     for found in (*facts["one_step"].values(), *facts["replay"]["numbers"].values()):

@@ -106,7 +106,9 @@ def verdict_of(facts: dict[str, Any]) -> str:
             base, model = row[f"{prefix}base"], row[f"{prefix}model"]
             if base is None or max(base, model) < NOTHING:
                 continue
-            change = f"{row['number']} (by {100 * abs(1.0 - model / base):.0f}\u00a0%)"
+            change = row["number"]
+            if base >= NOTHING:  # a base that knows it exactly is left behind by no share
+                change += f" (by {100 * abs(1.0 - model / base):.0f}\u00a0%)"
             if model < 0.98 * base:
                 better.append(change)
             elif model > 1.02 * base:
