@@ -1,8 +1,8 @@
 """What a roadside or cloud service tells of the road: mean speeds by lane and section, late and smoothed."""
 
 from collections import deque
-from math import exp
-from typing import Annotated
+from math import exp, prod
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,27 +51,33 @@ class Messages:
 class MainRoad:
     """The sections of a main road and of its ramps by way, and which of them lie ahead."""
 
-    def __init__(self, ways: int, length: float) -> None:
-        """Cut a road of a length [m] into sections; way 0 is the ramp's."""
-        self._shape = ways, int(np.ceil(length / SECTION))
+    def __init__(self, ways: int, length: float, roads: int = 1) -> None:
+        """Cut roads that are alike, of a length [m], into sections; way 0 is the ramp's."""
+        self._shape = roads, ways, int(np.ceil(length / SECTION))
 
-    def means(self, ways: NDArray[np.intp], places: Floats, speeds: Floats, allowed: float) -> Floats:
-        """Return mean speeds by way and section, in the last row of all ways of the main road [m/s].
+    def means(
+        self, ways: NDArray[np.intp], places: Floats, speeds: Floats, allowed: float, roads: Any = 0
+    ) -> Floats:
+        """Return mean speeds by road, way and section, in the last row of all ways of a main road [m/s].
 
         A section where nobody is counts as `allowed`, and so do those behind the end. Arrays of shape
-        (vehicles,): the way that each is on, its place along the road [m], its speed.
+        (vehicles,): the way that each is on, its place along the road [m], its speed, and which road it is.
         """
-        rows, sections = self._shape
-        cell = ways * sections + (places // SECTION).astype(np.intp).clip(0, sections - 1)
-        count, total = (np.bincount(cell, weight, rows * sections) for weight in (None, speeds))
+        _, rows, sections = self._shape
+        section = (places // SECTION).astype(np.intp).clip(0, sections - 1)
+        cell = (roads * rows + ways) * sections + section
+        count, total = (np.bincount(cell, weight, prod(self._shape)) for weight in (None, speeds))
         # the last row is of all ways of the main road, which are those from 1 on
         count, total = (each.reshape(self._shape).astype(np.float64) for each in (count, total))
-        count, total = (np.vstack([each, each[1:].sum(0)]) for each in (count, total))
+        count, total = (np.hstack([each, each[:, 1:].sum(1, keepdims=True)]) for each in (count, total))
         mean = np.where(count > 0, total / count.clip(1), allowed)
-        return np.pad(mean, ((0, 0), (0, SECTIONS_AHEAD)), constant_values=allowed)
+        return np.pad(mean, ((0, 0), (0, 0), (0, SECTIONS_AHEAD)), constant_values=allowed)
 
-    def ahead(self, means: Floats, ways: NDArray[np.intp], places: Floats) -> tuple[Floats, Floats]:
+    def ahead(
+        self, means: Floats, ways: NDArray[np.intp], places: Floats, roads: Any = 0
+    ) -> tuple[Floats, Floats]:
         """Return the means of the sections ahead, on the own way and on the whole main road: (n, ahead)."""
-        first = (places // SECTION).astype(np.intp).clip(0, self._shape[1] - 1)
+        first = (places // SECTION).astype(np.intp).clip(0, self._shape[-1] - 1)
         columns = first[:, None] + np.arange(SECTIONS_AHEAD)
-        return means[ways[:, None], columns], means[-1][columns]
+        road = np.broadcast_to(roads, ways.shape)[:, None]
+        return means[road, ways[:, None], columns], means[road, -1, columns]

@@ -19,6 +19,12 @@ MOVING_SPEED = 1.0
 """speed above which a time headway is a matter of safety [m/s]"""
 SHORT_HEADWAY = 1.0
 """[s]"""
+PEOPLE, CAV, CAV_CUT_IN = 0, 1, 2
+"""whose braking it is; the last: of a CAV just after somebody else came before it"""
+CUT_IN = 3.0
+"""time after a change of leader in which braking is counted apart [s]"""
+SETTLED = 5.0
+"""time behind the same leader after which headways are a car's own choice [s]"""
 NOTED_AT_ONCE = 1000
 """steps that are counted together: one by one takes longer than they take to drive"""
 

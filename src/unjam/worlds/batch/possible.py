@@ -1,16 +1,19 @@
-"""Which closed roads a batch steps as SUMO does, and which of them together."""
+"""Which roads a batch steps as SUMO does, and which of them together."""
 
 from collections.abc import Sequence
 from dataclasses import fields
 
 from unjam.errors import InputError
 from unjam.scenarios.figure_eight import FigureEight
+from unjam.scenarios.on_ramp import OnRamp
 from unjam.scenarios.ring import Loop, Ring
 from unjam.scenarios.scenario import Scenario
 from unjam.worlds.batch.lanes import LOOK_AHEAD
 
 LONGEST_STEP = 0.37
 """simulation step up to which SUMO's IDM makes one step of it [s]"""
+MOTORWAY_STEP = 0.5
+"""of the motorways, in which drivers think twice [s]"""
 
 
 def why_not(scenario: Scenario) -> str:
@@ -26,8 +29,11 @@ def statistical_why_not(scenario: Scenario) -> str:
     """Return why a scenario can be stepped in no batch; empty where it can, if only statistically.
 
     Of a figure eight all but a few steps in a million are SUMO's, as far as that was tried. Its right of way
-    is decisions, and one that turns makes another queue: whole episodes are alike in distribution alone.
+    is decisions, and one that turns makes another queue: whole episodes are alike in distribution alone. On
+    on-ramps people follow as SUMO's do, but change lanes all at once and err by other numbers.
     """
+    if isinstance(scenario, OnRamp):
+        return _why_not_on_ramp(scenario)
     if not isinstance(scenario, FigureEight):
         return why_not(scenario)
     if scenario.human_control != "commanded":
@@ -43,6 +49,20 @@ def statistical_why_not(scenario: Scenario) -> str:
     return _why_not_driven(scenario)
 
 
+def _why_not_on_ramp(scenario: OnRamp) -> str:
+    if scenario.actuation != "cruise" or scenario.safety.active:
+        return (
+            "actuation: CAVs have no ACC of their own that follows alone; allowed: cruise, without a filter"
+        )
+    if scenario.simulation_step != MOTORWAY_STEP:
+        return f"simulation_step: {scenario.simulation_step:g} s; allowed: {MOTORWAY_STEP:g} s"
+    if not scenario.sensors.exact or not scenario.actuator.instant:
+        return "sensors and actuator: CAVs misread, or obey late; allowed: exact ones that obey at once"
+    if scenario.roadside.loss > 0:
+        return f"roadside.loss: {scenario.roadside.loss:g}; allowed: 0"
+    return ""
+
+
 def _why_not_driven(scenario: Scenario) -> str:
     exact = scenario.actuation == "raw" or (scenario.actuation == "shielded" and scenario.safety.active)
     if not exact:
@@ -52,13 +72,14 @@ def _why_not_driven(scenario: Scenario) -> str:
     return ""
 
 
-def alike(one: Loop, other: Loop) -> bool:
+def alike(one: Scenario, other: Scenario) -> bool:
     """Return whether roads differ in their sizes alone, so that they can be stepped together."""
-    shared = (each.name for each in fields(one) if each.name != one.size)
+    size = one.size if isinstance(one, Loop) else ""
+    shared = (each.name for each in fields(one) if each.name != size)
     return type(one) is type(other) and all(getattr(one, name) == getattr(other, name) for name in shared)
 
 
-def check_together(roads: Sequence[Loop], statistical: bool) -> None:
+def check_together(roads: Sequence[Scenario], statistical: bool) -> None:
     """Raise `InputError` where roads cannot be stepped together; exactly, or `statistical` too."""
     why_none = statistical_why_not if statistical else why_not
     for road in roads:

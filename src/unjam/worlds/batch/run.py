@@ -1,4 +1,4 @@
-"""Episodes of many rings at once, instead of one after the other in SUMO."""
+"""Episodes of many roads at once, instead of one after the other in SUMO."""
 
 from collections.abc import Callable, Sequence
 from typing import cast
@@ -8,11 +8,13 @@ import numpy as np
 from unjam.drivers.driver import Driver, Memory
 from unjam.drivers.residual import AGE
 from unjam.errors import InputError
+from unjam.scenarios.on_ramp import OnRamp
 from unjam.scenarios.ring import Loop
 from unjam.tree import mapped
 from unjam.worlds.batch.begun import Begun, BegunRings
+from unjam.worlds.batch.motorway_world import MotorwayBatch
 from unjam.worlds.batch.noise import Numbers
-from unjam.worlds.batch.possible import alike, statistical_why_not, why_not
+from unjam.worlds.batch.possible import alike, check_together, statistical_why_not, why_not
 from unjam.worlds.batch.record import Rings
 from unjam.worlds.batch.world import RingBatch
 from unjam.worlds.drive import Drive, driven_to_the_end
@@ -26,6 +28,8 @@ _Ring = tuple[Loop, tuple[int, ...], frozenset[str]]
 BEGUN = BegunRings[_Ring]()
 MOST = 128
 """rings that are stepped at once at most, where whole episodes are kept: some 130 MB for 22 vehicles each"""
+MOST_MOTORWAYS = 64
+"""motorways, likewise: some 40 MB each"""
 
 
 def begin(
@@ -61,7 +65,7 @@ def run_batch(
     """Return the episodes of tasks, as `run_episode` does in SUMO, but for rounding; all are stepped at once.
 
     Args:
-        tasks: rings that differ in length and seed alone.
+        tasks: roads that differ in length and seed alone.
         numbers: makes the arrays that are stepped.
         coming: tasks that will follow, alike; they are warmed up beforehand where these have to be.
         statistical: whether roads are allowed whose episodes are SUMO's in distribution alone.
@@ -72,13 +76,26 @@ def run_batch(
     first = tasks[0]
     if any(_driven(each) != _driven(first) for each in tasks):
         raise InputError("batch: the tasks differ in driver, reward or exploration, or want fuel")
+    earned = make_reward(first.reward or first.scenario.reward)
+    return [rewarded(episode, earned) for episode in _driven_at_once(tasks, numbers, coming, statistical)]
+
+
+def _driven_at_once(
+    tasks: Sequence[EpisodeTask], numbers: Numbers, coming: Sequence[EpisodeTask], statistical: bool
+) -> Sequence[Episode]:
+    """Return the episodes of tasks, without what was earned; arguments as of `run_batch`."""
+    first = tasks[0]
+    if isinstance(first.scenario, OnRamp):
+        check_together([task.scenario for task in tasks], statistical)
+        motorways = MotorwayBatch(first.scenario, [task.seed for task in tasks])
+        motorways.asked = first.driver.asks
+        return driven_to_the_end(Drive(motorways, first.driver, first.explore))
     scenarios, seeds = [cast(Loop, each.scenario) for each in tasks], [each.seed for each in tasks]
     world = RingBatch(scenarios, seeds, numbers, first.reward, statistical=statistical)
     if world.scenario.warmup > 0:
         world.begun = BEGUN.of([_ring(task) for task in tasks], [_ring(task) for task in coming], _warm_up)
     rings: Rings = driven_to_the_end(begin(world, first.driver, numbers, first.explore))
-    earned = make_reward(first.reward or first.scenario.reward)
-    return [rewarded(episode, earned) for episode in rings.episodes]
+    return rings.episodes
 
 
 def _ring(task: EpisodeTask) -> _Ring:
@@ -99,13 +116,14 @@ def _warm_up(rings: Sequence[_Ring]) -> dict[_Ring, Begun]:
 def run_batches(
     tasks: Sequence[EpisodeTask], coming: Sequence[EpisodeTask] = (), statistical: bool = False
 ) -> list[Episode]:
-    """Return the episodes of tasks on rings of any kinds, in their order; those that are alike at once.
+    """Return the episodes of tasks on roads of any kinds, in their order; those that are alike at once.
 
     `coming` are tasks that will follow, of any kinds; see `run_batch`, of `statistical` too.
     """
     batches: list[dict[int, EpisodeTask]] = []
     for index, task in enumerate(tasks):
-        fits = (batch for batch in batches if len(batch) < MOST and _alike(task, next(iter(batch.values()))))
+        most = MOST_MOTORWAYS if isinstance(task.scenario, OnRamp) else MOST
+        fits = (batch for batch in batches if len(batch) < most and _alike(task, next(iter(batch.values()))))
         batch = next(fits, None)
         if batch is None:
             batches.append(batch := {})
@@ -144,4 +162,4 @@ def _driven(task: EpisodeTask) -> tuple[Driver, str, bool]:
 
 
 def _alike(one: EpisodeTask, other: EpisodeTask) -> bool:
-    return _driven(one) == _driven(other) and alike(cast(Loop, one.scenario), cast(Loop, other.scenario))
+    return _driven(one) == _driven(other) and alike(one.scenario, other.scenario)

@@ -14,20 +14,14 @@ from numpy.typing import NDArray
 
 from unjam.drivers.command import Command, time_headways
 from unjam.physics.idm import IDMParameters, desired_speed_for
-from unjam.worlds.audit import SHORT_HEADWAY, Audit, following
+from unjam.worlds.audit import CAV, CAV_CUT_IN, CUT_IN, PEOPLE, SETTLED, SHORT_HEADWAY, Audit, following
 from unjam.worlds.record import Floats, Trajectory
-from unjam.worlds.sumo.open import CAV, PEOPLE, OpenTraffic
+from unjam.worlds.sumo.open import OpenTraffic
 from unjam.worlds.sumo.traffic import OpenKind
 from unjam.worlds.world import OnProgress
 
-CUT_IN = 3.0
-"""time after a change of leader in which braking is counted apart [s]"""
-SETTLED = 5.0
-"""time behind the same leader after which headways are a car's own choice [s]"""
 SLOWEST = 0.1
 """set speed below which SUMO has none [m/s]"""
-CAV_CUT_IN = 2
-"""whose braking it is, beside PEOPLE and CAV"""
 
 
 class Followed(NamedTuple):

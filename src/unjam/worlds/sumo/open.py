@@ -11,15 +11,12 @@ from unjam.drivers.command import Command
 from unjam.drivers.local_state import LocalState
 from unjam.drivers.safety import Ahead
 from unjam.physics.kinematics import next_speed
-from unjam.worlds.audit import SHIELD_ROUNDING, Audit, BrakingLog, Following, following
+from unjam.worlds.audit import CAV, PEOPLE, SHIELD_ROUNDING, Audit, BrakingLog, Following, following
 from unjam.worlds.record import Episode, Floats, Trajectory
 from unjam.worlds.sumo.log import TrafficLog
 from unjam.worlds.sumo.stays import StayLog
 from unjam.worlds.sumo.traffic import OpenKind, Scene, Traffic
 from unjam.worlds.world import Driven, OnProgress
-
-PEOPLE, CAV = 0, 1
-"""whose braking it is"""
 
 
 class OpenTraffic(Traffic[OpenKind]):

@@ -1,0 +1,248 @@
+"""W motorways that a ramp joins as one world to drive in: CAVs hold their own ACCs back, as in SUMO.
+
+Rows of CAVs are in the order in which they entered, whatever their road.
+"""
+
+from collections.abc import Collection, Sequence
+from typing import cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from unjam.drivers.command import Command, accelerations_of_many, time_headways
+from unjam.drivers.local_state import BESIDE, LARGEST_GAP, SECTIONS_AHEAD, LocalState
+from unjam.drivers.roadside import MainRoad, Messages
+from unjam.physics.arrays import Floats
+from unjam.physics.idm import IDMParameters, desired_speed_for
+from unjam.physics.kinematics import next_speed
+from unjam.scenarios.on_ramp import OnRamp
+from unjam.scenarios.road import MotorwayRoad
+from unjam.worlds.batch.lanes import CONTACT
+from unjam.worlds.batch.motorway import UNCAPPED, Motorways
+from unjam.worlds.batch.motorway_record import MotorwayLog
+from unjam.worlds.batch.vehicles import Vehicles, around, chosen
+from unjam.worlds.record import Episode
+from unjam.worlds.world import Driven, OnProgress
+
+SLOWEST = 0.1
+"""set speed below which SUMO has none [m/s]"""
+PER_ROAD = 100_000
+"""more than want to enter a road in an episode"""
+
+
+class MotorwayBatch:
+    """W on-ramps of the same kind, each with a seed of its own; alike SUMO's in distribution."""
+
+    single = False
+    asked: Collection[str] = ()
+    """fields of a `LocalState` that the driver looks at"""
+    kept: Sequence[int] | None = None
+
+    def __init__(self, scenario: OnRamp, seeds: Sequence[Sequence[int]], kind: type = np.float64) -> None:
+        """Take empty roads, one for each seed; numbers have the precision `kind`."""
+        self.scenario, self._seeds = scenario, seeds
+        drawn = [scenario.of_seed(seed) for seed in seeds]
+        self.roads = [cast(MotorwayRoad, road) for road, _ in drawn]
+        self._people = [np.random.default_rng(noise) for _, (noise, *_) in drawn]
+        self._exploration = [np.random.default_rng(seed) for _, (_, seed, *_) in drawn]
+        self._kind, step = kind, self.scenario.simulation_step
+        self._traffic = Motorways(self.roads, step, self._drawn, lambda values: values.astype(kind))
+        entries = max(len(road.entries) for road in self.roads)
+        self._is_cav = np.zeros((len(drawn), entries), bool)
+        for number, road in enumerate(self.roads):
+            self._is_cav[number, : len(road.entries)] = [entry.name in road.cav_ids for entry in road.entries]
+        ways, road = len(self.roads[0].ways), self.roads[0]
+        self._main_road = MainRoad(ways, road.length, len(drawn))
+        self._messages = Messages(road.roadside, self.scenario.decision_step, self._people[0])
+        self.limits, self.decisions, self.entered = self.scenario.limits, 0, 0
+        self._cavs: NDArray[np.intp] = np.zeros(0, np.intp)
+        """road and entry of each CAV as one number, in order of entry"""
+        self._came = np.zeros(len(drawn))
+        """CAVs that have entered each road"""
+        self._controlled = False
+        self._log = MotorwayLog(self.roads, entries, step, self.scenario.decision_step)
+
+    def _drawn(self, shape: tuple[int, ...]) -> Floats:
+        """Return the errors of all vehicles in this step: each road draws its own."""
+        counts = np.bincount(self._traffic.vehicles.road, minlength=len(self.roads))
+        drawn = [
+            generator.standard_normal((shape[0], count))
+            for generator, count in zip(self._people, counts.tolist(), strict=True)
+        ]
+        return np.concatenate(drawn, 1).astype(self._kind)
+
+    def start(self, controlled: bool, on_progress: OnProgress | None = None) -> None:
+        """Begin with empty roads; nothing was before."""
+        self._controlled = controlled
+        self._look()
+
+    @property
+    def rows(self) -> int:
+        """CAVs on the roads now."""
+        return len(self._cavs)
+
+    @property
+    def ended(self) -> bool:
+        """Whether the horizon is reached."""
+        return self.decisions >= self.scenario.horizon
+
+    def perceive(self) -> LocalState:
+        """Return what the CAVs perceive now: arrays of shape (CAVs,)."""
+        return self._perceived
+
+    def advance(self, command: Command | None) -> None:
+        """Simulate one decision, held over its steps; None: the CAVs stay human."""
+        scenario, before = self.scenario, self._perceived.speed
+        wanted = None
+        if self._controlled:
+            wanted = accelerations_of_many(command, self.limits, self.rows, self.decisions)
+            self._ask_for_headways(command)
+        for _ in range(scenario.steps_per_decision):
+            if wanted is not None:
+                self._hold_back(np.asarray(wanted, np.float64))
+            left = self._traffic.step()
+            vehicles = self._traffic.vehicles
+            self._log.note_step(vehicles, left, self._rows_of_cavs(vehicles), self._controlled)
+        self.decisions += 1
+        self._look()
+        after, kept = before.copy(), slice(len(before)) if self.kept is None else self.kept
+        after[kept] = self._perceived.speed[: len(after[kept])]
+        self._log.note_applied((after - before) / scenario.decision_step)
+
+    def _ask_for_headways(self, command: Command | None) -> None:
+        if command is None or command.time_headway is None:
+            return
+        names = [str(number) for number in self._cavs]
+        least = self.scenario.cruise.time_headway
+        headways = time_headways(command, least, names, self.decisions)
+        self._traffic.vehicles.time_headway[self._rows_of_cavs(self._traffic.vehicles)] = headways
+
+    def _hold_back(self, wanted: Floats) -> None:
+        """Give each CAV a set speed, or none where its ACC may drive as it likes or a lane closes."""
+        vehicles, cruise, step = self._traffic.vehicles, self.scenario.cruise, self.scenario.simulation_step
+        found = self._rows_of_cavs(vehicles)
+        there = found >= 0
+        rows, wanted = found[there], wanted[there]
+        speed, stretch = vehicles.speed[rows].astype(np.float64), self._traffic.stretch
+        told = next_speed(speed, wanted, step)
+        asked = (told - speed) / step
+        most = min(self.limits.highest, cruise.acceleration) - 1e-6
+        place = vehicles.place[rows]
+        held = (asked < most) & ~((place >= stretch.merge) & (place < stretch.closes))
+        acc = IDMParameters(max_acceleration=cruise.acceleration)
+        faster = desired_speed_for(np.where(held, asked, 0.0), speed, acc)
+        cap = np.where(asked <= 0.0, told, np.maximum(told, faster)).clip(SLOWEST, None)
+        vehicles.cap[rows] = np.where(held, cap, UNCAPPED)
+
+    def _rows_of_cavs(self, vehicles: Vehicles) -> NDArray[np.intp]:
+        """Return the row of each CAV among vehicles; -1 where it has left."""
+        keys = vehicles.road * PER_ROAD + vehicles.entry
+        order = keys.argsort()
+        found = (
+            order[np.searchsorted(keys[order], self._cavs).clip(0, max(len(keys) - 1, 0))] if len(keys) else 0
+        )
+        if not len(keys):
+            return np.full(len(self._cavs), -1)
+        return np.where(keys[found] == self._cavs, found, -1)
+
+    def _look(self) -> None:
+        """Note who is where after a decision, and take control of the CAVs that have entered."""
+        vehicles = self._traffic.vehicles
+        there = self._rows_of_cavs(vehicles) >= 0
+        keys = vehicles.road * PER_ROAD + vehicles.entry
+        chosen_ones = np.flatnonzero(self._is_cav[vehicles.road, vehicles.entry])
+        new = chosen_ones[~np.isin(keys[chosen_ones], self._cavs)]
+        new = new[np.argsort(keys[new], kind="stable")]
+        self.kept = np.flatnonzero(there).tolist() if len(new) or not there.all() else None
+        self._cavs = np.concatenate([self._cavs[there], keys[new]])
+        self.entered += len(new)
+        if self._controlled and len(new):
+            self._take_control(vehicles, new)
+        self._came += np.bincount(vehicles.road[new], minlength=len(self.roads))
+        means = self._main_road.means(
+            vehicles.way, vehicles.place, vehicles.speed, self._traffic.stretch.limit, vehicles.road
+        )
+        self._messages.send(means)
+        self._perceived = self._state(vehicles)
+        waiting = self._traffic.waiting.count(self._traffic.now - self.scenario.simulation_step)
+        gaps = self._gaps(vehicles)
+        touched = vehicles.road[gaps < CONTACT]
+        self._log.ends[touched] = np.minimum(self._log.ends[touched], self.decisions)
+        self._log.note_moment(vehicles, gaps, waiting, self._cavs, self._perceived)
+
+    def _take_control(self, vehicles: Vehicles, rows: NDArray[np.intp]) -> None:
+        """Let CAVs' own ACCs drive instead of people."""
+        cruise = self.scenario.cruise
+        vehicles.extended[rows] = False
+        vehicles.time_headway[rows], vehicles.most[rows] = cruise.time_headway, cruise.acceleration
+        vehicles.braking[rows], vehicles.gap[rows] = cruise.deceleration, cruise.gap
+
+    def _gaps(self, vehicles: Vehicles) -> Floats:
+        """Return the gaps of all to those ahead on their ways [m]; NaN where nobody is."""
+        if not len(vehicles.road):
+            return np.zeros(0)
+        row = chosen(around(vehicles, len(self.roads[0].ways)).ahead, vehicles.way)
+        gaps = vehicles.place[row] - self.roads[0].vehicle_length - vehicles.place
+        return np.where(row >= 0, gaps, np.nan)
+
+    def _state(self, vehicles: Vehicles) -> LocalState:
+        """Return what exact sensors of the CAVs would read now."""
+        rows, road = self._rows_of_cavs(vehicles), self.roads[0]
+        if not len(rows):
+            return _nobody()
+        near = around(vehicles, len(road.ways))
+        way, place, speed = vehicles.way[rows], vehicles.place[rows], vehicles.speed[rows]
+
+        def other(neighbours: NDArray[np.intp], beside: int, towards: float) -> tuple[Floats, Floats]:
+            row = chosen(neighbours, vehicles.way + beside)[rows]
+            gap = towards * (vehicles.place[row] - place) - road.vehicle_length
+            there = (row >= 0) & (gap < LARGEST_GAP)
+            return np.where(there, vehicles.speed[row], speed), np.where(there, gap, LARGEST_GAP)
+
+        beside = [
+            other(each, side, sign)
+            for side in (1, -1)
+            for each, sign in ((near.ahead, 1.0), (near.behind, -1.0))
+        ]
+        ramp = (way == 0) & (place < road.merge)
+        allowed = np.where(ramp, self._traffic.stretch.ramp_limit, self._traffic.stretch.limit)
+        lane_speeds, road_speeds = self._main_road.ahead(
+            self._messages.arrived, way, place, vehicles.road[rows]
+        )
+        share = self._came / self._traffic.waiting.entered.clip(1)
+        found = LocalState(
+            speed,
+            *other(near.ahead, 0, 1.0),
+            *other(near.behind, 0, -1.0),
+            place - road.merge,
+            np.full(len(rows), np.nan),
+            allowed_speed=allowed * vehicles.factor[rows],
+            to_merge=road.merge - place,
+            lane_speeds=lane_speeds,
+            road_speeds=road_speeds,
+            beside_gaps=np.stack([gap for _, gap in beside], -1),
+            beside_speeds=np.stack([its for its, _ in beside], -1),
+            cav_share=share[vehicles.road[rows]],
+        )
+        return found.each(lambda values: values.astype(np.float64)).read_only()
+
+    def noise(self) -> Floats:
+        """Return standard normal noise for one look of a network, shape (CAVs,)."""
+        roads = self._cavs // PER_ROAD
+        found = np.empty(len(roads))
+        for road in np.unique(roads).tolist():
+            here = roads == road
+            found[here] = self._exploration[road].standard_normal(int(here.sum()))
+        return found
+
+    def record(self, driven: Driven) -> tuple[Episode, ...]:
+        """Return what happened on each road since the start, without what was earned."""
+        return self._log.episodes(driven, self._seeds, PER_ROAD)
+
+
+def _nobody() -> LocalState:
+    """Return what is perceived where no CAV is on the road."""
+    one, many, four = np.zeros(0), np.zeros((0, SECTIONS_AHEAD)), np.zeros((0, len(BESIDE)))
+    own = LocalState(one, one, one, one, one, one, one)
+    told = {"allowed_speed": one, "to_merge": one, "lane_speeds": many, "road_speeds": many}
+    return own._replace(**told, beside_gaps=four, beside_speeds=four, cav_share=one)

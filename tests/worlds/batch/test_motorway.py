@@ -1,0 +1,276 @@
+"""Do motorways of a batch do what SUMO's do: step by step where nothing is drawn, and in the mean?"""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from unjam.drivers.driver import Driver
+from unjam.drivers.registry import named_driver
+from unjam.errors import InputError
+from unjam.measures.metrics import travel_time
+from unjam.physics.arrays import Floats
+from unjam.physics.idm import IDMRows
+from unjam.scenarios import OnRamp
+from unjam.scenarios.on_ramp import ON_RAMP
+from unjam.scenarios.road import Edge, Node, RoadNetwork
+from unjam.worlds.batch import extended
+from unjam.worlds.batch.extended import Ahead, Errors, bounds, felt, finished, follow
+from unjam.worlds.batch.motorway import Motorways
+from unjam.worlds.batch.possible import statistical_why_not, why_not
+from unjam.worlds.batch.run import run_batch, run_where_possible
+from unjam.worlds.batch.vehicles import Drivers, Vehicles, around, chosen
+from unjam.worlds.episode import run_episode
+from unjam.worlds.record import Episode
+from unjam.worlds.sumo.files import Files
+from unjam.worlds.sumo.networks import document, network_file
+from unjam.worlds.sumo.simulation import Simulation
+from unjam.worlds.workers import EpisodeTask
+
+STEP, LIMIT, LENGTH = 0.5, 27.78, 4.8
+SHORT = replace(ON_RAMP, horizon=320, peak=(60.0, 300.0))
+
+
+def rows_of(drawn: Floats) -> IDMRows:
+    time_headway, most, braking, gap, factor = drawn.T
+    return IDMRows(LIMIT * factor, time_headway, most, braking, 4.0, gap)
+
+
+def platoon(simulation: Simulation) -> tuple[IDMRows, Floats, Floats]:
+    """People who err in nothing behind one who stops and goes: who they are, places and speeds by step."""
+    generator = np.random.default_rng(3)
+    low, high = [1.0, 1.0, 1.5, 2.0, 0.8], [1.8, 1.5, 2.0, 2.5, 1.2]
+    drawn = generator.uniform(low, high, (8, 5)).round(4)
+    drawn[0, 4] = 0.6
+    names = [f"car_{number}" for number in range(len(drawn))]
+    exact = {"sigmaleader": 0.0, "sigmagap": 0.0, "sigmaerror": 0.0, "speedDev": 0.0, "length": LENGTH}
+    types = [
+        {"id": name, "carFollowModel": "EIDM", "emergencyDecel": 9.0, **exact}
+        | dict(zip(("tau", "accel", "decel", "minGap", "speedFactor"), map(str, row), strict=True))
+        for name, row in zip(names, drawn, strict=True)
+    ]
+    nodes = Node("here", 0.0, 0.0), Node("there", 4000.0, 0.0)
+    network = RoadNetwork(nodes, (Edge("road", "here", "there", 4000.0),), LIMIT, links=False)
+    routes = "<route id='all' edges='road'/>" + "".join(
+        f"<vehicle id='{name}' type='{name}' route='all' depart='{3 * number}' departSpeed='last'/>"
+        for number, name in enumerate(names)
+    )
+    xml = document("routes", "vType", types).replace("</routes>", routes + "</routes>")
+    files = Files((), {"--net-file": (network_file(network),)}, xml, "--route-files")
+    simulation.load(files, STEP, 1)
+    places, speeds = [], []
+    for step in range(330):
+        if step in (140, 180, 220):
+            simulation.set_fastest(names[0], {140: 3.0, 180: 0.01, 220: 40.0}[step])
+        simulation.step()
+        if step > 60:
+            places.append(simulation.along_lanes(names))
+            speeds.append(simulation.speeds(names))
+    return rows_of(drawn), np.array(places), np.array(speeds)
+
+
+def test_extended_drivers_who_err_in_nothing_are_sumos(simulation: Simulation) -> None:
+    people, places, speeds = platoon(simulation)
+    count = places.shape[1] - 1
+    own = IDMRows(*(each if np.ndim(each) == 0 else each[1:] for each in people))
+    started, worst = np.full(count, -1000.0), []
+    exact = Errors(*np.zeros((3, count)))
+    for step in range(2, len(speeds)):
+        before, now = speeds[step - 1], (step + 61.0) * STEP
+        speed, leader = before[1:], before[:-1]
+        acceleration = (before - speeds[step - 2]) / STEP
+        gap = places[step - 1, :-1] - LENGTH - places[step - 1, 1:]
+        cool = (started + extended.STARTING < now - STEP) & (speed > extended.HALTING)
+        wanted = follow(speed, gap, leader, own, exact, STEP, Ahead(acceleration[:-1], cool))
+        freely = follow(speed, 500.0 + own.minimum_gap, own.desired_speed, own, exact, STEP)
+        safe = np.minimum.reduce([wanted, freely, own.desired_speed, speed + own.max_acceleration * STEP])
+        _, wish, highest = bounds(speed, safe, felt(gap, own), leader, own, exact, STEP)
+        about = wish, highest, started, own.max_acceleration, now, STEP
+        found, started = finished(speed, acceleration[1:], *about)
+        worst.append(np.abs(found - speeds[step, 1:]).max())
+    assert min(speeds[:, 3]) < 0.05
+    assert max(speeds[:, 3]) > 10.0
+    assert np.quantile(worst, 0.98) < 1e-3
+    assert max(worst) < 0.03  # behind one who stands but for a millimetre
+
+
+def test_gaps_and_speeds_of_both_kinds_of_drivers_are_sumos(simulation: Simulation) -> None:
+    people, _, _ = platoon(simulation)
+    sumo = simulation._sumo.vehicle  # no other test asks what SUMO's own formulas say
+    states = np.array([[20.0, 20.0, 30.0], [20.0, 15.0, 18.0], [25.0, 5.0, 60.0], [5.0, 8.0, 4.0]])
+    for row in (2, 5):
+        name = f"car_{row}"
+        one = IDMRows(*(each if np.ndim(each) == 0 else np.full(len(states), each[row]) for each in people))
+        drivers = Drivers(one, Errors(*np.zeros((3, len(states)))), np.ones(len(states), bool))
+        speed, leader, gap = states.T
+        told = [sumo.getSecureGap(name, *state[:2], 2.0, "car_1") for state in states]
+        assert drivers.secure_gap(speed, leader).clip(0.0) == pytest.approx(told, abs=1e-6)
+        told = [sumo.getFollowSpeed(name, own, gap, its, 2.0, "car_1") for own, its, gap in states]
+        assert drivers.follow(speed, gap + one.minimum_gap, leader, STEP) == pytest.approx(told, abs=1e-6)
+        told = [sumo.getStopSpeed(name, own, way) for own, _, way in states]
+        assert drivers.stop(speed, gap, STEP) == pytest.approx(told, abs=1e-6)
+
+
+def seeds_of(count: int) -> list[tuple[int, ...]]:
+    return [(11, number) for number in range(count)]
+
+
+def tasks_of(road: OnRamp, driver: Driver, count: int) -> list[EpisodeTask]:
+    return [EpisodeTask(road, driver, seed) for seed in seeds_of(count)]
+
+
+def driver_of(name: str) -> Driver:
+    return named_driver(name, SHORT.decision_step)
+
+
+def batch_of(road: OnRamp, name: str, count: int) -> list[Episode]:
+    return run_batch(tasks_of(road, driver_of(name), count), statistical=True)
+
+
+@pytest.fixture(scope="module")
+def driven() -> dict[str, list[Episode]]:
+    return {name: batch_of(SHORT, name, 4) for name in ("human", "jam-ahead")}
+
+
+def about(episode: Episode) -> list[float]:
+    """Mean travel time, speed, share on the right lane, and lane changes for a vehicle."""
+    there = ~np.isnan(episode.lanes)
+    both = there[1:] & there[:-1] & (np.diff(episode.speeds, axis=0) > -20.0)
+    changes = (np.diff(episode.lanes, axis=0) != 0.0) & both
+    return [
+        travel_time(episode),
+        float(np.nanmean(episode.speeds)),
+        float((episode.lanes[there] == 1.0).mean()),
+        changes.sum() / len(episode.vehicle_ids),
+    ]
+
+
+@pytest.mark.parametrize("name", ["human", "jam-ahead"])
+def test_episodes_are_sumos_in_the_mean(
+    name: str, driven: dict[str, list[Episode]], simulation: Simulation
+) -> None:
+    ours = np.array([about(episode) for episode in driven[name]])
+    theirs = np.array(
+        [
+            about(run_episode(SHORT, driver_of(name), seed, full=True, simulation=simulation))
+            for seed in seeds_of(4)
+        ]
+    )
+    assert ours.mean(0) == pytest.approx(theirs.mean(0), rel=0.08)
+
+
+def test_a_road_is_the_same_alone_and_among_others(driven: dict[str, list[Episode]]) -> None:
+    (alone,) = run_batch([EpisodeTask(SHORT, driver_of("jam-ahead"), seeds_of(4)[2])], statistical=True)
+    among = driven["jam-ahead"][2]
+    np.testing.assert_array_equal(alone.speeds, among.speeds)
+    assert alone.vehicle_ids == among.vehicle_ids
+    assert alone.audit == among.audit
+
+
+def test_nobody_touches_anybody_or_is_lost(driven: dict[str, list[Episode]]) -> None:
+    for episode in driven["human"] + driven["jam-ahead"]:
+        assert episode.status == "completed"
+        assert np.nanmin(episode.gaps) > 0.0
+        there = ~np.isnan(episode.speeds)
+        assert there[-1].sum() + episode.arrived == len(episode.vehicle_ids)
+        assert np.nanmin(episode.speeds) >= 0.0
+        assert episode.audit.people.hardest <= 9.0 + 1e-9
+
+
+def test_what_a_cav_perceived_is_what_was_there(driven: dict[str, list[Episode]]) -> None:
+    episode = driven["jam-ahead"][0]
+    column = dict(zip(episode.vehicle_ids, episode.columns, strict=True))
+    assert len(episode.trajectories) > 5
+    for each in episode.trajectories:
+        moments = slice(each.start, each.start + len(each.states.speed))
+        np.testing.assert_allclose(each.states.speed, episode.speeds[moments, column[each.vehicle]])
+        np.testing.assert_allclose(
+            each.states.route_position, episode.positions[moments, column[each.vehicle]]
+        )
+        gaps = episode.gaps[moments, column[each.vehicle]]
+        near = gaps < 100.0
+        np.testing.assert_allclose(each.states.leader_gap[near], gaps[near])
+        change = np.diff(each.states.speed) / episode.step
+        np.testing.assert_allclose(each.applied, change, atol=1e-12)
+        assert not each.terminated
+        assert np.isfinite(each.reward).all()
+
+
+def test_cavs_that_hold_back_are_slower_upstream_than_those_that_never_do() -> None:
+    crowded = replace(SHORT, cav_share=0.5, horizon=200)
+
+    def upstream(name: str) -> float:
+        states = [each.states for episode in batch_of(crowded, name, 3) for each in episode.trajectories]
+        return float(np.mean(np.concatenate([each.speed[each.to_merge > 0.0] for each in states])))
+
+    assert upstream("constant:acceleration=-1") < 0.8 * upstream("cruise")
+
+
+def test_neighbours_are_those_next_on_each_way_of_the_same_road() -> None:
+    generator = np.random.default_rng(5)
+    count = 60
+    road, way = np.sort(generator.integers(0, 3, count)), generator.integers(0, 3, count)
+    place = generator.uniform(0.0, 3000.0, count)
+    order = np.lexsort((-place, road))
+    columns = dict.fromkeys(Vehicles._fields, np.zeros(count)) | {"road": road, "way": way, "place": place}
+    vehicles = Vehicles(**columns).at(order)
+    near = around(vehicles, 3)
+    for row in range(count):
+        for side in range(3):
+            there = np.flatnonzero((vehicles.road == vehicles.road[row]) & (vehicles.way == side))
+            ahead = there[there < row].max(initial=-1)
+            behind = there[there > row].min(initial=count)
+            assert near.ahead[side, row] == ahead
+            assert near.behind[side, row] == (behind if behind < count else -1)
+    beyond = chosen(near.ahead, vehicles.way + 5)
+    assert (beyond == -1).all()
+
+
+def test_nobody_enters_before_the_time_or_without_room() -> None:
+    road = SHORT.draw(np.random.default_rng(1))
+    traffic = Motorways([road], STEP, lambda shape: np.zeros(shape), np.asarray)
+    times = [entry.time for entry in road.entries]
+    for _ in range(240):
+        known = set(traffic.vehicles.entry.tolist())
+        traffic.step()
+        vehicles = traffic.vehicles
+        new = [row for row, entry in enumerate(vehicles.entry.tolist()) if entry not in known]
+        assert all(times[vehicles.entry[row]] <= traffic.now for row in new)
+        row = chosen(around(vehicles, 3).ahead, vehicles.way)
+        gaps = np.where(row >= 0, vehicles.place[row] - LENGTH - vehicles.place, np.inf)
+        assert (gaps[new] >= vehicles.gap[new] - 1e-9).all()
+    assert traffic.waiting.entered[0] >= len(traffic.vehicles.entry) > 20
+
+
+REFUSED: dict[str, dict[str, Any]] = {
+    "actuation": {"actuation": "shielded"},
+    "simulation_step": {"simulation_step": 0.25, "steps_per_decision": 4},
+    "roadside.loss": {"roadside": replace(SHORT.roadside, loss=0.1)},
+    "sensors": {"actuator": replace(SHORT.actuator, lag=0.3)},
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_a_batch_cannot_do_is_refused_by_name(name: str) -> None:
+    road = replace(SHORT, **REFUSED[name])
+    assert statistical_why_not(road).startswith(name)
+    with pytest.raises(InputError, match=f"batch: {name}"):
+        run_batch(tasks_of(road, driver_of("cruise"), 1), statistical=True)
+
+
+def test_where_episodes_must_be_sumos_it_runs_in_sumo() -> None:
+    assert why_not(SHORT)
+    assert not statistical_why_not(SHORT)
+    asked = list[EpisodeTask]()
+
+    def run(tasks: Any) -> list[Episode]:
+        asked.extend(tasks)
+        return [Episode(seed=task.seed, status="completed") for task in tasks]
+
+    some = tasks_of(replace(SHORT, horizon=20), driver_of("cruise"), 1)
+    run_where_possible(some, run)
+    assert asked == some
+    asked.clear()
+    run_where_possible(some, run, statistical=True)
+    assert not asked
