@@ -43,7 +43,7 @@ def mean_speed_at(episode: Episode, place: float) -> np.ndarray:
 
 
 def wave_speed(episode: Episode) -> float:
-    """Return how fast slowness spreads against the traffic: by the time at which two places are most alike."""
+    """Return how fast slowness spreads against the traffic: by when two places are most alike [m/s]."""
     first, last = (mean_speed_at(episode, place)[300:1800] for place in (DOWNSTREAM, UPSTREAM))
     lags = range(20, LATEST)
     alike = [np.corrcoef(first[:-lag], last[lag:])[0, 1] for lag in lags]

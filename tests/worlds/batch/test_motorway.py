@@ -84,7 +84,10 @@ def test_extended_drivers_who_err_in_nothing_are_sumos(simulation: Simulation) -
         cool = (started + extended.STARTING < now - STEP) & (speed > extended.HALTING)
         wanted = follow(speed, gap, leader, own, exact, STEP, Ahead(acceleration[:-1], cool))
         freely = follow(speed, 500.0 + own.minimum_gap, own.desired_speed, own, exact, STEP)
-        safe = np.minimum.reduce([wanted, freely, own.desired_speed, speed + own.max_acceleration * STEP])
+        heeded = np.where(
+            freely.urgent < wanted.urgent + 1e-3, np.minimum(freely.speed, wanted.speed), wanted.speed
+        )
+        safe = np.minimum(heeded, speed + own.max_acceleration * STEP)
         _, wish, highest = bounds(speed, safe, felt(gap, own), leader, own, exact, STEP)
         about = wish, highest, started, own.max_acceleration, now, STEP
         found, started = finished(speed, acceleration[1:], *about)

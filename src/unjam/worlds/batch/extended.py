@@ -79,6 +79,14 @@ def acceleration(speed: Array, ratio: Array, people: IDMRows) -> Array:
     return found
 
 
+class Wish(NamedTuple):
+    """What drivers want after a step behind somebody."""
+
+    speed: Array
+    urgent: Array
+    """the acceleration for it if they were not cool: by it they choose which of several to heed [m/s2]"""
+
+
 def follow(
     speed: Array,
     gap: Array,
@@ -87,25 +95,26 @@ def follow(
     errors: Errors,
     step: float,
     ahead: Ahead | None = None,
-) -> Array:
+) -> Wish:
     """Return how fast drivers want to be after a step behind leaders whose bumpers are `gap` ahead."""
     xp, most = namespace(speed), people.max_acceleration
     least = people.minimum_gap
     left = felt(gap, people)
     new, each = speed, step / THINKS
     misjudged, slower = xp.exp(MISJUDGED_GAP * errors.gap), MISJUDGED_SPEED * errors.leader_speed
+    urgent = 0.0 * speed
     for _ in range(THINKS):
         leader, seen = at_least(leader_speed - left * slower, 0.0), left * misjudged
         wanted = desired_gap(new, new - leader, people) + SLACK
         enough = seen * square_root(1.0 + 2.0 * SLACK / most)
         stops = (seen < least + (10.0 * step + 1.0) * SLACK) & (new < CAREFUL)
         wanted = xp.where(stops, xp.maximum(wanted, enough), wanted)
-        told = acceleration(new, wanted / seen, people)
+        told = urgent = acceleration(new, wanted / seen, people)
         if ahead is not None:
             told = _cooler(told, new, leader, seen, wanted, people, ahead)
         new = at_least(new + told * each, 0.0)
         left = at_least(left - at_least(new - leader_speed, 0.0) * each, SMALLEST)
-    return new
+    return Wish(new, urgent)
 
 
 def felt(gap: Array, people: IDMRows) -> Array:
@@ -155,13 +164,6 @@ def secure_gap(speed: Array, leader_speed: Array, people: IDMRows) -> Array:
     """Return the gap beyond the smallest one with which drivers change lanes (`getSecureGap`)."""
     divisor = square_root(people.comfortable_deceleration / people.max_acceleration + 1.0)
     return (desired_gap(speed, speed - leader_speed, people) - people.minimum_gap) / divisor
-
-
-def safe_speed(gap: Array, leader_speed: Array, people: IDMRows) -> Array:
-    """Return the speed that a gap beyond the smallest one allows for long (`maximumSafeFollowSpeed`)."""
-    half = 0.5 * (leader_speed - people.time_headway * people.braking)
-    divisor = square_root(1.0 + people.comfortable_deceleration / (2.0 * people.max_acceleration))
-    return half + square_root(half * half + divisor * at_least(gap, 0.0) * people.braking)
 
 
 class Bounds(NamedTuple):

@@ -64,13 +64,13 @@ def _who_gains(vehicles: Vehicles, scene: Scene, stretch: Stretch, may: Array) -
     its = xp.minimum(stretch.limit * vehicles.factor[ahead.row], vehicles.cap[ahead.row])
     slower = xp.maximum(here - its, speed - ahead.speed)
     holds = may & rises & ahead.there & fast & (slower > 0.0)
-    this, soon, advice = here, speed < 0.0, vehicles.beside_advice
+    most, soon, advice = here, speed < 0.0, vehicles.beside_advice
     if bool(holds.any()):
         safe, soon_slow = _behind_left(vehicles, scene, holds, slower[holds])
-        advice, this = advice + 0.0, here + 0.0
+        advice, most = advice + 0.0, here + 0.0
         advice[holds] = xp.minimum(advice[holds], (safe - speed[holds]) / step)
         soon[holds] = soon_slow
-        this[holds] = xp.minimum(here[holds], safe)
+        most[holds] = xp.minimum(here[holds], safe)
         gain = gain + xp.where(soon, step * slower / at_least(here, LEAST_SPEED), 0.0 * gain)
     # How fast either lane will be.
     speeds_up = (ahead.there & (vehicles.acceleration[ahead.row] > 0.0)) | (
@@ -79,14 +79,15 @@ def _who_gains(vehicles: Vehicles, scene: Scene, stretch: Stretch, may: Array) -
 
     def foreseen(other: Other, end: Array) -> Array:
         gap, its = xp.where(other.there, other.gap, end), xp.where(other.there, other.speed, 0.0 * speed)
-        found = drivers.safe_speed(gap, its, step)
+        found = drivers.safe_speed(gap, its, vehicles.braking[other.row], step)
         later = (speed + vehicles.most * (1.0 - step))[speeds_up]
         gap = (gap + vehicles.gap)[speeds_up]
         found[speeds_up] = drivers.at(speeds_up).follow(later, gap, its[speeds_up], step)
         return found
 
     that = xp.minimum(there, foreseen(ahead, goes_on))
-    this = xp.minimum(this, foreseen(leader, own_end))
+    # Speeds that are steady are compared as far as they are safe: there who holds back is not bound by it.
+    this = xp.minimum(xp.where(speeds_up, most, here), foreseen(leader, own_end))
     relative = (that - this) / at_least(that, LEAST_SPEED)
     lasts = goes_on / at_least(speed, 0.1) > REMAINS
     # To the right.
@@ -107,7 +108,6 @@ def _who_gains(vehicles: Vehicles, scene: Scene, stretch: Stretch, may: Array) -
     slack = here - leader.speed
     slack = xp.where(slack * slack < 1e-12, 1e-6, slack)
     seconds = xp.where(behind, xp.minimum(seconds, xp.minimum(clear, leader.gap) / slack), seconds)
-    gain = gain + xp.where(behind, step * (here - wishes) / at_least(here, LEAST_SPEED), 0.0 * gain)
     keep = keep - xp.where(good, step * RIGHT_THRESHOLD * seconds / accepted / KEEP_RIGHT_TIME, 0.0 * keep)
     wants = (good & (keep < -RIGHT_THRESHOLD)) | (right & (gain < -RIGHT_THRESHOLD) & lasts)
     # To the left.

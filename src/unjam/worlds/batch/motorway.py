@@ -184,19 +184,20 @@ class Motorways:
         gap = xp.where(there, place[row] - stretch.vehicle_length - place, NOBODY_AHEAD + vehicles.gap)
         cool = (vehicles.started + STARTING + SMALLEST < self.now) & (speed > HALTING) & there
         own = xp.where(there, vehicles.acceleration[row], 0.0 * speed)
-        follow = drivers.follow(speed, gap, leader, step, Ahead(own, cool))
+        follow, urgent = drivers.wish(speed, gap, leader, step, Ahead(own, cool))
         next_allowed = xp.minimum(stretch.limit * vehicles.factor, vehicles.cap)
         # Extended drivers want what is allowed, and are a little faster or slower; IDMs are never faster.
         most = xp.where(vehicles.extended, vehicles.cap, allowed)
         safe = xp.minimum(xp.minimum(speed + vehicles.most * step, most), follow)
         may = safe > speed - BRAKES * step
         rows = drivers.at(may)
-        free = rows.follow(speed[may], NOBODY_AHEAD + vehicles.gap[may], next_allowed[may], step)
-        safe[may] = xp.minimum(safe[may], free)
-        near, heeds = felt(gap, drivers.people), may + False
-        heeds[may] = free >= follow[may]
-        near = xp.where(may & ~heeds, NOBODY_AHEAD, near)
-        leader = xp.where(may & ~heeds, next_allowed, leader)
+        free = rows.wish(speed[may], NOBODY_AHEAD + vehicles.gap[may], next_allowed[may], step)
+        # Of whom they follow and what is allowed they heed what they would brake for more if not cool.
+        alone = may & True
+        alone[may] = free.urgent < urgent[may] + SMALLEST
+        safe[may] = xp.where(alone[may], xp.minimum(safe[may], free.speed), safe[may])
+        near = xp.where(alone, NOBODY_AHEAD, felt(gap, drivers.people))
+        leader = xp.where(alone, next_allowed, leader)
         if bool(on_lane.any()):
             way_left = at_least(stretch.closes - place[on_lane], 0.0)
             stops, before = drivers.at(on_lane).stop(speed[on_lane], way_left, step), safe[on_lane]

@@ -8,11 +8,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from unjam.physics.arrays import Array, at_least, at_most, namespace, running_maximum
+from unjam.physics.arrays import Array, at_least, at_most, namespace, running_maximum, square_root
 from unjam.physics.idm import IDMRows, by_squaring, desired_gap, idm_acceleration
 from unjam.physics.kinematics import next_speed, stopping_distance
 from unjam.worlds.batch import extended
-from unjam.worlds.batch.extended import Ahead, Errors
+from unjam.worlds.batch.extended import Ahead, Errors, Wish
 from unjam.worlds.batch.people import SMALLEST_GAP
 
 NOBODY = -1
@@ -104,8 +104,16 @@ class Drivers(NamedTuple):
         self, speed: Array, gap: Array, leader_speed: Array, step: float, ahead: Ahead | None = None
     ) -> Array:
         """Return the speeds they want after a step, `gap` to the leaders' bumpers."""
-        one = extended.follow(speed, gap, leader_speed, self.people, self.errors, step, ahead)
-        return self._or_idm(one, _idm_follow, speed, gap, leader_speed, step=step)
+        return self.wish(speed, gap, leader_speed, step, ahead).speed
+
+    def wish(
+        self, speed: Array, gap: Array, leader_speed: Array, step: float, ahead: Ahead | None = None
+    ) -> Wish:
+        """Return the same, and how urgent it is."""
+        one, urgent = extended.follow(speed, gap, leader_speed, self.people, self.errors, step, ahead)
+        found = self._or_idm(one, _idm_follow, speed, gap, leader_speed, step=step)
+        xp = namespace(found)
+        return Wish(found, xp.where(self.extended, urgent, (found - speed) / step))
 
     def stop(self, speed: Array, way: Array, step: float) -> Array:
         """Return the speeds they want after a step who must stand within a way."""
@@ -117,10 +125,19 @@ class Drivers(NamedTuple):
         one = extended.secure_gap(speed, leader_speed, self.people)
         return self._or_idm(one, _idm_secure_gap, speed, leader_speed)
 
-    def safe_speed(self, gap: Array, leader_speed: Array, step: float) -> Array:
-        """Return the speed that a gap beyond the smallest one allows for long."""
-        one = extended.safe_speed(gap, leader_speed, self.people)
-        return self._or_idm(one, _idm_safe_speed, gap, leader_speed, step=step)
+    def safe_speed(self, gap: Array, leader_speed: Array, its_braking: Array, step: float) -> Array:
+        """Return the highest speed from which they can stand behind leaders who brake, a time headway later.
+
+        Source: SUMO's MSCFModel (`maximumSafeFollowSpeed`), of any driver; all stand a gap behind the leader.
+        """
+        xp, braking = namespace(gap), self.people.comfortable_deceleration
+        change, late = braking * step, self.people.time_headway / step
+        way = stopping_distance(leader_speed, xp.maximum(braking, its_braking), step)
+        room = (at_least(gap, 0.0) + way) / step
+        # n whole steps of braking from v = n b h + r take n b h ((n - 1) / 2 + late) + (n + late) r = room.
+        steps = xp.floor(0.5 - late + square_root(0.25 + late * (late - 1.0) + 2.0 * room / change))
+        rest = room - change * steps * ((steps - 1.0) / 2.0 + late)
+        return change * steps + rest / (steps + late)
 
     def brake_gap(self, speed: Array, step: float) -> Array:
         """Return the way in which they can stand, after their time headway."""
@@ -154,15 +171,6 @@ def _idm_stop(speed: Array, way: Array, people: IDMRows, step: float) -> Array:
 
 def _idm_secure_gap(speed: Array, leader_speed: Array, people: IDMRows) -> Array:
     return desired_gap(speed, speed - leader_speed, people) - people.minimum_gap
-
-
-def _idm_safe_speed(gap: Array, leader_speed: Array, people: IDMRows, step: float) -> Array:
-    """Return the speed from which it stands behind a leader who brakes as hard, after its time headway."""
-    braking = people.comfortable_deceleration
-    room = gap + stopping_distance(leader_speed, braking, step)
-    # SUMO's step of braking is as long as a reaction: here the reaction is the time headway, and even.
-    late = braking * people.time_headway
-    return (late * late + 2.0 * braking * at_least(room, 0.0)) ** 0.5 - late
 
 
 class Around(NamedTuple):
