@@ -16,11 +16,13 @@ from unjam.scenarios import OnRamp
 from unjam.scenarios.on_ramp import ON_RAMP
 from unjam.scenarios.road import Edge, Node, RoadNetwork
 from unjam.worlds.batch import extended
+from unjam.worlds.batch.beside import Stretch
 from unjam.worlds.batch.extended import Ahead, Errors, bounds, felt, finished, follow
+from unjam.worlds.batch.lane_changes import change_lanes
 from unjam.worlds.batch.motorway import Motorways
 from unjam.worlds.batch.possible import statistical_why_not, why_not
 from unjam.worlds.batch.run import run_batch, run_where_possible
-from unjam.worlds.batch.vehicles import Drivers, Vehicles, around, chosen
+from unjam.worlds.batch.vehicles import FREELY, Drivers, Vehicles, around, chosen, in_order
 from unjam.worlds.episode import run_episode
 from unjam.worlds.record import Episode
 from unjam.worlds.sumo.files import Files
@@ -37,12 +39,14 @@ def rows_of(drawn: Floats) -> IDMRows:
     return IDMRows(LIMIT * factor, time_headway, most, braking, 4.0, gap)
 
 
-def platoon(simulation: Simulation) -> tuple[IDMRows, Floats, Floats]:
-    """People who err in nothing behind one who stops and goes: who they are, places and speeds by step."""
-    generator = np.random.default_rng(3)
+def people(count: int, generator: np.random.Generator) -> Floats:
+    """People who differ: time headway, acceleration, braking, gap, and wanted speed over the limit."""
     low, high = [1.0, 1.0, 1.5, 2.0, 0.8], [1.8, 1.5, 2.0, 2.5, 1.2]
-    drawn = generator.uniform(low, high, (8, 5)).round(4)
-    drawn[0, 4] = 0.6
+    return generator.uniform(low, high, (count, 5)).round(4)
+
+
+def load(simulation: Simulation, drawn: Floats, times: Floats, lanes: int) -> list[str]:
+    """People who err in nothing enter a straight road one after the other, on its lanes in turn."""
     names = [f"car_{number}" for number in range(len(drawn))]
     exact = {"sigmaleader": 0.0, "sigmagap": 0.0, "sigmaerror": 0.0, "speedDev": 0.0, "length": LENGTH}
     types = [
@@ -51,14 +55,23 @@ def platoon(simulation: Simulation) -> tuple[IDMRows, Floats, Floats]:
         for name, row in zip(names, drawn, strict=True)
     ]
     nodes = Node("here", 0.0, 0.0), Node("there", 4000.0, 0.0)
-    network = RoadNetwork(nodes, (Edge("road", "here", "there", 4000.0),), LIMIT, links=False)
+    network = RoadNetwork(nodes, (Edge("road", "here", "there", 4000.0, lanes=lanes),), LIMIT, links=False)
     routes = "<route id='all' edges='road'/>" + "".join(
-        f"<vehicle id='{name}' type='{name}' route='all' depart='{3 * number}' departSpeed='last'/>"
-        for number, name in enumerate(names)
+        f"<vehicle id='{name}' type='{name}' route='all' depart='{time:.1f}' departSpeed='last' "
+        f"departLane='{number % lanes}' departPos='base' insertionChecks='collision'/>"
+        for number, (name, time) in enumerate(zip(names, times, strict=True))
     )
     xml = document("routes", "vType", types).replace("</routes>", routes + "</routes>")
     files = Files((), {"--net-file": (network_file(network),)}, xml, "--route-files")
     simulation.load(files, STEP, 1)
+    return names
+
+
+def platoon(simulation: Simulation) -> tuple[IDMRows, Floats, Floats]:
+    """People on one lane behind one who stops and goes: who they are, places and speeds by step."""
+    drawn = people(8, np.random.default_rng(3))
+    drawn[0, 4] = 0.6
+    names = load(simulation, drawn, 3.0 * np.arange(8), 1)
     places, speeds = [], []
     for step in range(330):
         if step in (140, 180, 220):
@@ -113,6 +126,63 @@ def test_gaps_and_speeds_of_both_kinds_of_drivers_are_sumos(simulation: Simulati
         assert drivers.follow(speed, gap + one.minimum_gap, leader, STEP) == pytest.approx(told, abs=1e-6)
         told = [sumo.getStopSpeed(name, own, way) for own, _, way in states]
         assert drivers.stop(speed, gap, STEP) == pytest.approx(told, abs=1e-6)
+
+
+def test_who_changes_lanes_is_who_does_in_sumo(simulation: Simulation) -> None:
+    generator = np.random.default_rng(1)
+    drawn = people(160, generator)
+    names = load(simulation, drawn, np.cumsum(generator.uniform(0.6, 1.6, 160)), 2)
+    time_headway, most, braking, gap, factor = drawn.T
+    road = Stretch(4000.0, 4000.0, 4000.0, LIMIT, LIMIT, 2, LENGTH)
+    nothing, free = np.zeros(160), np.full(160, FREELY)
+    wishes = dict.fromkeys(("gain", "keep", "look"), nothing)
+    before = {"speed": nothing, "way": nothing - 1.0}
+    changes, alike, others, moments = 0, 0, 0, 0
+    for _ in range(320):
+        simulation.step()
+        known = [number for number in range(160) if before["way"][number] >= 0]
+        there = (
+            set(simulation.on_lane("road_0")),
+            set(simulation.on_lane("road_1")),
+        )
+        way = np.array([next((lane + 1 for lane in (0, 1) if name in there[lane]), -1) for name in names])
+        on_road = [number for number in range(160) if way[number] >= 0]
+        speed, place = np.zeros((2, 160))
+        speed[on_road] = simulation.speeds([names[number] for number in on_road])
+        place[on_road] = simulation.along_lanes([names[number] for number in on_road])
+        columns = (
+            dict.fromkeys(Vehicles._fields, nothing)
+            | wishes
+            | {
+                **{"road": np.zeros(160, int), "entry": np.arange(160), "way": before["way"].astype(int)},
+                **{"place": place, "speed": speed, "acceleration": (speed - before["speed"]) / STEP},
+                **{
+                    "time_headway": time_headway,
+                    "most": most,
+                    "braking": braking,
+                    "gap": gap,
+                    "factor": factor,
+                },
+                **{"extended": np.ones(160, bool), "cap": free, "wish": LIMIT * factor},
+            }
+        )
+        if known:
+            vehicles = in_order(Vehicles(**columns).at(np.array(known)))
+            after = change_lanes(vehicles, road, STEP)
+            mine, sumos = after.way != vehicles.way, way[after.entry] != vehicles.way
+            counted = (vehicles.place > 20.0) & (way[after.entry] > 0)
+            changes += int((sumos & counted).sum())
+            alike += int((mine & sumos & counted).sum())
+            others += int((mine & ~sumos & counted).sum())
+            moments += int(counted.sum())
+            wishes = {name: values.copy() for name, values in wishes.items()}
+            for name, values in wishes.items():
+                values[after.entry] = np.where(sumos, 0.0, getattr(after, name))
+        before = {"speed": speed, "way": way.astype(float)}
+    assert moments > 10_000
+    assert changes > 20
+    assert alike > 0.8 * changes
+    assert others < 0.15 * changes
 
 
 def seeds_of(count: int) -> list[tuple[int, ...]]:
