@@ -71,7 +71,7 @@ def platoon(simulation: Simulation) -> tuple[IDMRows, Floats, Floats]:
     """People on one lane behind one who stops and goes: who they are, places and speeds by step."""
     drawn = people(8, np.random.default_rng(3))
     drawn[0, 4] = 0.6
-    names = load(simulation, drawn, 3.0 * np.arange(8), 1)
+    names = load(simulation, drawn, np.linspace(0.0, 21.0, 8), 1)
     places, speeds = [], []
     for step in range(330):
         if step in (140, 180, 220):
