@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 from unjam.drivers.driver import Driver
 from unjam.drivers.registry import named_driver
@@ -347,3 +348,24 @@ def test_where_episodes_must_be_sumos_it_runs_in_sumo() -> None:
     asked.clear()
     run_where_possible(some, run, statistical=True)
     assert not asked
+
+
+def test_tensors_are_stepped_as_arrays_are() -> None:
+    roads = [SHORT.draw(np.random.default_rng(number)) for number in range(2)]
+    generator = np.random.default_rng(0)
+    drawn = [generator.standard_normal((3, 300)) for _ in range(90)]
+
+    def after(numbers: Any) -> Vehicles:
+        steps = iter(drawn)
+        traffic = Motorways(roads, STEP, lambda shape: numbers(next(steps)[:, : shape[1]]), numbers)
+        for _ in range(90):  # later somebody changes lanes one step sooner: roots are rounded otherwise
+            traffic.step()
+        return traffic.vehicles
+
+    arrays, tensors = after(np.asarray), after(torch.as_tensor)
+    assert len(arrays.road) > 50
+    came = [roads[road].entries[entry].route for road, entry in zip(arrays.road, arrays.entry, strict=True)]
+    assert any(route == "ramp" and way > 0 for route, way in zip(came, arrays.way, strict=True))
+    np.testing.assert_array_equal(arrays.entry, tensors.entry.numpy())
+    np.testing.assert_array_equal(arrays.way, tensors.way.numpy())
+    np.testing.assert_allclose(arrays.place, tensors.place.numpy(), atol=1e-6)

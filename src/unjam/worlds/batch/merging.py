@@ -10,6 +10,7 @@ from unjam.worlds.batch.vehicles import FREELY, NOBODY, Vehicles
 LOOK_FORWARD, LEFT_FACTOR = 10.0, 2.0
 """how long somebody looks ahead for a change that must be made [s], and how much longer to the left"""
 URGENCY = 2.0
+"""how many times over the way that is left would be driven in the time that is left"""
 HELP, FALL_BEHIND = 10.0 / 3.6, 7.0 / 3.6
 """speed by which one overtakes to help [m/s], braking at least to fall behind [m/s2]"""
 UNCONGESTED = 60.0 / 3.6
@@ -31,7 +32,7 @@ def who_must(vehicles: Vehicles, scene: Scene, stretch: Stretch) -> tuple[Vehicl
     needed = vehicles.look * (LOOK_FORWARD * LEFT_FACTOR) + 2.0 * (vehicles.gap + stretch.vehicle_length)
     urgent = on_lane & (left - occupied < needed)
     helps = vehicles.speed < 0.0
-    rows = urgent.nonzero()[0] if hasattr(urgent, "ctypes") else urgent.nonzero()[:, 0]
+    rows = xp.arange(len(place))[urgent]
     if len(rows) == 0:
         return vehicles, urgent, helps
     own, told, leans = vehicles.own_advice, vehicles.told_advice, vehicles.leans
@@ -57,6 +58,7 @@ class Merging:
     """Those who must leave the ramp's lane, and what they ask of others."""
 
     def __init__(self, vehicles: Vehicles, scene: Scene, stretch: Stretch, rows: Array, left: Array) -> None:
+        """Take their rows, and how much of the lane is left to each [m]."""
         self.speed, self.left, self._step = vehicles.speed[rows], left, scene.step
         self._length, self._gap = stretch.vehicle_length, vehicles.gap[rows]
         self.ahead, self.behind = (

@@ -59,7 +59,7 @@ class MotorwayBatch:
         """road and entry of each CAV as one number, in order of entry"""
         self._came = np.zeros(len(drawn))
         """CAVs that have entered each road"""
-        self._controlled = False
+        self._controlled, self._headways_asked = False, False
         self._log = MotorwayLog(self.roads, entries, step, self.scenario.decision_step)
 
     def _drawn(self, shape: tuple[int, ...]) -> Floats:
@@ -110,7 +110,11 @@ class MotorwayBatch:
         self._log.note_applied((after - before) / scenario.decision_step)
 
     def _ask_for_headways(self, command: Command | None) -> None:
-        if command is None or command.time_headway is None:
+        """Let CAVs' ACCs keep the time headways that a driver asks for; their own, where it asks no more."""
+        self._headways_asked = self._headways_asked or (
+            command is not None and command.time_headway is not None
+        )
+        if not self._headways_asked:
             return
         names = [str(number) for number in self._cavs]
         least = self.scenario.cruise.time_headway
@@ -137,12 +141,10 @@ class MotorwayBatch:
     def _rows_of_cavs(self, vehicles: Vehicles) -> NDArray[np.intp]:
         """Return the row of each CAV among vehicles; -1 where it has left."""
         keys = vehicles.road * PER_ROAD + vehicles.entry
-        order = keys.argsort()
-        found = (
-            order[np.searchsorted(keys[order], self._cavs).clip(0, max(len(keys) - 1, 0))] if len(keys) else 0
-        )
         if not len(keys):
             return np.full(len(self._cavs), -1)
+        order = keys.argsort()
+        found = order[np.searchsorted(keys[order], self._cavs).clip(0, len(keys) - 1)]
         return np.where(keys[found] == self._cavs, found, -1)
 
     def _look(self) -> None:

@@ -6,8 +6,6 @@ Arrays have shape (n,) of all n vehicles that are on a road now, units are m/s, 
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from unjam.physics.arrays import Array, at_least, at_most, namespace, running_maximum, square_root
 from unjam.physics.idm import IDMRows, by_squaring, desired_gap, idm_acceleration
 from unjam.physics.kinematics import next_speed, stopping_distance
@@ -185,9 +183,7 @@ def in_order(vehicles: Vehicles) -> Vehicles:
     key = vehicles.road * 1e6 - vehicles.place
     if bool((key[1:] >= key[:-1]).all()):
         return vehicles
-    return vehicles.at(
-        key.argsort(**({"kind": "stable"} if isinstance(key, np.ndarray) else {"stable": True}))
-    )
+    return vehicles.at(key.argsort(stable=True))
 
 
 def around(vehicles: Vehicles, ways: int) -> Around:
