@@ -3,9 +3,9 @@
 import json
 import sys
 from time import perf_counter
-from typing import Any
 
 import numpy as np
+from comparing import compared
 
 from unjam.controller import make_driver
 from unjam.manifest import manifest
@@ -47,24 +47,6 @@ def about(episode: Episode) -> dict[str, float]:
     return found
 
 
-def compared(batch: list[Episode], sumo: list[Episode]) -> dict[str, Any]:
-    """Return the mean, and the difference with its 95 % interval: as of other seeds, and seed by seed."""
-    ours, theirs = ([about(episode) for episode in episodes] for episodes in (batch, sumo))
-    found = {}
-    for name in theirs[0]:
-        one, other = (np.array([row[name] for row in rows]) for rows in (ours, theirs))
-        count, paired = len(one), one - other
-        spread = np.sqrt(one.var(ddof=1) / count + other.var(ddof=1) / count)
-        found[name] = {
-            "sumo": float(other.mean()),
-            "difference": float(paired.mean()),
-            "95 % as of other seeds": float(1.96 * spread),
-            "95 % seed by seed": float(1.96 * paired.std(ddof=1) / np.sqrt(count)),
-            "largest of a seed": float(np.abs(paired).max()),
-        }
-    return found
-
-
 def when_apart(one: Episode, other: Episode) -> int | None:
     """Return the decision from which on speeds differ; None where they never do."""
     count = min(len(one.speeds), len(other.speeds))
@@ -90,7 +72,7 @@ with Simulation() as simulation:
                 "collisions": [sum(not each.ok for each in episodes) for episodes in (batch, sumo)],
                 "episodes apart": sum(when is not None for when in apart),
                 "earliest apart": min((when for when in apart if when is not None), default=None),
-                "compared": compared(batch, sumo),
+                "compared": compared(*([about(each) for each in episodes] for episodes in (batch, sumo))),
             }
         )
         print(name, rows[-1]["episodes apart"], file=sys.stderr)

@@ -4,9 +4,9 @@ import json
 import sys
 from dataclasses import replace
 from time import perf_counter
-from typing import Any
 
 import numpy as np
+from comparing import compared
 
 from unjam.controller import make_driver
 from unjam.manifest import manifest
@@ -85,23 +85,6 @@ def about(episode: Episode) -> dict[str, float]:
     return found
 
 
-def compared(batch: list[Episode], sumo: list[Episode]) -> dict[str, Any]:
-    """Return the mean, and the difference with its 95 % interval: as of other seeds, and seed by seed."""
-    ours, theirs = ([about(episode) for episode in episodes] for episodes in (batch, sumo))
-    found = {}
-    for name in theirs[0]:
-        one, other = (np.array([row[name] for row in rows]) for rows in (ours, theirs))
-        count, paired = len(one), one - other
-        spread = np.sqrt(one.var(ddof=1) / count + other.var(ddof=1) / count)
-        found[name] = {
-            "sumo": float(other.mean()),
-            "difference": float(paired.mean()),
-            "95 % as of other seeds": float(1.96 * spread),
-            "95 % seed by seed": float(1.96 * paired.std(ddof=1) / np.sqrt(count)),
-        }
-    return found
-
-
 def main() -> None:
     """Print the answer as JSON."""
     started, rows, seconds = manifest(), [], np.zeros(2)
@@ -121,7 +104,13 @@ def main() -> None:
             ]
             seconds += between - begun, perf_counter() - between
             collisions = [sum(each.status != "completed" for each in episodes) for episodes in (batch, sumo)]
-            rows.append({"driver": name, "collisions": collisions, "compared": compared(batch, sumo)})
+            rows.append(
+                {
+                    "driver": name,
+                    "collisions": collisions,
+                    "compared": compared(*([about(each) for each in episodes] for episodes in (batch, sumo))),
+                }
+            )
             about_time = rows[-1]["compared"]["travel time"]
             print(name, collisions, about_time, seconds.round(), file=sys.stderr, flush=True)
     answer = {

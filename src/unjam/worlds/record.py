@@ -14,6 +14,10 @@ from unjam.physics.arrays import Floats
 from unjam.worlds.audit import Audit
 from unjam.worlds.world import Driven
 
+FRAMES = 200
+"""an episode in so many frames has an empty one between two vehicles that share a column: else it would look
+as if one flew back"""
+
 
 @dataclass(frozen=True)
 class Trajectory:

@@ -25,11 +25,8 @@ from unjam.worlds.audit import (
     following,
 )
 from unjam.worlds.batch.vehicles import Vehicles, around, chosen
-from unjam.worlds.record import Episode, Trajectory, shared_columns, trajectory
+from unjam.worlds.record import FRAMES, Episode, Trajectory, shared_columns, trajectory
 from unjam.worlds.world import Driven
-
-FRAMES = 200
-"""an episode in so many frames has an empty one between two vehicles that share a column"""
 
 
 class _Where(NamedTuple):

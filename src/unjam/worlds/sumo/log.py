@@ -12,16 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from unjam.physics.arrays import Floats
-from unjam.worlds.record import shared_columns
+from unjam.worlds.record import FRAMES, shared_columns
 
 MOST_PICTURED = 600_000
 """vehicles at moments of which pictures are kept: of more, those of every second moment alone, then of every
 fourth, and so on"""
 MOST_CELLS = 20_000_000
 """cells of a table with a column for each vehicle; of larger ones columns are shared"""
-FRAMES = 200
-"""an episode in so many frames has an empty one between two vehicles that share a column: else it would look
-as if one flew back"""
 
 
 class TrafficLog:
