@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import field
 from functools import cached_property
+from math import inf
 from typing import Annotated, ClassVar, Literal, Self
 
 import numpy as np
@@ -13,7 +14,8 @@ from unjam.drivers.command import Limits
 from unjam.drivers.safety import Actuator, SafetyFilter
 from unjam.drivers.sensors import Sensors
 from unjam.parameters import STRICT, Count, CountOrNone, NotNegative, Positive
-from unjam.physics.idm import IDMParameters
+from unjam.physics.arrays import Array, at_least, namespace
+from unjam.physics.idm import IDMParameters, desired_speed_for
 from unjam.scenarios.population import Population, read_population
 from unjam.scenarios.road import Road
 
@@ -25,6 +27,8 @@ ACCELERATION = 2.6
 """of commanded people and of cars, SUMO's own [m/s2]"""
 SMALLEST_CAV_GAP = 0.5
 """gap that SUMO keeps for a CAV [m]"""
+SLOWEST = 0.1
+"""set speed below which SUMO has none [m/s]"""
 
 Actuation = Literal["shielded", "raw", "flow", "cruise"]
 """How SUMO carries out a CAV's command.
@@ -62,6 +66,24 @@ class CruiseControl:
     """comfortable [m/s2]"""
     gap: Positive = 2.0
     """to who stands ahead [m]"""
+
+    def set_speed(self, speed: Array, wanted: Array, highest: float, step: float) -> Array:
+        """Return the set speed with which it accelerates as wanted where nobody is near [m/s].
+
+        Infinite where it may drive as it likes: as hard as it can, or as anybody may ask.
+
+        Args:
+            speed: own [m/s], shape (n,).
+            wanted: how fast it is to be after a step [m/s], shape (n,).
+            highest: acceleration that anybody may ask for [m/s2].
+            step: of the simulation [s].
+        """
+        xp, asked = namespace(speed), (wanted - speed) / step
+        held = asked < min(highest, self.acceleration) - 1e-6
+        acc = IDMParameters(max_acceleration=self.acceleration)
+        faster = desired_speed_for(xp.where(held, asked, 0.0 * asked), speed, acc)
+        found = at_least(xp.where(asked <= 0.0, wanted, xp.maximum(wanted, faster)), SLOWEST)
+        return xp.where(held, found, 0.0 * found + inf)
 
 
 @dataclass(frozen=True, config=STRICT)

@@ -7,21 +7,18 @@ nothing of how it follows; the audit counts it apart.
 from array import array
 from collections.abc import Sequence
 from dataclasses import replace
+from math import inf
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from unjam.drivers.command import Command, time_headways
-from unjam.physics.idm import IDMParameters, desired_speed_for
 from unjam.worlds.audit import CAV, CAV_CUT_IN, CUT_IN, PEOPLE, SETTLED, SHORT_HEADWAY, Audit, following
 from unjam.worlds.record import Floats, Trajectory
 from unjam.worlds.sumo.open import OpenTraffic
 from unjam.worlds.sumo.traffic import OpenKind
 from unjam.worlds.world import OnProgress
-
-SLOWEST = 0.1
-"""set speed below which SUMO has none [m/s]"""
 
 
 class Followed(NamedTuple):
@@ -104,15 +101,12 @@ class LaneTraffic(OpenTraffic[OpenKind]):
         if self.scenario.actuation != "cruise":
             super()._tell(speeds)
             return
-        acc = IDMParameters(max_acceleration=cruise.acceleration)
-        most = min(self.limits.highest, cruise.acceleration) - 1e-6
-        now = self._simulation.speeds(list(speeds))
-        for (name, speed), own in zip(speeds.items(), now, strict=True):
-            wanted = (speed - own) / step
-            if wanted < most and not self._is_free(name):
+        now = np.array(self._simulation.speeds(list(speeds)))
+        held = cruise.set_speed(now, np.array([*speeds.values()]), self.limits.highest, step)
+        for name, cap in zip(speeds, held.tolist(), strict=True):
+            if cap < inf and not self._is_free(name):
                 fastest = self._fastest.setdefault(name, self._simulation.fastest(name))
-                held = speed if wanted <= 0 else max(speed, desired_speed_for(wanted, own, acc))
-                self._simulation.set_fastest(name, min(max(held, SLOWEST), fastest))
+                self._simulation.set_fastest(name, min(cap, fastest))
             elif name in self._fastest:
                 self._simulation.set_fastest(name, self._fastest.pop(name))
 
