@@ -25,7 +25,7 @@ from unjam.worlds.batch.extended import (
 )
 from unjam.worlds.batch.lane_changes import change_lanes
 from unjam.worlds.batch.noise import Numbers
-from unjam.worlds.batch.vehicles import FREELY, Vehicles, around, chosen, in_order
+from unjam.worlds.batch.vehicles import FREELY, Around, Vehicles, around, chosen, in_order
 
 NEVER = -1000.0
 """long before an episode began [s]"""
@@ -152,8 +152,16 @@ class Motorways:
             vehicle_length=road.vehicle_length,
         )
         self.vehicles, self.now = nobody(numbers), 0.0
+        self._near: tuple[Vehicles, Around] | None = None
         self.waiting = Waiting(roads, numbers)
         self._step, self._draw = step, draw
+
+    @property
+    def near(self) -> Around:
+        """Who is next to whom now."""
+        if self._near is None or self._near[0] is not self.vehicles:
+            self._near = self.vehicles, around(self.vehicles, self.stretch.lanes + 1)
+        return self._near[1]
 
     def step(self) -> Vehicles:
         """Make one step of all, and return who has left."""
@@ -172,7 +180,7 @@ class Motorways:
         xp, speed, place, way = namespace(vehicles.speed), vehicles.speed, vehicles.place, vehicles.way
         if not len(speed):
             return vehicles
-        row = chosen(around(vehicles, stretch.lanes + 1).ahead, way)
+        row = chosen(self.near.ahead, way)
         there = row >= 0
         on_ramp, on_lane = (way == 0) & (place < stretch.merge), (way == 0) & (place >= stretch.merge)
         allowed = xp.where(on_ramp, stretch.ramp_limit, stretch.limit) * vehicles.factor

@@ -24,7 +24,7 @@ from unjam.worlds.audit import (
     Brakings,
     following,
 )
-from unjam.worlds.batch.vehicles import Vehicles, around, chosen
+from unjam.worlds.batch.vehicles import Vehicles
 from unjam.worlds.record import FRAMES, Episode, Trajectory, shared_columns, trajectory
 from unjam.worlds.world import Driven
 
@@ -79,8 +79,15 @@ class MotorwayLog:
         self._leader, self._since = np.full((2, roads, self.entries), -1)
         self._steps, self._settled = 0, list[Floats]()
 
-    def note_step(self, vehicles: Vehicles, left: Vehicles, cavs: NDArray[np.intp], controlled: bool) -> None:
-        """Note how all braked in a step, and how CAVs follow, whose rows are `cavs`."""
+    def note_step(
+        self,
+        vehicles: Vehicles,
+        ahead: NDArray[np.intp],
+        left: Vehicles,
+        cavs: NDArray[np.intp],
+        controlled: bool,
+    ) -> None:
+        """Note how all braked in a step, and how CAVs, the rows `cavs`, follow those `ahead` of each."""
         self._steps += 1
         self._arrived += np.bincount(left.road, minlength=len(self.roads))
         road, entry = vehicles.road, vehicles.entry
@@ -88,7 +95,7 @@ class MotorwayLog:
         if controlled:
             rows = cavs[cavs >= 0]
             kind[rows] = CAV
-            leader = chosen(around(vehicles, len(self.roads[0].ways)).ahead, vehicles.way)[rows]
+            leader = ahead[rows]
             now, own = np.where(leader >= 0, entry[leader], -1), (road[rows], entry[rows])
             changed = self._leader[own] != now
             self._leader[own] = now

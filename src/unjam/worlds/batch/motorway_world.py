@@ -13,19 +13,16 @@ from unjam.drivers.command import Command, accelerations_of_many, time_headways
 from unjam.drivers.local_state import BESIDE, LARGEST_GAP, SECTIONS_AHEAD, LocalState
 from unjam.drivers.roadside import MainRoad, Messages
 from unjam.physics.arrays import Floats
-from unjam.physics.idm import IDMParameters, desired_speed_for
 from unjam.physics.kinematics import next_speed
 from unjam.scenarios.on_ramp import OnRamp
 from unjam.scenarios.road import MotorwayRoad
 from unjam.worlds.batch.lanes import CONTACT
 from unjam.worlds.batch.motorway import UNCAPPED, Motorways
 from unjam.worlds.batch.motorway_record import MotorwayLog
-from unjam.worlds.batch.vehicles import Vehicles, around, chosen
+from unjam.worlds.batch.vehicles import Vehicles, chosen
 from unjam.worlds.record import Episode
 from unjam.worlds.world import Driven, OnProgress
 
-SLOWEST = 0.1
-"""set speed below which SUMO has none [m/s]"""
 PER_ROAD = 100_000
 """more than want to enter a road in an episode"""
 
@@ -60,6 +57,8 @@ class MotorwayBatch:
         self._came = np.zeros(len(drawn))
         """CAVs that have entered each road"""
         self._controlled, self._headways_asked = False, False
+        self._lasting: Floats | None = None
+        """what networks explore with all episode long, of each road"""
         self._log = MotorwayLog(self.roads, entries, step, self.scenario.decision_step)
 
     def _drawn(self, shape: tuple[int, ...]) -> Floats:
@@ -102,7 +101,8 @@ class MotorwayBatch:
                 self._hold_back(np.asarray(wanted, np.float64))
             left = self._traffic.step()
             vehicles = self._traffic.vehicles
-            self._log.note_step(vehicles, left, self._rows_of_cavs(vehicles), self._controlled)
+            ahead = chosen(self._traffic.near.ahead, vehicles.way)
+            self._log.note_step(vehicles, ahead, left, self._rows_of_cavs(vehicles), self._controlled)
         self.decisions += 1
         self._look()
         after, kept = before.copy(), slice(len(before)) if self.kept is None else self.kept
@@ -128,15 +128,9 @@ class MotorwayBatch:
         there = found >= 0
         rows, wanted = found[there], wanted[there]
         speed, stretch = vehicles.speed[rows].astype(np.float64), self._traffic.stretch
-        told = next_speed(speed, wanted, step)
-        asked = (told - speed) / step
-        most = min(self.limits.highest, cruise.acceleration) - 1e-6
-        place = vehicles.place[rows]
-        held = (asked < most) & ~((place >= stretch.merge) & (place < stretch.closes))
-        acc = IDMParameters(max_acceleration=cruise.acceleration)
-        faster = desired_speed_for(np.where(held, asked, 0.0), speed, acc)
-        cap = np.where(asked <= 0.0, told, np.maximum(told, faster)).clip(SLOWEST, None)
-        vehicles.cap[rows] = np.where(held, cap, UNCAPPED)
+        asked = cruise.set_speed(speed, next_speed(speed, wanted, step), self.limits.highest, step)
+        beside = (vehicles.place[rows] >= stretch.merge) & (vehicles.place[rows] < stretch.closes)
+        vehicles.cap[rows] = np.where(beside, UNCAPPED, np.minimum(asked, UNCAPPED))
 
     def _rows_of_cavs(self, vehicles: Vehicles) -> NDArray[np.intp]:
         """Return the row of each CAV among vehicles; -1 where it has left."""
@@ -183,7 +177,7 @@ class MotorwayBatch:
         """Return the gaps of all to those ahead on their ways [m]; NaN where nobody is."""
         if not len(vehicles.road):
             return np.zeros(0)
-        row = chosen(around(vehicles, len(self.roads[0].ways)).ahead, vehicles.way)
+        row = chosen(self._traffic.near.ahead, vehicles.way)
         gaps = vehicles.place[row] - self.roads[0].vehicle_length - vehicles.place
         return np.where(row >= 0, gaps, np.nan)
 
@@ -192,8 +186,12 @@ class MotorwayBatch:
         rows, road = self._rows_of_cavs(vehicles), self.roads[0]
         if not len(rows):
             return _nobody()
-        near = around(vehicles, len(road.ways))
-        way, place, speed = vehicles.way[rows], vehicles.place[rows], vehicles.speed[rows]
+        near, way, place, speed = (
+            self._traffic.near,
+            vehicles.way[rows],
+            vehicles.place[rows],
+            vehicles.speed[rows],
+        )
 
         def other(neighbours: NDArray[np.intp], beside: int, towards: float) -> tuple[Floats, Floats]:
             row = chosen(neighbours, vehicles.way + beside)[rows]
@@ -228,9 +226,14 @@ class MotorwayBatch:
         )
         return found.each(lambda values: values.astype(np.float64)).read_only()
 
-    def noise(self) -> Floats:
-        """Return standard normal noise for one look of a network, shape (CAVs,)."""
+    def noise(self, lasting: int = 0) -> Floats:
+        """Return standard normal noise for one look of a network, shape (CAVs,), or what lasts."""
         roads = self._cavs // PER_ROAD
+        if lasting:
+            if self._lasting is None:
+                each = [generator.standard_normal(lasting) for generator in self._exploration]
+                self._lasting = np.stack(each)
+            return self._lasting[roads]
         found = np.empty(len(roads))
         for road in np.unique(roads).tolist():
             here = roads == road
