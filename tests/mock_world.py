@@ -42,7 +42,10 @@ class MockWorld:
             self.kept, self.entered = list(range(1, self.rows)), self.entered + 1
             self._speed, self._gap = (np.append(each[1:], 9.0) for each in (self._speed, self._gap))
 
-    def noise(self) -> Any:
+    def noise(self, lasting: int = 0) -> Any:
+        if lasting:
+            same = np.random.default_rng(1).standard_normal(lasting)
+            return same if self.single else np.tile(same, (self.rows, 1))
         drawn = self._generator.standard_normal(self.rows)
         return float(drawn[0]) if self.single else drawn
 

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -47,6 +49,23 @@ def test_exploration_adds_scaled_noise() -> None:
     network = random_network(5)
     observation, noise = np.zeros((3, 5)), np.array([-1.0, 0.0, 2.0])
     np.testing.assert_allclose(network.explore(observation, noise) - network(observation), 0.2 * noise)
+
+
+def test_noise_that_lasts_changes_what_the_last_hidden_layer_is_weighed_with() -> None:
+    network = replace(random_network(5), lasts=True)
+    generator = np.random.default_rng(1)
+    observation, noise = generator.normal(size=(7, 5)), generator.normal(size=(7, 16))
+    hidden = observation
+    for weight, bias in network.layers[:-1]:
+        hidden = np.maximum(0.0, hidden @ weight + bias)
+    assert network.noise_numbers == 16
+    found = network.explore(observation, noise)
+    np.testing.assert_allclose(found, network(observation) + 0.2 * (hidden * noise).sum(1), atol=1e-12)
+    plain = network.explore(tuple(observation[3].tolist()), noise[3])
+    assert isinstance(plain, float)
+    assert plain == pytest.approx(found[3], abs=1e-12)
+    tensors = network.explore(torch.tensor(observation), torch.tensor(noise))
+    np.testing.assert_allclose(tensors.numpy(), found, atol=1e-12)
 
 
 def test_noise_that_the_network_sizes_itself_comes_before_the_tanh() -> None:

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -13,7 +15,8 @@ from tests.learners.task import (
     sloped_target,
 )
 from unjam.errors import UnjamError
-from unjam.learners.algorithm_1 import actual_experience, seed_iteration
+from unjam.learners.algorithm_1 import actual_experience, afterwards, seed_iteration
+from unjam.learners.experience import experience_of
 from unjam.learners.settings import (
     AGENTS,
     LearnerSettings,
@@ -100,6 +103,22 @@ def test_only_the_critic_sees_the_road_that_was_drawn(agent: str, sees_road: boo
         assert set(rows.observations[:, INPUTS]) == {-1.0, 1.0}
     assert task.learner.sb3.observation_space.shape == (INPUTS + sees_road,)
     assert task.learner.network().inputs == INPUTS
+
+
+def test_what_is_earned_afterwards_is_discounted_look_by_look_to_the_last_one() -> None:
+    reward = np.arange(1.0, 12.0)
+    task = Toy(hold=2)
+    (episode,) = task.collect(task.learner.network(), 1)[0][:1]
+    (stays,) = episode.trajectories
+    left = replace(stays, residual=np.zeros(4), applied=np.zeros(4), hold=2)
+    whole = replace(episode, speeds=np.zeros((12, 1)), terms={"one": reward})
+    expected = 0.9 * (5.0 + 6.0) + 0.9**2 * (7.0 + 8.0) + 0.9**3 * (9.0 + 10.0) + 0.9**4 * 11.0
+    assert afterwards(whole, left, 0.9) == pytest.approx(expected)
+    assert afterwards(whole, replace(left, terminated=True), 0.9) is None
+    assert afterwards(replace(whole, speeds=np.zeros((5, 1))), left, 0.9) is None
+    alone, more = experience_of([left], [()]), experience_of([left], [()], [expected])
+    assert more.rewards[-1] - alone.rewards[-1] == pytest.approx(expected)
+    assert (alone.terminated.tolist(), more.terminated.tolist()) == ([False], [True])
 
 
 def test_each_iteration_of_each_run_draws_its_own_numbers() -> None:

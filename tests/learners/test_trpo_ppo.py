@@ -1,10 +1,11 @@
 from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
 import torch
+from torch.distributions import Normal
 
 from tests.learners.task import INPUTS, Toy, make_policy, of_any_size, random_rows, same, shake
 from unjam.drivers import PISaturation, ResidualDriver
@@ -132,6 +133,20 @@ def test_explores_at_the_start_with_the_standard_deviation_that_was_set(learned:
     torch.manual_seed(0)
     drawn = policy.get_distribution(torch.zeros(20_000, 5)).sample().detach()
     assert float(drawn.std()) == pytest.approx(0.5, rel=0.02)
+
+
+def test_noise_that_lasts_is_as_wide_in_the_network_as_the_policy_reckons() -> None:
+    policy = fresh(PolicySettings(exploration_std=0.1, exploration="lasting"), action_limit=2.0)
+    shake(policy, 3)
+    network, rows = policy.network(), random_rows(6, 5)
+    assert network.exploration_std == pytest.approx(0.2, rel=1e-6)
+    noise = np.random.default_rng(0).normal(size=(20_000, 1, network.noise_numbers))
+    drawn = np.stack([network.explore(rows.astype(float), each) for each in noise])
+    with torch.no_grad():
+        expected = cast(Normal, policy.get_distribution(torch.as_tensor(rows)).distribution)
+    np.testing.assert_allclose(drawn.std(0), expected.stddev[:, 0], rtol=0.03)
+    np.testing.assert_allclose(drawn.mean(0), expected.mean[:, 0], atol=0.02)
+    assert "log_std" not in dict(policy.named_parameters())
 
 
 @pytest.mark.parametrize("learned", [True, False])

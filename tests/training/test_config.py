@@ -97,6 +97,14 @@ def test_merging_changes_neither_side() -> None:
         ({"tasks": [{"road": {"lenght": 3}}]}, "scenario ring.lenght: unknown name"),
         ({"road.vehicles": 1}, "scenario ring.vehicles: 1 is not allowed"),
         ({"road.length": [250, 230]}, "scenario ring.length: 230 m is not allowed as the largest"),
+        (
+            {"policy.exploration": "mirrored", "agent": "sac"},
+            "policy.exploration: mirrored is not allowed; allowed: anew, for sac",
+        ),
+        (
+            {"policy.afterwards": True},
+            "policy.afterwards: true is not allowed; allowed: false with a virtual environment",
+        ),
         ({"scenario": "merge", "world": "batch"}, "world: batch is not allowed; allowed: sumo, for merge"),
         (
             {"world": "batch", "tasks": [{"scenario": "figure-eight"}, {"scenario": "merge"}]},

@@ -8,6 +8,7 @@ from unjam.drivers import PISaturation
 from unjam.scenarios import Ring
 from unjam.training.sampling import (
     FOLLOWING,
+    episodes_of,
     episodes_of_iteration,
     iterations_ahead,
     shares_by_regret,
@@ -55,6 +56,14 @@ def test_shares_sum_to_one_and_none_falls_below_what_weights_leave_it(
     assert all(
         share >= (1.0 - FOLLOWING) * least * (1 - 1e-9) for share, least in zip(found, by_weight, strict=True)
     )
+
+
+def test_mirrored_episodes_share_their_seed_and_explore_opposite_ways() -> None:
+    driver = PISaturation()
+    found = episodes_of(tasks(1.0), [driver], [5], (3, 7), spread=True, explore=True, mirrored=True)
+    assert [each.seed for each in found] == [(3, 7, 0), (3, 7, 0), (3, 7, 2), (3, 7, 2), (3, 7, 4)]
+    assert [each.explore for each in found] == [1.0, -1.0, 1.0, -1.0, 1.0]
+    assert found[0].scenario == found[1].scenario != found[2].scenario
 
 
 def test_every_road_has_an_episode_however_small_its_share() -> None:

@@ -1,6 +1,7 @@
 """Does tuning find better settings with the steps it has, and write what every verb can drive?"""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,18 +14,21 @@ from unjam.errors import InputError
 from unjam.measures.drivable import drivable_in_all
 from unjam.measures.gain import MEAN_GAIN, MOST, WORST
 from unjam.measures.metrics import measure
-from unjam.scenarios import FigureEight, Ring
-from unjam.training.search import Choice, Range
+from unjam.scenarios import FigureEight, Merge, Ring
+from unjam.scenarios.on_ramp import ON_RAMP
+from unjam.training.search import Choice, Range, Space
 from unjam.training.seeds import TUNE, tuning_seeds
 from unjam.training.tried import TRIED
 from unjam.training.tune import EPISODES, FINALISTS, OF_EACH, TUNED, space_around, tune
+from unjam.worlds.batch.run import run_batches
 from unjam.worlds.episode import run_episode
 from unjam.worlds.sumo.simulation import Simulation
-from unjam.worlds.workers import Workers
+from unjam.worlds.workers import EpisodeTask, Workers
 
 SMALL = Ring(horizon=60)
 FINAL = (FINALISTS + 1) * 2 * EPISODES * 60
 STEPS = FINAL + 4 * EPISODES * 60
+RAMP_SPACE: Space = {"margin": Range(-4.0, 4.0)}
 SPACE = {"catch_up_speed": Range(0.5, 3.0), "safe_gap_rule": Choice(("constant", "closing"))}
 
 
@@ -103,7 +107,23 @@ def test_screened_settings_are_judged_as_sumo_judges_them(tmp_path: Path, simula
 
 def test_roads_that_cannot_be_stepped_in_a_batch_are_not_screened(tmp_path: Path) -> None:
     with Workers(1) as workers, pytest.raises(InputError, match=r"screen: .*no ring"):
-        tune({"eight": FigureEight()}, "pi", SPACE, 10**9, tmp_path, workers, screen=True)
+        tune({"merge": Merge()}, "pi", SPACE, 10**9, tmp_path, workers, screen=True)
+
+
+def test_on_ramps_are_screened_in_batches_where_each_setting_has_roads_of_its_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("unjam.training.tune.EPISODES", 2)
+    monkeypatch.setattr("unjam.training.tune.FINALISTS", 1)
+    road = replace(ON_RAMP, horizon=60, cav_share=0.5)
+    with Workers(1) as workers:
+        found = tune({"on-ramp": road}, "jam-ahead", RAMP_SPACE, (8 + 4) * 60, tmp_path, workers, screen=None)
+    assert (found.actual_steps, found.imagined_steps) == (8 * 60, 2 * 2 * 60)
+    for setting in found.settings:
+        driver = named_driver(setting.driver, 1.0)
+        tasks = [EpisodeTask(road.part(part, 2), driver, seed) for part, seed in enumerate(tuning_seeds(2))]
+        rows = [measure(episode) for episode in run_batches(tasks, statistical=True)]
+        assert setting.score == pytest.approx(np.mean([row["return"] for row in rows]), rel=1e-12)
 
 
 def test_too_few_steps_are_refused_before_anything_is_driven(tmp_path: Path) -> None:

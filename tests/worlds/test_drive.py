@@ -1,5 +1,7 @@
 """The one loop, on a world without a simulator."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -45,6 +47,15 @@ def test_it_explores_only_when_asked_to() -> None:
     again, _ = drive(MockWorld(), RESIDUAL)
     np.testing.assert_array_equal(calm, again)
     assert not np.array_equal(calm, drive(MockWorld(), RESIDUAL, explore=True)[0])
+
+
+def test_noise_that_lasts_is_the_same_in_all_decisions_and_counts_the_other_way_too() -> None:
+    lasting = replace(RESIDUAL, network=replace(random_network(), lasts=True), action_limit=100.0)
+    told = [drive(MockWorld(decisions=4), lasting, explore)[0] for explore in (0.0, 1.0, -1.0)]
+    (calm, one, other), again = told, drive(MockWorld(decisions=4), lasting, 1.0)[0]
+    np.testing.assert_array_equal(one, again)
+    np.testing.assert_allclose(one[0] - calm[0], calm[0] - other[0], atol=1e-12)
+    assert np.abs(one[0] - calm[0]).min() > 0.01
 
 
 @pytest.mark.parametrize("driver", [PI, RESIDUAL, Mixed((PI, IDM())), Impaired(PI, delay=0.3)])

@@ -44,8 +44,8 @@ def tune(
     screen: Annotated[
         bool | None,
         typer.Option(
-            help="Try settings on batches of imagined rings, equal to SUMO's, and only finalists in SUMO "
-            "itself; without it, where there is such a ring."
+            help="Try settings on batches of imagined roads, equal to SUMO's or alike, and only finalists in "
+            "SUMO itself; without it, where there are such roads."
         ),
     ] = None,
     workers: WorkersOption = DEFAULT_WORKERS,

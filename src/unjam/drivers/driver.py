@@ -76,6 +76,9 @@ class Driver:
     hold: int = 1
     """decisions for which one residual is held"""
 
+    lasting_noise: int = 0
+    """how many numbers it explores with that stay as they are all episode long; 0: a new one each time"""
+
     limits: Limits | None = None
     """within which it keeps its own acceleration [m/s2]; None: the road does"""
 

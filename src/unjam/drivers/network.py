@@ -32,6 +32,9 @@ class Network:
     """largest residual acceleration [m/s2]"""
     exploration_std: float = 0.0
     """standard deviation of the exploration noise [m/s2], where the network does not give it"""
+    lasts: bool = False
+    """whether noise changes what the last hidden layer is weighed with; `exploration_std` is then that of
+    each weight"""
     squashes_noise: bool = field(init=False)
     """whether the network gives its noise's log standard deviation, and adds the noise before the tanh"""
     _hidden: tuple[Floats, ...] = field(init=False, repr=False, compare=False)
@@ -57,7 +60,15 @@ class Network:
         return self.authority * self._outputs_on_tensors(observation)[:, 0].tanh()
 
     def explore(self, observation: Any, noise: Any) -> Any:
-        """Return the residual with exploration; `noise` is standard normal, shaped like the residual."""
+        """Return the residual with exploration.
+
+        `noise` is standard normal, shaped like the residual; where it `lasts`, a number for each unit of the
+        last hidden layer, shape (n, units), or (units,) for a tuple. Source: generalised state-dependent
+        exploration, Raffin et al. 2022, CoRL.
+        """
+        if self.lasts:
+            shift = self.exploration_std * (self._units(observation) * noise).sum(-1)
+            return self(observation) + (float(shift) if isinstance(observation, tuple) else shift)
         if not self.squashes_noise:
             return self(observation) + self.exploration_std * noise
         if isinstance(observation, (tuple, np.ndarray)):
@@ -70,14 +81,30 @@ class Network:
 
     def _outputs_on_tensors(self, observation: Array) -> Array:
         """Return the last layer's outputs, shape (n, outputs)."""
-        xp, hidden = namespace(observation), observation
-        for index, layer in enumerate(self.layers):
-            weight, bias = (xp.as_tensor(part, dtype=hidden.dtype, device=hidden.device) for part in layer)
-            hidden = xp.addmm(bias, hidden.relu_() if index else hidden, weight)
+        hidden = self._units_of_tensors(observation)
+        weight, bias = _like(hidden, self.layers[-1])
+        return namespace(hidden).addmm(bias, hidden, weight)
+
+    def _units_of_tensors(self, observation: Array) -> Array:
+        """Return the last hidden layer, shape (n, units)."""
+        hidden = observation
+        for layer in self.layers[:-1]:
+            weight, bias = _like(hidden, layer)
+            hidden = namespace(hidden).addmm(bias, hidden, weight).relu_()
         return hidden
+
+    def _units(self, observation: Any) -> Any:
+        """Return the last hidden layer, shape (n, units), or (units,) for a tuple."""
+        if isinstance(observation, (tuple, np.ndarray)):
+            return self._folded_units(observation)[..., :-1]
+        return self._units_of_tensors(observation)
 
     def _outputs(self, observation: Any, last: Floats) -> Any:
         """Return what the weights `last` make of the last hidden layer."""
+        return self._folded_units(observation).dot(last)
+
+    def _folded_units(self, observation: Any) -> Floats:
+        """Return the last hidden layer, with one unit more that is always 1."""
         if isinstance(observation, tuple):
             hidden = np.array((*observation, 1.0))
         else:
@@ -85,12 +112,17 @@ class Network:
         for weight in self._hidden:
             hidden = hidden.dot(weight)
             np.maximum(hidden, 0.0, out=hidden)
-        return hidden.dot(last)
+        return hidden
 
     @property
     def inputs(self) -> int:
         """How many numbers the network sees."""
         return self.layers[0][0].shape[0]
+
+    @property
+    def noise_numbers(self) -> int:
+        """How many numbers it explores with that stay as they are; 0: a new one each time."""
+        return self.layers[-1][0].shape[0] if self.lasts else 0
 
 
 def _fold_biases(layers: tuple[tuple[Floats, Floats], ...]) -> tuple[Floats, ...]:
@@ -107,6 +139,11 @@ def _fold_biases(layers: tuple[tuple[Floats, Floats], ...]) -> tuple[Floats, ...
     return tuple(folded)
 
 
+def _like(tensor: Any, layer: tuple[Floats, Floats]) -> Any:
+    """Return weight and bias as tensors of the precision and on the device of another."""
+    return (namespace(tensor).as_tensor(part, dtype=tensor.dtype, device=tensor.device) for part in layer)
+
+
 def network_arrays(network: Network) -> dict[str, Floats]:
     """Return the weights of a network under the names that `network_from_arrays` reads."""
     arrays = {}
@@ -116,7 +153,9 @@ def network_arrays(network: Network) -> dict[str, Floats]:
     return arrays
 
 
-def network_from_arrays(arrays: dict[str, Floats], authority: float, exploration_std: float) -> Network:
+def network_from_arrays(
+    arrays: dict[str, Floats], authority: float, exploration_std: float, lasts: bool = False
+) -> Network:
     """Return the network whose weights `network_arrays` wrote; raise `InputError` where they do not fit."""
     layers: list[tuple[Floats, Floats]] = []
     for index in range(sum(name.endswith(".weight") for name in arrays)):
@@ -137,4 +176,4 @@ def network_from_arrays(arrays: dict[str, Floats], authority: float, exploration
         layers.append((np.asarray(weight, np.float64), np.asarray(bias, np.float64)))
     if not layers or layers[-1][0].shape[1] not in (1, 2):
         raise InputError("network: the last layer must have one output, or two with that of its noise")
-    return Network(tuple(layers), authority, exploration_std)
+    return Network(tuple(layers), authority, exploration_std, lasts)

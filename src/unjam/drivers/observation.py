@@ -7,6 +7,7 @@ A feature of your own is `path.py:name`, a function of a `LocalState` that answe
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
+from itertools import pairwise
 from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
@@ -33,6 +34,8 @@ ACCELERATION_SCALE = 1.0
 LOOP_LENGTH_SCALE = 250.0
 ROUTE_POSITION_SCALE = 100.0
 TO_MERGE_SCALE = 1000.0
+APPROACH = (0.0, 250.0, 500.0, 1000.0, 2000.0)
+"""ways to where a ramp joins at which one of the feature `approach` is one [m]"""
 
 
 class Seen(NamedTuple):
@@ -103,6 +106,19 @@ def _sections_ahead(field: str, where: str) -> Feature:
     )
 
 
+def approach(state: LocalState) -> Array:
+    """Return how near each place of `APPROACH` is: piecewise linear, in all one; none behind the last.
+
+    What is learned of one stretch of the way then changes nothing elsewhere.
+    """
+    way = clip(state.to_merge, APPROACH[0], APPROACH[-1])
+    xp, columns = namespace(way), [way * 0.0 + 1.0]
+    for low, high in pairwise(APPROACH):
+        share = clip((way - low) / (high - low), 0.0, 1.0)
+        columns[-1:] = [columns[-1] - share, share]
+    return xp.where((state.to_merge > 0.0)[..., None], stack_columns(tuple(columns)), 0.0)
+
+
 def _beside(state: LocalState) -> Array:
     """Return the relative speeds of those on the lanes beside, then the gaps, shape (n, 8), no unit."""
     speeds = (state.beside_speeds - state.speed[..., None]) / RELATIVE_SPEED_SCALE
@@ -150,6 +166,12 @@ FEATURES: dict[str, Feature] = {
         (Observed("way to where a ramp joins", TO_MERGE_SCALE, "m"),),
         told=("to_merge",),
     ),
+    "approach": Feature(
+        lambda seen: approach(seen.state),
+        tuple(Observed(f"nearness to {way:g} m before a ramp joins", 1.0, "") for way in APPROACH),
+        told=("to_merge",),
+        plain=False,
+    ),
     "lane_speeds": _sections_ahead("lane_speeds", "in its lane"),
     "road_speeds": _sections_ahead("road_speeds", "on the road"),
     "cav_share": Feature(
@@ -169,8 +191,8 @@ FEATURES: dict[str, Feature] = {
 }
 """all that a network can be shown: the paper's five numbers; the expert's acceleration; what the expert
 remembers; the length of the closed road; the place on it; the position along a road with ends; the share of
-CAVs; on motorways the wanted speed, the way to where a ramp joins, the speeds ahead in its lane and on all,
-and who drives beside it"""
+CAVs; on motorways the wanted speed, the way to where a ramp joins, also stretch by stretch, the speeds ahead
+in its lane and on all, and who drives beside it"""
 
 
 def _known(name: str) -> str:

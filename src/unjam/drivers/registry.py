@@ -76,6 +76,7 @@ class _ResidualRecipe:
     hold: Count
     authority: Positive
     exploration_std: NotNegative
+    lasts: bool = False
     files: list[dict[str, Any]] = Field(default_factory=list)
 
 
@@ -126,7 +127,7 @@ def _residual(recipe: Recipe, arrays: Arrays, held: Held) -> Driver:
     found = build(_ResidualRecipe, recipe, "driver recipe")
     expert = held(found.expert, EXPERT)
     own = {name: array for name, array in arrays.items() if not name.startswith(f"{EXPERT}.")}
-    network = network_from_arrays(own, found.authority, found.exploration_std)
+    network = network_from_arrays(own, found.authority, found.exploration_std, found.lasts)
     shown = observation_size(found.parts, expert)
     if network.inputs != shown:
         raise InputError(f"network: {network.inputs} inputs are not allowed; allowed: {shown}")

@@ -46,6 +46,11 @@ class ResidualDriver(Wrapper):
         return self.expert.plain_numbers and all(feature(name).plain for name in self.parts)
 
     @property
+    def lasting_noise(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """How many numbers its network explores with that stay as they are."""
+        return self.network.noise_numbers
+
+    @property
     def told(self) -> tuple[str, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
         """What the features look at."""
         return tuple(name for part in self.parts for name in feature(part).told)
@@ -120,6 +125,7 @@ class ResidualDriver(Wrapper):
             "hold": self.hold,
             "authority": self.network.authority,
             "exploration_std": self.network.exploration_std,
+            **({"lasts": True} if self.network.lasts else {}),
             **({"files": files} if files else {}),
         }
 

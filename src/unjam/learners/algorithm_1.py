@@ -24,7 +24,7 @@ from unjam.learners.road_imagination import RoadImagination
 from unjam.learners.settings import LearnerSettings, PolicySettings
 from unjam.virtual.settings import VirtualSettings
 from unjam.worlds.episode import Task
-from unjam.worlds.record import Episode, Floats
+from unjam.worlds.record import Episode, Floats, Trajectory
 
 COMPARED_ROWS = 2000
 """at most so many of the visited states tell how far an update has moved the policy"""
@@ -101,7 +101,7 @@ def begin_training(
         imaginations = [kind(virtual, task, policy, seed, index) for index, task in enumerate(tasks)]
     inputs = observation_size(policy.observe, tasks[0].expert)
     drawn = np.zeros((1, len(tasks[0].scenario.drawn_ranges)))
-    critic_inputs = seen_by_critic(tasks, policy, 0, drawn).shape[1]
+    critic_inputs = seen_by_critic(tasks, policy, 0, drawn).shape[1] + policy.afterwards
     limit = min(task.scenario.action_limit for task in tasks)
     spec = AgentSpec(inputs, critic_inputs, limit, policy, seed)
     return Training(tasks, policy, seed, make_learner(learner, spec), imaginations)
@@ -200,21 +200,30 @@ def plan_updates(training: Training) -> list[tuple[bool, int, int]]:
 
 def actual_experience(training: Training, episodes: Collected) -> Experience:
     """Return what was driven as experience; raise `UnjamError` where some of it is not finite."""
-    found = []
+    found, policy, gamma = [], training.policy, training.learner.gamma
     for index, (task, driven) in enumerate(zip(training.tasks, episodes, strict=True)):
-        pairs = [
-            (trajectory, task.scenario.drawn_scaled(episode.drawn))
-            for episode in driven
-            for trajectory in episode.trajectories
-        ]
-        drawn = np.array([scaled for _, scaled in pairs])
-        extra = seen_by_critic(training.tasks, training.policy, index, drawn)
-        found.append(experience_of([trajectory for trajectory, _ in pairs], extra))
+        pairs = [(episode, trajectory) for episode in driven for trajectory in episode.trajectories]
+        drawn = np.array([task.scenario.drawn_scaled(episode.drawn) for episode, _ in pairs])
+        extra, later = seen_by_critic(training.tasks, policy, index, drawn), None
+        if policy.afterwards:
+            came = [trajectory.start / task.scenario.horizon for _, trajectory in pairs]
+            extra = np.column_stack([extra, came])
+            later = [afterwards(episode, trajectory, gamma) for episode, trajectory in pairs]
+        found.append(experience_of([trajectory for _, trajectory in pairs], extra, later))
     joined = join(found)
     for name in ("observations", "rewards"):
         if not np.isfinite(getattr(joined, name)).all():
             raise UnjamError(f"learner: {name} of iteration {training.iteration} are not finite")
     return joined
+
+
+def afterwards(episode: Episode, trajectory: Trajectory, gamma: float) -> float | None:
+    """Return what was earned after a CAV had left, discounted to its last choice; None: it never left."""
+    end = trajectory.during.stop
+    if end >= episode.steps or trajectory.terminated:
+        return None
+    earned = np.add.reduceat(episode.reward[end:], np.arange(0, episode.steps - end, trajectory.hold))
+    return float(earned @ gamma ** np.arange(1, len(earned) + 1))
 
 
 def virtual_experience(training: Training, part: int, parts: int) -> Experience | None:

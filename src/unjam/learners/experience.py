@@ -49,10 +49,21 @@ class Experience:
 
 
 def experience_of(
-    trajectories: Sequence[Trajectory], critic_inputs: Sequence[Sequence[float]] | Float64
+    trajectories: Sequence[Trajectory],
+    critic_inputs: Sequence[Sequence[float]] | Float64,
+    afterwards: Sequence[float | None] | None = None,
 ) -> Experience:
-    """Return the experience of trajectories; `critic_inputs` has, for each, what the critic alone sees."""
+    """Return the experience of trajectories.
+
+    `critic_inputs` has, for each, what the critic alone sees; `afterwards` what was earned after its end,
+    discounted to its last choice: it then is no cut. None: the value of where it ended stands for that.
+    """
     choices = [trajectory.choices for trajectory in trajectories]
+    ended = [trajectory.terminated for trajectory in trajectories]
+    for number, more in enumerate(afterwards or ()):
+        if more is not None:
+            choices[number][1][-1] += more
+            ended[number] = True
     seen = [
         np.column_stack([trajectory.observations, np.tile(extra, (len(trajectory.observations), 1))])
         for trajectory, extra in zip(trajectories, critic_inputs, strict=True)
@@ -64,7 +75,7 @@ def experience_of(
         rewards=np.concatenate([earned for _, earned in choices]),
         starts=np.concatenate([[0], np.cumsum(counts)[:-1]]).astype(np.intp),
         last_observations=np.concatenate([rows[-1:] for rows in seen]).astype(np.float32),
-        terminated=np.array([trajectory.terminated for trajectory in trajectories]),
+        terminated=np.array(ended),
     )
 
 

@@ -40,6 +40,16 @@ class PolicySettings:
     """standard deviation of the exploration noise at the start, as a share of the action limit"""
     learn_exploration: bool = True
     """whether the standard deviation is learned, or stays what it is at the start (sac always learns it)"""
+    exploration: Literal["anew", "lasting", "mirrored"] = "anew"
+    """`anew`: noise for each look of a CAV. `lasting`: one change of what the last hidden layer is weighed
+    with, of which `exploration_std` is that of each weight, for all CAVs all episode long: what many do for
+    minutes shows in what everybody gains, where single commands vanish in people's noise (trpo and ppo; it
+    is not learned; after Raffin et al. 2022, CoRL). `mirrored`: likewise, and each episode has another of the
+    same people in which the change is opposite (after Salimans et al. 2017, arXiv:1703.03864)"""
+    afterwards: bool = False
+    """whether a CAV also earns what is earned once it has left a road with ends, and the value network sees
+    when it came: where all earn the same, a jam that it has prevented shows when it is gone. Without a
+    virtual environment, whose moments do not know what follows"""
     hold: NotNegative = 1.0
     """how long one residual is held [s], rounded to whole decisions, at least one: over a second noise adds
     up to a change of speed instead of cancelling itself"""
@@ -49,6 +59,11 @@ class PolicySettings:
     normalise_value: bool = True
     """scale the value network by the returns of the first iteration (sac: shift by its mean reward): one that
     starts at zero needs tens of iterations to reach values of 150"""
+
+    @property
+    def lasts(self) -> bool:
+        """Whether exploration stays as it is all episode long."""
+        return self.exploration != "anew"
 
     def decisions_held(self, decision_step: float) -> int:
         """Return for how many decisions a residual is held where one takes `decision_step` seconds."""

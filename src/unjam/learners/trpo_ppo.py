@@ -87,8 +87,11 @@ class ResidualPolicy(ActorCriticPolicy):
         self.settings = settings
         self.inputs = inputs
         self.authority = settings.authority * action_limit
-        noise = math.log(settings.exploration_std * action_limit)
-        super().__init__(*arguments, log_std_init=noise, optimizer_class=Adam, **named)
+        named |= {
+            "log_std_init": math.log(settings.exploration_std * action_limit),
+            "use_sde": settings.lasts,
+        }
+        super().__init__(*arguments, optimizer_class=Adam, **named)
 
     def _build_mlp_extractor(self) -> None:
         critic_inputs = self.features_dim - self.inputs
@@ -104,7 +107,7 @@ class ResidualPolicy(ActorCriticPolicy):
         self.value_net = ScaledValue(self.mlp_extractor.latent_dim_vf)  # pyright: ignore[reportAttributeAccessIssue]
         nn.init.orthogonal_(self.value_net.linear.weight)
         nn.init.zeros_(self.value_net.linear.bias)
-        if not self.settings.learn_exploration:
+        if self.settings.lasts or not self.settings.learn_exploration:
             log_std = self.log_std.detach()
             del self.log_std
             self.register_buffer("log_std", log_std)
@@ -128,7 +131,8 @@ class ResidualPolicy(ActorCriticPolicy):
     def network(self) -> Network:
         """Return the NumPy twin: the same residual to 1e-6, and the same exploration noise."""
         layers = network_layers(nn.Sequential(self.mlp_extractor.policy_net, self.action_net))  # pyright: ignore[reportArgumentType]
-        return Network(layers, self.authority, float(torch.exp(self.log_std.detach()).item()))
+        std = float(torch.exp(self.log_std.detach()).flatten()[0].item())
+        return Network(layers, self.authority, std, self.settings.lasts)
 
 
 class OnPolicy(Learner):

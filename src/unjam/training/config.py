@@ -117,6 +117,13 @@ class RunConfig(Agents):
         whys = [why_none(road.make_scenario()) for road in self.roads().values()]
         if self.world == "batch" and all(whys):
             raise ValueError(f"world: batch is not allowed; allowed: sumo, for {whys[0]}")
+        if self.policy.afterwards and self.virtual.virtual_ratio > 0:
+            raise ValueError(
+                "policy.afterwards: true is not allowed; allowed: false with a virtual environment"
+            )
+        if self.policy.lasts and self.agent not in ("trpo", "ppo"):
+            kind = self.policy.exploration
+            raise ValueError(f"policy.exploration: {kind} is not allowed; allowed: anew, for {self.agent}")
         if self.sampling == "regret" and (len(self.tasks) < 2 or self.evaluation.every == 0):
             raise ValueError(
                 "sampling: regret is not allowed; allowed: weights, but for several validated tasks"

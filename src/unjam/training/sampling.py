@@ -95,16 +95,20 @@ def episodes_of(
     *,
     spread: bool,
     explore: bool,
+    mirrored: bool = False,
 ) -> list[EpisodeTask]:
     """Return `counts` episodes of each task, one after the other; each has a number behind the seed.
 
-    With `spread` those of a road cover the range of what its scenario draws.
+    With `spread` those of a road cover the range of what its scenario draws. Of two that are `mirrored` the
+    second has the seed of the first, and explores the other way.
     """
     wanted: list[EpisodeTask] = []
     for task, driver, count in zip(tasks, drivers, counts, strict=True):
         for part in range(count):
-            scenario = task.scenario.part(part, count) if spread else task.scenario
-            wanted.append(EpisodeTask(scenario, driver, (*seed, len(wanted)), task.reward, explore))
+            second = mirrored and part % 2 == 1
+            scenario = task.scenario.part(part - second, count) if spread else task.scenario
+            own = (*seed, len(wanted) - second)
+            wanted.append(EpisodeTask(scenario, driver, own, task.reward, -1.0 if second else float(explore)))
     return wanted
 
 

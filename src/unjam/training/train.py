@@ -291,7 +291,9 @@ class Trainer:
         self, drivers: Sequence[Driver], counts: Sequence[int], *seeds: tuple[int, ...], explore: bool = True
     ) -> Collected:
         """Run `counts` episodes of the first seed, road by road; those of the others are to come."""
-        all_of = partial(episodes_of, self.tasks, drivers, counts, spread=self.config.spread, explore=explore)
+        mirrored = explore and self.config.policy.exploration == "mirrored"
+        how = {"spread": self.config.spread, "explore": explore, "mirrored": mirrored}
+        all_of = partial(episodes_of, self.tasks, drivers, counts, **how)
         now, *coming = map(all_of, seeds)
         alone, later = not self.config.tasks, list(chain(*coming))
         at_once = partial(run_where_possible, run=self.workers.run, coming=later, statistical=alone)

@@ -7,6 +7,7 @@ limits and filter. Settings that no car could drive do not count.
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from functools import cache, partial
+from itertools import chain
 from math import inf
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin, get_type_hints
@@ -24,14 +25,15 @@ from unjam.measures.drivable import DRIVABLE, drivable_in_all
 from unjam.measures.gain import MEAN_GAIN, Rows, ceiling, gain
 from unjam.measures.metrics import measure
 from unjam.scenarios import scenario_recipe
+from unjam.scenarios.on_ramp import OnRamp
 from unjam.scenarios.scenario import Scenario
 from unjam.training.evaluate import raise_failure
 from unjam.training.folder import origin
 from unjam.training.search import Choice, Range, Space, quiet_optuna
 from unjam.training.seeds import tuning_seeds
 from unjam.training.tried import Tried, Verdict
-from unjam.worlds.batch.possible import why_not
-from unjam.worlds.batch.run import run_batch
+from unjam.worlds.batch.possible import statistical_why_not, why_not
+from unjam.worlds.batch.run import run_batch, run_batches
 from unjam.worlds.workers import EpisodeTask, Workers
 
 TUNED = "tuned.json"
@@ -76,7 +78,7 @@ class Tuned:
     actual_steps: int
     """driven in SUMO"""
     imagined_steps: int
-    """driven in batches of rings, where settings were screened there"""
+    """driven in batches, where settings were screened there"""
     file: Path
     """the tuned expert as a controller"""
 
@@ -147,8 +149,8 @@ def tune(
         reward: what is maximised on one road; empty: the scenario's own.
         seed: of the proposals.
         on_line: gets a line for each setting.
-        screen: whether settings are tried in batches where a road is a ring, which are SUMO's but for
-            rounding, and there only the finalists, and the expert as it is, in SUMO; None: if there is one.
+        screen: whether settings are tried in batches where a road can be stepped so (of several: exactly),
+            and there only the finalists, and the expert as it is, in SUMO; None: if there is one.
 
     Raises:
         InputError: the steps are too few, a parameter is wrong, no road can be stepped in a batch, or the
@@ -163,7 +165,8 @@ def tune(
     trials = (steps - final) // each
     if trials < 2:
         raise InputError(f"steps: {steps} is not allowed; allowed: >= {final + 2 * each} for two settings")
-    reasons = {road: why_not(scenario) for road, scenario in roads.items()}
+    why_none = statistical_why_not if len(roads) == 1 else why_not
+    reasons = {road: why_none(scenario) for road, scenario in roads.items()}
     if screen and all(reasons.values()):
         raise InputError(f"screen: {next(iter(reasons.values()))}")
     screened = [road for road, why in reasons.items() if screen is not False and not why]
@@ -191,7 +194,8 @@ def tune(
     optuna, settings = quiet_optuna("tune"), list[Setting]()
     sampler = optuna.samplers.TPESampler(seed=seed, multivariate=True)
     study = optuna.create_study(direction="maximize", sampler=sampler)
-    at_once = SCREENED if screen else 1
+    few = not any(isinstance(roads[road], OnRamp) for road in screened)  # they take as long as many
+    at_once = 1 if few and not screen else SCREENED
     for first in range(0, trials, at_once):
         asked = [study.ask() for _ in range(first, min(first + at_once, trials))]
         for trial in asked:
@@ -236,10 +240,7 @@ def _driven(
     reward: str,
     run: Mapping[str, Run],
 ) -> list[dict[str, Rows]]:
-    """Return the rows of each driver, road by road, on tuning seeds from number `first` on.
-
-    Each road is driven by its own of `run`.
-    """
+    """Return the rows of each driver, by road, each by its own of `run`, on tuning seeds from `first` on."""
     found: list[dict[str, Rows]] = [{} for _ in drivers]
     seeds = tuning_seeds(count, first)
     for road, scenario in roads.items() if drivers else ():
@@ -258,19 +259,21 @@ def _driven(
 
 def _in_sumo(workers: Workers, tasks: list[list[EpisodeTask]]) -> list[Rows]:
     # Measured as they end: a motorway's whole episode takes 80 MB.
-    every = [task for each in tasks for task in each]
-    rows = iter(workers.run_each(every, lambda index, episode: measure(episode)))
+    rows = iter(workers.run_each([*chain(*tasks)], lambda index, episode: measure(episode)))
     return [[next(rows) for _ in each] for each in tasks]
 
 
 def _in_batch(tasks: list[list[EpisodeTask]]) -> list[Rows]:
     import torch
 
+    if isinstance(tasks[0][0].scenario, OnRamp):
+        driven = iter(run_batches([*chain(*tasks)], statistical=True))
+        return [[measure(next(driven)) for _ in each] for each in tasks]
     # Rings go round the drivers as CAVs do in a mixture: a ring's CAVs all have the same one.
     drivers = [each[0].driver for each in tasks]
     together = drivers[0] if len(drivers) == 1 else Mixed(tuple(drivers))
     mixed = [replace(task, driver=together) for part in zip(*tasks, strict=True) for task in part]
-    episodes = run_batch(mixed, torch.as_tensor if together.tensors else np.asarray)
+    episodes = run_batch(mixed, torch.as_tensor if together.tensors else np.asarray, statistical=True)
     rows = [measure(episode) for episode in episodes]
     return [rows[number :: len(drivers)] for number in range(len(drivers))]
 
@@ -317,9 +320,7 @@ def _write(
         "default": asdict(found.default),
     }
     driver = named_driver(found.best.driver, scenario.decision_step)
-    tuned = {
-        key: about[key] for key in ("reward", "seed", "actual_steps", "imagined_steps", "best", "default")
-    }
+    tuned = {key: value for key, value in about.items() if key not in ("scenario", "expert")}
     content = controller_bytes(driver, {**origin(scenario, driver), "tuned": tuned})
     write_whole(found.file, content)
     rows = [asdict(one) for one in found.settings]

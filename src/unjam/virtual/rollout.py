@@ -135,6 +135,7 @@ class ImaginedWorld:
         self._decisions, self._generator = decisions, generator
         like = starts.state.speed
         self._running, self._ran, self._rewards = torch.ones_like(like), [], []
+        self._lasting: Tensor | None = None
         # Single precision counts to 2^24 only.
         self._lived = torch.zeros((), dtype=torch.float64, device=like.device)
         self._bounded = torch.zeros(len(BOUNDS), dtype=torch.float64, device=like.device)
@@ -163,10 +164,16 @@ class ImaginedWorld:
         self._lived += self._running.sum()
         self._running = self._running * ~found.crashed
 
-    def noise(self) -> Tensor:
-        """Return standard normal noise, shape (n,)."""
+    def noise(self, lasting: int = 0) -> Tensor:
+        """Return standard normal noise, shape (n,), or (n, lasting): each row is a road of its own."""
         like = self.states[-1].speed
-        return torch.randn(len(like), generator=self._generator, device=like.device)
+        if not lasting:
+            return torch.randn(len(like), generator=self._generator, device=like.device)
+        if self._lasting is None:
+            shape = len(like), lasting
+            drawn = torch.randn(shape, generator=self._generator, device=like.device)
+            self._lasting = drawn.to(like.dtype)
+        return self._lasting
 
     def record(self, driven: Driven) -> Rollouts:
         """Return what happened, choice by choice.

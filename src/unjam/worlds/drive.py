@@ -1,6 +1,7 @@
 """Driving: the one loop in which a driver and a world meet."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -21,17 +22,17 @@ class Drive:
         self,
         world: World[Recorded],
         driver: Driver,
-        explore: bool = False,
+        explore: float = 0.0,
         memory: Memory | None = None,
         on_progress: OnProgress | None = None,
     ) -> None:
         """Start the world; nothing is decided yet.
 
-        With `explore`, what was learned adds its noise. Without a `memory` the driver remembers nothing but
+        What was learned adds its noise times `explore`. Without a `memory` the driver remembers nothing but
         what the world began with. `on_progress` is called now and then with the number of decisions made.
         """
         self.world, self.driver, self._on_progress = world, driver, on_progress
-        self._noise = world.noise if explore else None
+        self._noise = partial(_times, explore, world.noise, driver.lasting_noise) if explore else None
         history = world.start(not driver.native, on_progress)
         self.memory = driver.initial_memory(world.rows) if memory is None else memory
         if history is not None:
@@ -78,10 +79,15 @@ class Drive:
             self.memories.append(mapped(lambda values: np.array(values[row], np.float64), self.memory))  # noqa: B023
 
 
+def _times(factor: float, noise: Callable[[int], Any], lasting: int) -> Any:
+    """Return noise times a factor."""
+    return noise(lasting) if factor == 1.0 else factor * noise(lasting)
+
+
 def drive(
     world: World[Recorded],
     driver: Driver,
-    explore: bool = False,
+    explore: float = 0.0,
     memory: Memory | None = None,
     on_progress: OnProgress | None = None,
 ) -> Recorded:

@@ -37,7 +37,7 @@ def run_episode(
     driver: DriverLike,
     seed: int | Sequence[int],
     reward: str = "",
-    explore: bool = False,
+    explore: float = 0.0,
     full: bool = False,
     simulation: Simulation | None = None,
     progress: OnProgress | None = None,
@@ -52,7 +52,7 @@ def run_episode(
         driver: of every CAV: a driver, anything with `act` and `initial_memory`, or a function of the state.
         seed: an integer or several; everything random comes from them.
         reward: name, or `path.py:name`; empty: the scenario's own.
-        explore: whether a residual driver adds its exploration noise.
+        explore: by how much a residual driver's exploration noise counts: 1, -1 for the opposite, or 0.
         full: whether fuel is recorded and, on roads with ends, where on the plane vehicles are (it costs a
             tenth of the speed).
         simulation: an open one to use again; without it, one is opened and closed, on a network of your

@@ -39,7 +39,7 @@ class EpisodeTask:
     driver: Driver
     seed: tuple[int, ...]
     reward: str = ""
-    explore: bool = False
+    explore: float = 0.0
     full: bool = False
 
     def message(self) -> Message:

@@ -80,8 +80,12 @@ class World(Protocol[Recorded]):
         """
         ...
 
-    def noise(self) -> Array:
-        """Return standard normal noise for one look of a network: shape (CAVs,), or a plain number."""
+    def noise(self, lasting: int = 0) -> Array:
+        """Return standard normal noise for one look of a network: shape (CAVs,), or a plain number.
+
+        With `lasting`, so many numbers for each CAV, shape (CAVs, lasting), that are the same for all CAVs
+        of a road and in all looks.
+        """
         ...
 
     def record(self, driven: Driven) -> Recorded:
@@ -120,9 +124,9 @@ class RecordedWorld:
         """Note what was asked for, and go on to the next moment."""
         self._answers.append(accelerations(command, self.limits, self._names, len(self._answers)))
 
-    def noise(self) -> Any:
+    def noise(self, lasting: int = 0) -> Any:
         """Return none: nobody explores here."""
-        return np.zeros(self.rows)
+        return np.zeros((self.rows, lasting) if lasting else self.rows)
 
     def record(self, driven: Driven) -> NDArray[np.float64]:
         """Return what was asked for, within the limits [m/s2], shape (T, n)."""
@@ -184,9 +188,9 @@ class PursuitWorld:
         self._position = self._position + speed * step
         self._ahead.append(Ahead(speed, leader, before.gap + (leader - speed) * step))
 
-    def noise(self) -> Floats:
+    def noise(self, lasting: int = 0) -> Floats:
         """Return none: nobody explores here."""
-        return np.zeros(self.rows)
+        return np.zeros((self.rows, lasting) if lasting else self.rows)
 
     def record(self, driven: Driven) -> Pursued:
         """Return what happened."""

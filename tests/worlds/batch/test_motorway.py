@@ -7,6 +7,9 @@ import numpy as np
 import pytest
 import torch
 
+from tests.conftest import random_network
+from unjam.drivers import ResidualDriver
+from unjam.drivers.command import Command
 from unjam.drivers.driver import Driver
 from unjam.drivers.registry import named_driver
 from unjam.errors import InputError
@@ -21,6 +24,7 @@ from unjam.worlds.batch.beside import Stretch
 from unjam.worlds.batch.extended import Ahead, Errors, bounds, felt, finished, follow
 from unjam.worlds.batch.lane_changes import change_lanes
 from unjam.worlds.batch.motorway import Motorways
+from unjam.worlds.batch.motorway_world import MotorwayBatch
 from unjam.worlds.batch.possible import statistical_why_not, why_not
 from unjam.worlds.batch.run import run_batch, run_where_possible
 from unjam.worlds.batch.vehicles import FREELY, Drivers, Vehicles, around, chosen, in_order
@@ -250,6 +254,37 @@ def test_nobody_touches_anybody_or_is_lost(driven: dict[str, list[Episode]]) -> 
         assert there[-1].sum() + episode.arrived == len(episode.vehicle_ids)
         assert np.nanmin(episode.speeds) >= 0.0
         assert episode.audit.people.hardest <= 9.0 + 1e-9
+
+
+def test_each_road_has_its_own_driver_and_exploration() -> None:
+    road = replace(SHORT, horizon=150, cav_share=0.3)
+    drivers = [driver_of("jam-ahead"), driver_of("cruise"), driver_of("gap-maker")]
+    tasks = [EpisodeTask(road, driver, seeds_of(2)[-1]) for driver in drivers]
+    for task, together in zip(tasks, run_batch(tasks, statistical=True), strict=True):
+        (alone,) = run_batch([task], statistical=True)
+        np.testing.assert_array_equal(together.speeds, alone.speeds)
+    noises = [replace(random_network(3), lasts=lasts) for lasts in (False, True)]
+    for network in noises:
+        driver = ResidualDriver(
+            driver_of("jam-ahead"), network, 2.5, ("to_merge", "allowed_speed", "cav_share")
+        )
+        tasks = [EpisodeTask(road, driver, seeds_of(1)[0], explore=explore) for explore in (1.0, -1.0)]
+        one, other = run_batch(tasks, statistical=True)
+        first, second = (each.trajectories[0] for each in (one, other))
+        calm = network(first.observations[:1])
+        assert first.residual[0] != second.residual[0]
+        assert first.residual[0] + second.residual[0] == pytest.approx(2.0 * calm[0], abs=1e-12)
+
+
+def test_noise_that_lasts_is_that_of_the_road() -> None:
+    world = MotorwayBatch(replace(SHORT, cav_share=0.5), seeds_of(2))
+    world.start(True)
+    seen = set[tuple[float, ...]]()
+    for _ in range(40):
+        world.advance(Command(np.zeros(world.rows)))
+        assert world.noise(3).shape == (world.rows, 3)
+        seen |= set(map(tuple, world.noise(3).tolist()))
+    assert len(seen) == 2
 
 
 def test_what_a_cav_perceived_is_what_was_there(driven: dict[str, list[Episode]]) -> None:

@@ -35,8 +35,18 @@ class MotorwayBatch:
     """fields of a `LocalState` that the driver looks at"""
     kept: Sequence[int] | None = None
 
-    def __init__(self, scenario: OnRamp, seeds: Sequence[Sequence[int]], kind: type = np.float64) -> None:
-        """Take empty roads, one for each seed; numbers have the precision `kind`."""
+    def __init__(
+        self,
+        scenario: OnRamp,
+        seeds: Sequence[Sequence[int]],
+        kind: type = np.float64,
+        explore: Sequence[float] | None = None,
+    ) -> None:
+        """Take empty roads, one for each seed; numbers have the precision `kind`.
+
+        By `explore` exploration noise counts on each road; None: as it is drawn.
+        """
+        self._explore = np.ones(len(seeds)) if explore is None else np.array(explore)
         self.scenario, self._seeds = scenario, seeds
         drawn = [scenario.of_seed(seed) for seed in seeds]
         self.roads = [cast(MotorwayRoad, road) for road, _ in drawn]
@@ -79,6 +89,11 @@ class MotorwayBatch:
     def rows(self) -> int:
         """CAVs on the roads now."""
         return len(self._cavs)
+
+    @property
+    def of_road(self) -> NDArray[np.intp]:
+        """Which road each CAV is on, shape (CAVs,)."""
+        return self._cavs // PER_ROAD
 
     @property
     def ended(self) -> bool:
@@ -228,17 +243,17 @@ class MotorwayBatch:
 
     def noise(self, lasting: int = 0) -> Floats:
         """Return standard normal noise for one look of a network, shape (CAVs,), or what lasts."""
-        roads = self._cavs // PER_ROAD
+        roads = self.of_road
         if lasting:
             if self._lasting is None:
                 each = [generator.standard_normal(lasting) for generator in self._exploration]
                 self._lasting = np.stack(each)
-            return self._lasting[roads]
+            return self._explore[roads, None] * self._lasting[roads]
         found = np.empty(len(roads))
         for road in np.unique(roads).tolist():
             here = roads == road
             found[here] = self._exploration[road].standard_normal(int(here.sum()))
-        return found
+        return self._explore[roads] * found
 
     def record(self, driven: Driven) -> tuple[Episode, ...]:
         """Return what happened on each road since the start, without what was earned."""

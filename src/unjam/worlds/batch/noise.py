@@ -1,12 +1,12 @@
 """The noise of many episodes at once: each world's as SUMO's episode of its seed draws it, or quicker."""
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from unjam.physics.arrays import Array
+from unjam.physics.arrays import Array, namespace
 from unjam.worlds.closed import NOISE_BLOCK
 
 Numbers = Callable[[NDArray[np.float64]], Array]
@@ -26,6 +26,10 @@ class Noise(Protocol):
 
     def of_networks(self, decision: int) -> Array:
         """Return a number for each CAV, shape (CAVs * W,), for its network's exploration."""
+        ...
+
+    def lasting(self, numbers: int) -> Array:
+        """Return so many numbers for each CAV, shape (CAVs * W, numbers): always those of its world."""
         ...
 
 
@@ -90,6 +94,13 @@ class SeededNoise:
             self._exploration = self._numbers(np.stack(each, 2).reshape(len(each[0]), -1))
         return self._exploration[decision]
 
+    def lasting(self, numbers: int) -> Array:
+        """Return so many numbers for each CAV, shape (CAVs * W, numbers)."""
+        if self._exploration is None:
+            each = [np.random.default_rng(seed).standard_normal(numbers) for seed in self._networks]
+            self._exploration = self._numbers(np.tile(each, (self._decisions[1], 1)))
+        return self._exploration
+
 
 class QuickNoise:
     """One generator for all worlds: other numbers than SUMO's episodes draw, of the same kind."""
@@ -99,6 +110,7 @@ class QuickNoise:
     ) -> None:
         """Take what draws standard normal numbers of a shape."""
         self._draw, self._people, self._networks = draw, (vehicles, worlds), (cavs * worlds,)
+        self._worlds, self._exploration = worlds, cast(Array, None)
 
     def of_people(self) -> Array:
         """Return a number for each vehicle in this step, shape (vehicles, W)."""
@@ -110,6 +122,13 @@ class QuickNoise:
     def of_networks(self, decision: int) -> Array:
         """Return a number for each CAV, shape (CAVs * W,)."""
         return self._draw(self._networks)
+
+    def lasting(self, numbers: int) -> Array:
+        """Return so many numbers for each CAV, shape (CAVs * W, numbers)."""
+        if self._exploration is None:
+            each = self._draw((self._worlds, numbers))
+            self._exploration = namespace(each).tile(each, (self._networks[0] // self._worlds, 1))
+        return self._exploration
 
 
 def noise_of(

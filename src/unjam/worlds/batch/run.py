@@ -1,13 +1,18 @@
 """Episodes of many roads at once, instead of one after the other in SUMO."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import cast
 
 import numpy as np
+from numpy.typing import NDArray
 
 from unjam.drivers.driver import Driver, Memory
+from unjam.drivers.local_state import LocalState
 from unjam.drivers.residual import AGE
+from unjam.drivers.wrappers import KIND, Mixed
 from unjam.errors import InputError
+from unjam.physics.arrays import Array
 from unjam.scenarios.on_ramp import OnRamp
 from unjam.scenarios.ring import Loop
 from unjam.tree import mapped
@@ -36,7 +41,7 @@ def begin(
     world: RingBatch,
     driver: Driver,
     numbers: Numbers = np.asarray,
-    explore: bool = False,
+    explore: float = 0.0,
     memory: Memory | None = None,
 ) -> Drive:
     """Return a driver who has just begun in a batch, and remembers in its arrays.
@@ -45,7 +50,7 @@ def begin(
         world: where.
         driver: of every CAV; where arrays are tensors, one who takes them.
         numbers: makes the world's arrays.
-        explore: whether what was learned adds its exploration noise.
+        explore: by how much exploration noise of what was learned counts.
         memory: what the driver remembers already; None: nothing but what the world began with.
     """
     world.asked = driver.asks
@@ -65,7 +70,7 @@ def run_batch(
     """Return the episodes of tasks, as `run_episode` does in SUMO, but for rounding; all are stepped at once.
 
     Args:
-        tasks: roads that differ in length and seed alone.
+        tasks: roads that differ in length and seed alone; motorways also in driver and exploration.
         numbers: makes the arrays that are stepped.
         coming: tasks that will follow, alike; they are warmed up beforehand where these have to be.
         statistical: whether roads are allowed whose episodes are SUMO's in distribution alone.
@@ -75,7 +80,7 @@ def run_batch(
     """
     first = tasks[0]
     if any(_driven(each) != _driven(first) for each in tasks):
-        raise InputError("batch: the tasks differ in driver, reward or exploration, or want fuel")
+        raise InputError("batch: the tasks differ in driver, reward or exploration")
     earned = make_reward(first.reward or first.scenario.reward)
     return [rewarded(episode, earned) for episode in _driven_at_once(tasks, numbers, coming, statistical)]
 
@@ -87,15 +92,45 @@ def _driven_at_once(
     first = tasks[0]
     if isinstance(first.scenario, OnRamp):
         check_together([task.scenario for task in tasks], statistical)
-        motorways = MotorwayBatch(first.scenario, [task.seed for task in tasks])
-        motorways.asked = first.driver.asks
-        return driven_to_the_end(Drive(motorways, first.driver, first.explore))
+        explore = [task.explore for task in tasks]
+        motorways = MotorwayBatch(first.scenario, [task.seed for task in tasks], explore=explore)
+        driver = _of_all(tasks, motorways)
+        motorways.asked = driver.asks
+        return driven_to_the_end(Drive(motorways, driver, float(any(explore))))
     scenarios, seeds = [cast(Loop, each.scenario) for each in tasks], [each.seed for each in tasks]
     world = RingBatch(scenarios, seeds, numbers, first.reward, statistical=statistical)
     if world.scenario.warmup > 0:
         world.begun = BEGUN.of([_ring(task) for task in tasks], [_ring(task) for task in coming], _warm_up)
     rings: Rings = driven_to_the_end(begin(world, first.driver, numbers, first.explore))
     return rings.episodes
+
+
+@dataclass(frozen=True)
+class PerRoad(Mixed):
+    """Drives each motorway of a batch by its own of several drivers."""
+
+    motorways: MotorwayBatch
+    owner: NDArray[np.intp]
+    """which driver each road has, shape (W,)"""
+
+    def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
+        """Return the acceleration that each CAV's driver wants, and the new memory."""
+        return super().act(state, memory | {KIND: self.owner[self.motorways.of_road]})
+
+    def time_headways(self, state: LocalState, memory: Memory) -> Array | None:
+        """Return for each CAV that of its driver."""
+        return super().time_headways(state, memory | {KIND: self.owner[self.motorways.of_road]})
+
+
+def _of_all(tasks: Sequence[EpisodeTask], motorways: MotorwayBatch) -> Driver:
+    """Return the driver of all tasks, or who drives each motorway by its own."""
+    drivers = list[Driver]()
+    for task in tasks:
+        if task.driver not in drivers:
+            drivers.append(task.driver)
+    if len(drivers) == 1:
+        return drivers[0]
+    return PerRoad(tuple(drivers), motorways, np.array([drivers.index(task.driver) for task in tasks]))
 
 
 def _ring(task: EpisodeTask) -> _Ring:
@@ -157,8 +192,12 @@ def run_where_possible(
     return [next(quick if possible else slow) for possible in batched]
 
 
-def _driven(task: EpisodeTask) -> tuple[Driver, str, bool]:
-    return task.driver, task.reward, task.explore
+def _driven(task: EpisodeTask) -> tuple[object, ...]:
+    """Return in what tasks may not differ that are driven at once."""
+    if not isinstance(task.scenario, OnRamp):
+        return task.driver, task.reward, task.explore
+    alone = task.driver if task.driver.native or task.driver.shown is not None else None
+    return alone, task.reward, task.explore != 0.0
 
 
 def _alike(one: EpisodeTask, other: EpisodeTask) -> bool:

@@ -307,9 +307,9 @@ class RingBatch:
         xp, counts = namespace(speed), (speed > MOVING_SPEED) * (self._running > 0)
         return xp.where(counts, xp.minimum(self._headway, gap / at_least(speed, MOVING_SPEED)), self._headway)
 
-    def noise(self) -> Array:
-        """Return standard normal noise of this decision, shape (CAVs * W,)."""
-        return self._noise.of_networks(self.decisions)
+    def noise(self, lasting: int = 0) -> Array:
+        """Return standard normal noise of this decision, shape (CAVs * W,), or what lasts."""
+        return self._noise.lasting(lasting) if lasting else self._noise.of_networks(self.decisions)
 
     def record(self, driven: Driven) -> Rings:
         """Return what happened since the start."""

@@ -199,8 +199,10 @@ class ClosedTraffic(Traffic[ClosedRoad]):
                 wanted[place] = at_least(speed + acceleration * step + noise[place], 0.0)
         self._simulation.command_speeds(self._human_ids, wanted.values())
 
-    def noise(self) -> Array:
+    def noise(self, lasting: int = 0) -> Array:
         """Return standard normal noise of this decision, drawn for the whole episode at once."""
+        if lasting:
+            return super().noise(lasting)
         if self._exploration is None:
             drawn = self._exploration_generator.standard_normal((self.scenario.horizon, len(self.cavs)))
             self._exploration = drawn[:, 0].tolist() if self.single else drawn

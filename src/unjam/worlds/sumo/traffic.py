@@ -92,6 +92,7 @@ class Traffic(World[Episode], Generic[RoadKind]):
         self._perceived: tuple[int, LocalState] | None = None
         self._noise_generator = np.random.default_rng(noise_seed)
         self._exploration_generator = np.random.default_rng(exploration_seed)
+        self._lasting: Floats | None = None
         self._simulation = simulation
         sumo = int(sumo_seed.generate_state(1)[0]) % 2**31
         simulation.load(files_of(scenario, road), scenario.simulation_step, sumo)
@@ -142,9 +143,16 @@ class Traffic(World[Episode], Generic[RoadKind]):
         known = ahead if self._readings is None else self._readings.of_filter(name, ahead)
         return self._cars.carry_out(name, wanted, known)
 
-    def noise(self) -> Array:
-        """Return standard normal noise for one decision: an array (CAVs,), or a plain number."""
-        return self._exploration_generator.standard_normal(len(self.cavs))
+    def noise(self, lasting: int = 0) -> Array:
+        """Return standard normal noise for one decision: an array (CAVs,), or a plain number.
+
+        With `lasting`, so many for each CAV, alike for all and in all decisions; of a single one (lasting,).
+        """
+        if not lasting:
+            return self._exploration_generator.standard_normal(len(self.cavs))
+        if self._lasting is None:
+            self._lasting = self._exploration_generator.standard_normal(lasting)
+        return self._lasting if self.single else np.tile(self._lasting, (len(self.cavs), 1))
 
     def last_applied(self) -> Floats:
         """Return what the CAVs were told in the last decision, once it was filtered [m/s2], shape (CAVs,)."""
