@@ -60,7 +60,7 @@ def test_shares_sum_to_one_and_none_falls_below_what_weights_leave_it(
 
 def test_mirrored_episodes_share_their_seed_and_explore_opposite_ways() -> None:
     driver = PISaturation()
-    found = episodes_of(tasks(1.0), [driver], [5], (3, 7), spread=True, explore=True, mirrored=True)
+    found = episodes_of(tasks(1.0), [driver], [5], (3, 7), spread=True, explore=(1.0, -1.0))
     assert [each.seed for each in found] == [(3, 7, 0), (3, 7, 0), (3, 7, 2), (3, 7, 2), (3, 7, 4)]
     assert [each.explore for each in found] == [1.0, -1.0, 1.0, -1.0, 1.0]
     assert found[0].scenario == found[1].scenario != found[2].scenario

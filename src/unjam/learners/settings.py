@@ -65,6 +65,11 @@ class PolicySettings:
         """Whether exploration stays as it is all episode long."""
         return self.exploration != "anew"
 
+    @property
+    def explores(self) -> list[float]:
+        """By how much exploration counts in episodes that are alike but for that."""
+        return [1.0, -1.0] if self.exploration == "mirrored" else [1.0]
+
     def decisions_held(self, decision_step: float) -> int:
         """Return for how many decisions a residual is held where one takes `decision_step` seconds."""
         return max(1, round(self.hold / decision_step))

@@ -11,6 +11,7 @@ from unjam.studies.envelope import ENVELOPE
 from unjam.studies.everywhere import EVERYWHERE_STUDY, JUDGING
 from unjam.studies.figure_6 import FIGURE_6
 from unjam.studies.imagined import imagined
+from unjam.studies.ramp_trained import ramp_trained
 from unjam.studies.roads_together import (
     BESIDE_EVERYWHERE,
     BESIDE_SHARED,
@@ -74,6 +75,7 @@ STUDIES: dict[str, Study] = {
     "drivable": DRIVABLE_STUDY,
     "drivable-eight": DRIVABLE_EIGHT,
     "drivable-jammed": DRIVABLE_JAMMED,
+    "on-ramp-trained": ramp_trained("ramp"),
     "envelope": ENVELOPE,
     "everywhere": EVERYWHERE_STUDY,
     "adaptation": ADAPTATION,

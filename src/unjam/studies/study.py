@@ -35,15 +35,10 @@ MILLION = 1_000_000
 """where an hour makes no more"""
 
 ROADS: dict[str, dict[str, Any]] = {
-    "ring": {"scenario": "ring"},
-    "ring-jammed": {"scenario": "ring-jammed"},
-    "rings": {"scenario": "ring"},
-    "shared-rings": {"scenario": "ring"},
-    "everywhere": {"scenario": "ring"},
+    **{name: {"scenario": name} for name in ("ring", "ring-jammed", "figure-eight", "merge", "on-ramp")},
+    **{name: {"scenario": "ring"} for name in ("rings", "shared-rings", "everywhere")},
     "ring-11": {"scenario": "ring", "road.vehicles": 11},
     "ring-5": {"scenario": "ring", "road.vehicles": 5},
-    "figure-eight": {"scenario": "figure-eight"},
-    "merge": {"scenario": "merge"},
 }
 PAPERS_ROADS = ("ring", "figure-eight", "merge")
 LAST_SHARE = 0.1
@@ -199,6 +194,7 @@ VARIANTS: dict[str, Variant] = {
     **few_steps("jammed", 24_000, 768_000),
     **few_steps("eight", 6_000, 612_000, horizon=1500),
     "best-in-batches": Variant("ours, all its steps", "best", {"world": "batch"}, None),
+    "ramp": Variant("residual", "best", {}, None),
     "by-150-seconds": Variant("residual", "best", BY_150_SECONDS, None),
     "rings": Variant("residual", "rings", TWO_EACH, None),
     "shared-rings": Variant("residual", "shared-rings", TWO_EACH, None),

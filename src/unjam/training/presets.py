@@ -178,6 +178,31 @@ BEST: dict[str, dict[str, Any]] = {
         "virtual": {"virtual_ratio": 0.0},
         "evaluation": {"every": 6, "validation_episodes": 64},
     },
+    # One CAV in twenty, whose commands all vanish in people's noise: an episode explores with one change for
+    # all of them, and another with its opposite. What they did shows when they have left.
+    "on-ramp": {
+        "steps": 4_608_000,
+        "world": "batch",
+        "road": {"cav_share": 0.05},
+        "expert": "unjam:on-ramp-tuned",
+        "policy": {
+            "observe": ["approach"],
+            "exploration": "mirrored",
+            "exploration_std": 0.12,
+            "learn_exploration": False,
+            "afterwards": True,
+            "hold": 5.0,
+        },
+        "trpo": {
+            "batch_steps": 153_600,
+            "gamma": 0.995,
+            "gae_lambda": 0.99,
+            "target_kl": 0.05,
+            "critic_batch": 2000,
+        },
+        "virtual": {"virtual_ratio": 0.0},
+        "evaluation": {"every": 10, "validation_episodes": 128},
+    },
     # A jam comes or does not: what a CAV did shows minutes later, and only in the mean of many episodes.
     "merge": {
         "expert": CLOSING_ABSORBER,

@@ -94,21 +94,20 @@ def episodes_of(
     seed: tuple[int, ...],
     *,
     spread: bool,
-    explore: bool,
-    mirrored: bool = False,
+    explore: Sequence[float],
 ) -> list[EpisodeTask]:
     """Return `counts` episodes of each task, one after the other; each has a number behind the seed.
 
-    With `spread` those of a road cover the range of what its scenario draws. Of two that are `mirrored` the
-    second has the seed of the first, and explores the other way.
+    With `spread` those of a road cover the range of what its scenario draws. As many as `explore` says by how
+    much exploration counts, in turn, are alike but for that.
     """
     wanted: list[EpisodeTask] = []
     for task, driver, count in zip(tasks, drivers, counts, strict=True):
         for part in range(count):
-            second = mirrored and part % 2 == 1
-            scenario = task.scenario.part(part - second, count) if spread else task.scenario
-            own = (*seed, len(wanted) - second)
-            wanted.append(EpisodeTask(scenario, driver, own, task.reward, -1.0 if second else float(explore)))
+            turn = part % len(explore)
+            scenario = task.scenario.part(part - turn, count) if spread else task.scenario
+            own = (*seed, len(wanted) - turn)
+            wanted.append(EpisodeTask(scenario, driver, own, task.reward, explore[turn]))
     return wanted
 
 

@@ -190,8 +190,7 @@ class Trainer:
         self._sampler = Sampler(self.tasks, config.sampling, self._expert_returns)
         self._controllers = KeptControllers(self.folders)
         self._belongs = belonging(config)
-        checkpoint = last_state(folder, {folder, *self.folders}, self._belongs)
-        if checkpoint is not None:
+        if checkpoint := last_state(folder, {folder, *self.folders}, self._belongs):
             state, tensors = checkpoint
             self._controllers.restore(tensors, state["actual_steps"] >= config.steps)
             self.training.restore(state, tensors)
@@ -222,7 +221,8 @@ class Trainer:
         steps, left = self.config.learner.batch_steps, self.config.steps - self.training.actual_steps
         counts = self._sampler.episodes(steps)
         ahead = iterations_ahead(iteration, left, steps, self.tasks, counts)
-        return self._drive(self.drivers(network), counts, *((self.config.seed, each) for each in ahead))
+        seeds = ((self.config.seed, each) for each in ahead)
+        return self._drive(self.drivers(network), counts, self.config.policy.explores, *seeds)
 
     def validate(self, iteration: Iteration, ended: bool = False) -> Validated:
         """Now and then, and at the end, drive the validation seeds, and keep the best controller."""
@@ -284,16 +284,14 @@ class Trainer:
     def returns_of(self, drivers: Sequence[Driver]) -> list[float]:
         """Return the mean return on the validation seeds, by road, each driven by its own of `drivers`."""
         counts = [self.config.evaluation.validation_episodes] * len(self.tasks)
-        episodes = self._drive(drivers, counts, (VALIDATE,), explore=False)
+        episodes = self._drive(drivers, counts, [0.0], (VALIDATE,))
         return [float(np.mean([measure(episode)["return"] for episode in driven])) for driven in episodes]
 
     def _drive(
-        self, drivers: Sequence[Driver], counts: Sequence[int], *seeds: tuple[int, ...], explore: bool = True
+        self, drivers: Sequence[Driver], counts: Sequence[int], noise: list[float], *seeds: tuple[int, ...]
     ) -> Collected:
         """Run `counts` episodes of the first seed, road by road; those of the others are to come."""
-        mirrored = explore and self.config.policy.exploration == "mirrored"
-        how = {"spread": self.config.spread, "explore": explore, "mirrored": mirrored}
-        all_of = partial(episodes_of, self.tasks, drivers, counts, **how)
+        all_of = partial(episodes_of, self.tasks, drivers, counts, spread=self.config.spread, explore=noise)
         now, *coming = map(all_of, seeds)
         alone, later = not self.config.tasks, list(chain(*coming))
         at_once = partial(run_where_possible, run=self.workers.run, coming=later, statistical=alone)

@@ -1,0 +1,86 @@
+"""What a learned residual is worth on the on-ramp, where one vehicle in twenty is a CAV, beside tuned laws.
+
+The seeds are shared by all trainings, which the intervals know.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from unjam.controller import make_driver
+from unjam.files import to_json, write_whole
+from unjam.measures.drivable import DRIVABLE
+from unjam.measures.statistics import crossed_estimate, estimate
+from unjam.measures.table import PEOPLE, cell_of
+from unjam.scenarios.on_ramp import ON_RAMP
+from unjam.studies.study import VARIANTS, Study, StudyFolder, judged, planned, read_part
+from unjam.worlds.workers import Workers
+
+ROAD = replace(ON_RAMP, cav_share=0.05)
+SEEDS = 60
+TUNED, TUNED_LONG = "its expert, tuned", "the same, tuned with as many steps"
+NAMED = {PEOPLE: "human", "own ACC": "cruise", TUNED: "unjam:on-ramp-tuned"}
+TIME, FLOW, BRAKING = "travel_time", "throughput_veh_per_h", "people_beyond_4_5"
+KEPT = (TIME, FLOW, BRAKING, "mean_speed", "fuel_ml_per_km", "drivable", "min_headway", "cav_max_braking")
+"""of each episode"""
+
+
+def _write(variants: Sequence[str], studies: StudyFolder, seeds: int, folder: Path, workers: int) -> None:
+    drivers = {label: make_driver(name, ROAD.decision_step) for label, name in NAMED.items()}
+    for variant in variants:
+        for run in planned(["on-ramp"], [variant], seeds):
+            name = f"{variant} {run.seed}"
+            drivers[name] = make_driver(str(studies.controller_of(run)), ROAD.decision_step)
+    with Workers(workers) as pool:
+        write_whole(folder / "ramp.json", to_json(judged(ROAD, drivers, SEEDS, KEPT, pool)))
+
+
+def table(variants: Sequence[str], folder: Path) -> pd.DataFrame:
+    """Return how long everybody takes behind whom, and what more than behind its expert and people alone."""
+    found = read_part(folder, "ramp")
+    groups = {label: [label] for label in NAMED}
+    for variant in variants:
+        own = [label for label in found if label.rpartition(" ")[0] == variant]
+        groups[f"{VARIANTS[variant].label}, {len(own)} trainings"] = own
+    return pd.DataFrame([_row(found, label, members) for label, members in groups.items()])
+
+
+def _row(found: dict[str, Any], label: str, members: Sequence[str]) -> dict[str, Any]:
+    """Return what a driver, or several trainings together, are worth."""
+
+    def of(labels: Sequence[str], name: str) -> np.ndarray:
+        return np.array([[row[name] for row in found[each]["episodes"]] for each in labels], np.float64)
+
+    def beyond(baseline: str, name: str, digits: int) -> str:
+        values = of(members, name) - of([baseline], name)
+        same = [baseline] == list(members)
+        more = crossed_estimate(values) if len(members) > 1 else estimate(values[0])
+        return "–" if same else str(cell_of(more, digits, sign="+"))
+
+    worst = [found[each]["drivable"] for each in members if found[each]["drivable"] != DRIVABLE]
+    return {
+        "driver": label,
+        "travel time [s]": f"{of(members, TIME).mean():.1f}",
+        "beyond its expert [s]": beyond(TUNED, TIME, 1),
+        "beyond people [s]": beyond(PEOPLE, TIME, 1),
+        "flow beyond people [veh/h]": beyond(PEOPLE, FLOW, 0),
+        "smallest headway [s]": f"{np.nanmin(of(members, 'min_headway')):.2f}" if label != PEOPLE else "–",
+        "people beyond 4.5 m/s²": f"{of(members, BRAKING).mean():.0f}",
+        "drivable": (worst[0] or "–") if worst else "yes",
+    }
+
+
+def ramp_trained(*variants: str) -> Study:
+    """Return the study of variants that learn on the on-ramp."""
+    return Study(
+        title="what a residual is worth on the on-ramp at 5 % CAVs, beside the tuned law that it is added to",
+        runs=partial(planned, ["on-ramp"], variants),
+        write=partial(_write, variants),
+        minutes=35.0,
+        tables={"ramp": partial(table, variants)},
+    )

@@ -1,0 +1,42 @@
+"""Does the on-ramp's page say of trainings what they are beyond their expert and people alone?"""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from unjam.files import to_json
+from unjam.studies.ramp_trained import NAMED, PEOPLE, TUNED, ramp_trained
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    generator = np.random.default_rng(0)
+    times = dict.fromkeys(NAMED, 150.0) | {TUNED: 128.0} | {f"ramp {seed}": 125.0 for seed in range(10)}
+    seeds = generator.normal(0.0, 10.0, 40)
+    found = {
+        label: {
+            "drivable": "drivable" if label != "ramp 3" else "follows below 0.8 s",
+            "episodes": [
+                {"travel_time": time + seed, "throughput_veh_per_h": 3900.0 - time, "min_headway": 0.9}
+                | {"people_beyond_4_5": 2.0}
+                for seed in seeds + generator.normal(0.0, 1.0, 40)
+            ],
+        }
+        for label, time in times.items()
+    }
+    (tmp_path / "ramp.json").write_text(to_json(found))
+    return tmp_path
+
+
+def test_trainings_are_one_row_beside_their_expert_and_people(folder: Path) -> None:
+    table = ramp_trained("ramp").tables["ramp"](folder).set_index("driver")
+    assert list(table.index) == [*NAMED, "residual, 10 trainings"]
+    row = table.loc["residual, 10 trainings"]
+    low, high = map(float, row["beyond its expert [s]"].partition("[")[2].rstrip("]").split(", "))
+    assert low < -3.0 < high < -2.0
+    assert row["beyond people [s]"].startswith("-2")
+    assert row["flow beyond people [veh/h]"].startswith("+25")
+    assert row["drivable"] == "follows below 0.8 s"
+    assert table.loc[TUNED, "beyond its expert [s]"] == "–"
+    assert table.loc[PEOPLE, "smallest headway [s]"] == "–"
