@@ -32,11 +32,12 @@ from unjam.worlds.episode import can_drive
 from unjam.worlds.workers import Workers
 
 SECONDS: dict[str, dict[str, float]] = {
-    "trpo": {"ring": 45, "figure-eight": 80, "merge": 900},
-    "ppo": {"ring": 75, "figure-eight": 110, "merge": 930},
+    "trpo": {"ring": 45, "figure-eight": 80, "merge": 900, "on-ramp": 170},
+    "ppo": {"ring": 75, "figure-eight": 110, "merge": 930, "on-ramp": 190},
     "sac": {"ring": 450, "figure-eight": 480, "merge": 1300},
 }
-"""what 300,000 actual steps took on one core of the machine of results/, model-free [s]"""
+"""what 300,000 actual steps took on one core of the machine of results/, model-free, on the on-ramp in
+batches [s]"""
 VIRTUAL_SECONDS = 60.0
 """what the virtual environment adds, for each virtual decision per actual one up to one [s]"""
 DRIVE_SECONDS = {"ring": 60.0, "figure-eight": 60.0, "merge": 400.0}
