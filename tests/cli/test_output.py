@@ -1,7 +1,9 @@
 """Can a table of metrics be read, however narrow the terminal?"""
 
+import shlex
 import sys
 from io import StringIO
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +14,7 @@ from unjam.cli import output
 from unjam.cli.train import _Progress
 from unjam.measures.metrics import METRICS
 from unjam.measures.statistics import estimate
+from unjam.parameters import parse_assignments
 from unjam.training import evaluate
 from unjam.training.config import RunConfig
 
@@ -75,6 +78,36 @@ def test_after_a_training_of_several_roads_it_is_the_whole_run_that_goes_on(
     monkeypatch.setattr(output, "aside", Console(file=text, width=200))
     output.after_training(Path("runs/all/ring"), estimate([0.0, 0.0]), 100, Path("runs/all"))
     assert "unjam train --resume runs/all --steps 200" in text.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("drivers", "changes", "words"),
+    [
+        (
+            ["human", "unjam:best"],
+            {"population": "unjam:ngsim", "length": [230, 240]},
+            "unjam watch ring -d unjam:best --video ring.gif --set population=unjam:ngsim --set "
+            "'length=[230, 240]'",
+        ),
+        (
+            ["human", "pi"],
+            {"cavs": 2, "actuation": "raw"},
+            "unjam train ring --expert pi --preset demo --set road.cavs=2 --set road.actuation=raw",
+        ),
+    ],
+)
+def test_what_is_proposed_after_a_drive_is_for_the_same_road(
+    drivers: list[str], changes: dict[str, Any], words: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = StringIO()
+    monkeypatch.setattr(output, "aside", Console(file=text, width=400))
+    output.after_drive("ring", drivers, changes)
+    proposed = text.getvalue().strip().partition(": ")[2]
+    assert proposed == words
+    asked = shlex.split(proposed)
+    told = [word for option, word in pairwise(asked) if option == "--set"]
+    given = {key.removeprefix("road."): value for key, value in parse_assignments(told, "--set").items()}
+    assert given == changes
 
 
 def test_the_judgement_after_a_training_shows_how_far_it_is(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,10 +1,11 @@
 """What the command line prints: tables, one JSON document, progress on the side, and what to type next."""
 
+import json
 import os
 import shlex
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from textwrap import fill
@@ -153,19 +154,27 @@ def say_next(why: str, *words: object) -> None:
     aside.print(f"{why}: {shlex.join(['unjam', *map(str, words)])}", soft_wrap=True, markup=False)
 
 
-def after_drive(scenario: str, drivers: Sequence[str]) -> None:
-    """Compare with people first, then learn on an expert, then look at what was learned."""
+def after_drive(scenario: str, drivers: Sequence[str], changes: Mapping[str, Any]) -> None:
+    """Compare with people first, then learn on an expert, then look at what was learned, on the same road."""
     from unjam.drivers.registry import DRIVERS
 
     experts = [driver for driver in drivers if driver.partition(":")[0] in DRIVERS and driver != "human"]
     if "human" not in drivers:
         say_next("compare with people", *_command_without_out(), "-d", "human")
     elif experts and len(experts) == len(drivers) - 1:
-        say_next("learn on an expert", "train", scenario, "--expert", experts[-1], "--preset", "demo")
+        learn = "train", scenario, "--expert", experts[-1], "--preset", "demo"
+        say_next("learn on an expert", *learn, *_as_options(changes, "road."))
     elif drivers != ["human"]:
-        say_next("see it", "watch", scenario, "-d", drivers[-1], "--video", f"{Path(scenario).stem}.gif")
+        see = "watch", scenario, "-d", drivers[-1], "--video", f"{Path(scenario).stem}.gif"
+        say_next("see it", *see, *_as_options(changes))
     else:
         say_next("compare with an expert", *_command_without_out(), "-d", "pi")
+
+
+def _as_options(changes: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
+    """Yield the options that change a scenario so."""
+    for key, value in changes.items():
+        yield from ("--set", f"{prefix}{key}={value if isinstance(value, str) else json.dumps(value)}")
 
 
 def _command_without_out() -> list[str]:
