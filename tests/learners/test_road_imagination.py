@@ -12,7 +12,8 @@ from unjam.drivers.network import Network
 from unjam.drivers.observation import observation_size
 from unjam.drivers.safety import SafetyFilter
 from unjam.drivers.sensors import Sensors
-from unjam.learners.imagination import full_policy
+from unjam.learners.experience import join
+from unjam.learners.imagination import AsExperience, full_policy
 from unjam.learners.road_imagination import RoadImagination
 from unjam.learners.settings import PolicySettings
 from unjam.scenarios import FigureEight, Ring
@@ -33,12 +34,13 @@ WRONG = replace(
     RING, sensors=Sensors(0.5, 0.5, dropout=0.1), safety=SafetyFilter(gap_error=0.5, speed_error=0.5)
 )
 POLICY = PolicySettings(hidden=(8,))
+AS_DRAWN = AsExperience(lambda drawn: drawn, lambda episodes: join([]))
 VIRTUAL = VirtualSettings(model="road", k_max=DECISIONS, virtual_ratio=1.0)
 
 
-def network_of(exploration_std: float) -> Network:
+def network_of(exploration_std: float, policy: PolicySettings = POLICY) -> Network:
     generator = np.random.default_rng(3)
-    sizes = [observation_size(POLICY.observe, PISaturation()), 8, 1]
+    sizes = [observation_size(policy.observe, PISaturation()), 8, 1]
     layers = [
         (0.3 * generator.normal(size=(before, after)), 0.1 * generator.normal(size=after))
         for before, after in itertools.pairwise(sizes)
@@ -80,7 +82,7 @@ def test_the_policy_goes_on_with_what_it_remembered() -> None:
     network = network_of(0.0)
     imagination, episodes = imagined(replace(RING, noise=0.0), network)
     imagination.k_star = DECISIONS
-    found = imagination.imagine(network, 1, 0, 1, lambda drawn: drawn)
+    found = imagination.imagine(network, 1, 0, 1, AS_DRAWN)
     assert found is not None
     actual = [each.choices[1] for episode in episodes for each in episode.trajectories]
     same = 0
@@ -96,7 +98,7 @@ def test_the_policy_goes_on_with_what_it_remembered() -> None:
 )
 def test_with_noise_returns_are_those_of_the_road(road: Loop) -> None:
     imagination, _ = imagined(road, network_of(0.05))
-    found = imagination.imagine(network_of(0.05), 1, 0, 1, lambda drawn: drawn)
+    found = imagination.imagine(network_of(0.05), 1, 0, 1, AS_DRAWN)
     assert found is not None
     assert len(found.rewards) == 2 * 4 * 400 / 10
     assert found.observations.shape[1] == observation_size(POLICY.observe, PISaturation()) + 1
@@ -116,7 +118,7 @@ def test_each_imagined_road_misreads_in_its_own_way() -> None:
 def test_a_model_that_is_not_trusted_imagines_nothing() -> None:
     imagination, _ = imagined(RING, network_of(0.0))
     imagination.k_star = 9
-    assert imagination.imagine(network_of(0.0), 1, 0, 1, lambda drawn: drawn) is None
+    assert imagination.imagine(network_of(0.0), 1, 0, 1, AS_DRAWN) is None
 
 
 @pytest.mark.parametrize("road", [RING, EIGHT], ids=["a ring", "a figure eight"])

@@ -12,11 +12,11 @@ from unjam.studies.ramp_trained import NAMED, PEOPLE, TUNED, ramp_trained
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
     generator = np.random.default_rng(0)
-    times = dict.fromkeys(NAMED, 150.0) | {TUNED: 128.0} | {f"ramp {seed}": 125.0 for seed in range(10)}
+    times = dict.fromkeys(NAMED, 150.0) | {TUNED: 128.0} | {f"best {seed}": 125.0 for seed in range(10)}
     seeds = generator.normal(0.0, 10.0, 40)
     found = {
         label: {
-            "drivable": "drivable" if label != "ramp 3" else "follows below 0.8 s",
+            "drivable": "drivable" if label != "best 3" else "follows below 0.8 s",
             "episodes": [
                 {"travel_time": time + seed, "throughput_veh_per_h": 3900.0 - time, "min_headway": 0.9}
                 | {"people_beyond_4_5": 2.0}
@@ -30,7 +30,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 def test_trainings_are_one_row_beside_their_expert_and_people(folder: Path) -> None:
-    table = ramp_trained("ramp").tables["ramp"](folder).set_index("driver")
+    table = ramp_trained({"best": "residual"}).tables["ramp"](folder).set_index("driver")
     assert list(table.index) == [*NAMED, "residual, 10 trainings"]
     row = table.loc["residual, 10 trainings"]
     low, high = map(float, row["beyond its expert [s]"].partition("[")[2].rstrip("]").split(", "))

@@ -103,7 +103,7 @@ def test_merging_changes_neither_side() -> None:
         ),
         (
             {"policy.afterwards": True},
-            "policy.afterwards: true is not allowed; allowed: false with a virtual environment",
+            "policy.afterwards: true is not allowed; allowed: false where rows are imagined",
         ),
         ({"scenario": "merge", "world": "batch"}, "world: batch is not allowed; allowed: sumo, for merge"),
         (

@@ -156,8 +156,24 @@ def test_a_run_that_imagines_whole_roads_shows_waves(tmp_path: Path) -> None:
     ]
 
 
-def test_a_run_that_imagines_whole_roads_goes_on_as_if_it_had_not_been_stopped(tmp_path: Path) -> None:
-    changes = {"virtual__virtual_ratio": 1.0, "virtual__model": "road", "virtual__members": 2}
+RAMP: dict[str, Any] = {
+    "scenario": "on-ramp",
+    "road": {"horizon": 30, "cav_share": 0.5, "peak": [0, 30]},
+    "expert": "jam-ahead",
+    "world": "batch",
+    "policy__observe": ["local"],
+    "policy__exploration": "mirrored",
+    "policy__afterwards": True,
+    "virtual__begin": "first",
+    "evaluation__baselines": [],
+}
+
+
+@pytest.mark.parametrize("road", [{}, RAMP])
+def test_a_run_that_imagines_whole_roads_goes_on_as_if_it_had_not_been_stopped(
+    road: dict[str, Any], tmp_path: Path
+) -> None:
+    changes = {"virtual__virtual_ratio": 1.0, "virtual__model": "road", "virtual__members": 2, **road}
     ends = []
     for stops in ([2 * STEPS], [STEPS, 2 * STEPS]):
         folder = tmp_path / str(len(stops))

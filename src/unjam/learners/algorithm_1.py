@@ -18,10 +18,12 @@ from unjam.drivers.network import Network
 from unjam.drivers.observation import observation_size
 from unjam.errors import UnjamError
 from unjam.learners.experience import Experience, experience_of, join
-from unjam.learners.imagination import Imagination, RowImagination
+from unjam.learners.imagination import AsExperience, Imagination, RowImagination
 from unjam.learners.learner import AgentSpec, Learner, Tensors, Update, make_learner, policy_distance, under
+from unjam.learners.motorway_imagination import MotorwayImagination
 from unjam.learners.road_imagination import RoadImagination
 from unjam.learners.settings import LearnerSettings, PolicySettings
+from unjam.scenarios.on_ramp import OnRamp
 from unjam.virtual.settings import VirtualSettings
 from unjam.worlds.episode import Task
 from unjam.worlds.record import Episode, Floats, Trajectory
@@ -97,14 +99,21 @@ def begin_training(
     """Initialise pi_theta, the value network, T and an empty D_a (lines 1 and 2); pi_H is the tasks'."""
     imaginations = []
     if virtual.virtual_ratio > 0:
-        kind = RoadImagination if virtual.model == "road" else RowImagination
-        imaginations = [kind(virtual, task, policy, seed, index) for index, task in enumerate(tasks)]
+        imaginations = [
+            _kind_of(virtual, task)(virtual, task, policy, seed, index) for index, task in enumerate(tasks)
+        ]
     inputs = observation_size(policy.observe, tasks[0].expert)
     drawn = np.zeros((1, len(tasks[0].scenario.drawn_ranges)))
     critic_inputs = seen_by_critic(tasks, policy, 0, drawn).shape[1] + policy.afterwards
     limit = min(task.scenario.action_limit for task in tasks)
     spec = AgentSpec(inputs, critic_inputs, limit, policy, seed)
     return Training(tasks, policy, seed, make_learner(learner, spec), imaginations)
+
+
+def _kind_of(virtual: VirtualSettings, task: Task) -> type[Imagination[Any]]:
+    if virtual.model == "row":
+        return RowImagination
+    return MotorwayImagination if isinstance(task.scenario, OnRamp) else RoadImagination
 
 
 def algorithm_1(
@@ -200,21 +209,24 @@ def plan_updates(training: Training) -> list[tuple[bool, int, int]]:
 
 def actual_experience(training: Training, episodes: Collected) -> Experience:
     """Return what was driven as experience; raise `UnjamError` where some of it is not finite."""
-    found, policy, gamma = [], training.policy, training.learner.gamma
-    for index, (task, driven) in enumerate(zip(training.tasks, episodes, strict=True)):
-        pairs = [(episode, trajectory) for episode in driven for trajectory in episode.trajectories]
-        drawn = np.array([task.scenario.drawn_scaled(episode.drawn) for episode, _ in pairs])
-        extra, later = seen_by_critic(training.tasks, policy, index, drawn), None
-        if policy.afterwards:
-            came = [trajectory.start / task.scenario.horizon for _, trajectory in pairs]
-            extra = np.column_stack([extra, came])
-            later = [afterwards(episode, trajectory, gamma) for episode, trajectory in pairs]
-        found.append(experience_of([trajectory for _, trajectory in pairs], extra, later))
-    joined = join(found)
+    joined = join([experience_on(training, index, driven) for index, driven in enumerate(episodes)])
     for name in ("observations", "rewards"):
         if not np.isfinite(getattr(joined, name)).all():
             raise UnjamError(f"learner: {name} of iteration {training.iteration} are not finite")
     return joined
+
+
+def experience_on(training: Training, index: int, episodes: Sequence[Episode]) -> Experience:
+    """Return the experience of episodes of task `index`."""
+    policy, scenario = training.policy, training.tasks[index].scenario
+    pairs = [(episode, trajectory) for episode in episodes for trajectory in episode.trajectories]
+    drawn = np.array([scenario.drawn_scaled(episode.drawn) for episode, _ in pairs])
+    extra, later = seen_by_critic(training.tasks, policy, index, drawn), None
+    if policy.afterwards:
+        came = [trajectory.start / scenario.horizon for _, trajectory in pairs]
+        extra = np.column_stack([extra, came])
+        later = [afterwards(episode, trajectory, training.learner.gamma) for episode, trajectory in pairs]
+    return experience_of([trajectory for _, trajectory in pairs], extra, later)
 
 
 def afterwards(episode: Episode, trajectory: Trajectory, gamma: float) -> float | None:
@@ -230,8 +242,11 @@ def virtual_experience(training: Training, part: int, parts: int) -> Experience 
     """Return one of `parts` of what the policy as it is now does in the virtual environments, if anything."""
     network, found = training.learner.network(), []
     for index, imagination in enumerate(training.imaginations):
-        sees = partial(seen_by_critic, training.tasks, training.policy, index)
-        found.append(imagination.imagine(network, training.iteration, part, parts, sees))
+        how = AsExperience(
+            partial(seen_by_critic, training.tasks, training.policy, index),
+            partial(experience_on, training, index),
+        )
+        found.append(imagination.imagine(network, training.iteration, part, parts, how))
     imagined = [each for each in found if each is not None]
     return join(imagined) if imagined else None
 

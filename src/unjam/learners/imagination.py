@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 from math import ceil
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -31,8 +31,15 @@ from unjam.worlds.record import Episode, Floats
 FIT, STARTS, NOISE, EXPLORATION = 2, 3, 4, 5
 """what the random numbers of an iteration are for, in their seeds"""
 DATA = "data/"
-SeenByCritic = Callable[[Floats], Floats]
-"""from what episodes drew, shape (rows, m), to what the critic alone sees of it"""
+
+
+class AsExperience(NamedTuple):
+    """How what was imagined becomes what a learner takes."""
+
+    seen_by_critic: Callable[[Floats], Floats]
+    """from what episodes drew, shape (rows, m), to what the critic alone sees of it"""
+    of_episodes: Callable[[Sequence[Episode]], Experience]
+    """of whole episodes, as of actual ones"""
 
 
 def full_policy(task: Task, policy: PolicySettings, network: Network) -> ResidualDriver:
@@ -85,7 +92,7 @@ class Imagination(Generic[Model]):
         raise NotImplementedError
 
     def imagine(
-        self, network: Network, iteration: int, part: int, parts: int, seen_by_critic: SeenByCritic
+        self, network: Network, iteration: int, part: int, parts: int, how: AsExperience
     ) -> Experience | None:
         """Return what the policy `network` does in the virtual environment; None where it is not trusted.
 
@@ -183,13 +190,13 @@ class RowImagination(Imagination[EnvironmentModel]):
         return fit(self.model, actual, self.settings, self.scenario, self._task.reward, seed)
 
     def imagine(
-        self, network: Network, iteration: int, part: int, parts: int, seen_by_critic: SeenByCritic
+        self, network: Network, iteration: int, part: int, parts: int, how: AsExperience
     ) -> Experience | None:
         """Return what the policy `network` does with rows; None where there are none."""
         rollouts = self.rollouts(network, iteration, part, parts)
         if rollouts is None:
             return None
-        return rollout_experience(rollouts, seen_by_critic(rollouts.drawn.cpu().numpy()))
+        return rollout_experience(rollouts, how.seen_by_critic(rollouts.drawn.cpu().numpy()))
 
     def rollouts(self, network: Network, iteration: int, part: int = 0, parts: int = 1) -> Rollouts | None:
         """Return the virtual rollouts of rows; None where there are none."""

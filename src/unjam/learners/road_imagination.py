@@ -17,8 +17,8 @@ from unjam.learners.imagination import (
     FIT,
     NOISE,
     STARTS,
+    AsExperience,
     Imagination,
-    SeenByCritic,
     full_policy,
 )
 from unjam.learners.learner import under
@@ -80,7 +80,7 @@ class RoadImagination(Imagination[RoadModel]):
         return fit_roads(self.model, self.moments, self.settings, self.scenario, seed)
 
     def imagine(
-        self, network: Network, iteration: int, part: int, parts: int, seen_by_critic: SeenByCritic
+        self, network: Network, iteration: int, part: int, parts: int, how: AsExperience
     ) -> Experience | None:
         """Return what the policy `network` does on imagined roads; None where they are not trusted."""
         driver = full_policy(self._task, self._policy, network)
@@ -111,7 +111,7 @@ class RoadImagination(Imagination[RoadModel]):
             for trajectory in episode.trajectories
         ]
         drawn = np.array([each for _, each in pairs])
-        return experience_of([trajectory for trajectory, _ in pairs], seen_by_critic(drawn))
+        return experience_of([trajectory for trajectory, _ in pairs], how.seen_by_critic(drawn))
 
     def driven(
         self,

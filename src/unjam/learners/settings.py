@@ -48,8 +48,8 @@ class PolicySettings:
     same people in which the change is opposite (after Salimans et al. 2017, arXiv:1703.03864)"""
     afterwards: bool = False
     """whether a CAV also earns what is earned once it has left a road with ends, and the value network sees
-    when it came: where all earn the same, a jam that it has prevented shows when it is gone. Without a
-    virtual environment, whose moments do not know what follows"""
+    when it came: where all earn the same, a jam that it has prevented shows when it is gone. Not where
+    rows are imagined, whose moments do not know what follows"""
     hold: NotNegative = 1.0
     """how long one residual is held [s], rounded to whole decisions, at least one: over a second noise adds
     up to a change of speed instead of cancelling itself"""

@@ -75,7 +75,7 @@ STUDIES: dict[str, Study] = {
     "drivable": DRIVABLE_STUDY,
     "drivable-eight": DRIVABLE_EIGHT,
     "drivable-jammed": DRIVABLE_JAMMED,
-    "on-ramp-trained": ramp_trained("ramp"),
+    "on-ramp-trained": ramp_trained({"best": "residual"}),
     "envelope": ENVELOPE,
     "everywhere": EVERYWHERE_STUDY,
     "adaptation": ADAPTATION,

@@ -3,7 +3,7 @@
 The seeds are shared by all trainings, which the intervals know.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -18,7 +18,7 @@ from unjam.measures.drivable import DRIVABLE
 from unjam.measures.statistics import crossed_estimate, estimate
 from unjam.measures.table import PEOPLE, cell_of
 from unjam.scenarios.on_ramp import ON_RAMP
-from unjam.studies.study import VARIANTS, Study, StudyFolder, judged, planned, read_part
+from unjam.studies.study import Study, StudyFolder, judged, planned, read_part
 from unjam.worlds.workers import Workers
 
 ROAD = replace(ON_RAMP, cav_share=0.05)
@@ -30,7 +30,7 @@ KEPT = (TIME, FLOW, BRAKING, "mean_speed", "fuel_ml_per_km", "drivable", "min_he
 """of each episode"""
 
 
-def _write(variants: Sequence[str], studies: StudyFolder, seeds: int, folder: Path, workers: int) -> None:
+def _write(variants: Iterable[str], studies: StudyFolder, seeds: int, folder: Path, workers: int) -> None:
     drivers = {label: make_driver(name, ROAD.decision_step) for label, name in NAMED.items()}
     for variant in variants:
         for run in planned(["on-ramp"], [variant], seeds):
@@ -40,13 +40,13 @@ def _write(variants: Sequence[str], studies: StudyFolder, seeds: int, folder: Pa
         write_whole(folder / "ramp.json", to_json(judged(ROAD, drivers, SEEDS, KEPT, pool)))
 
 
-def table(variants: Sequence[str], folder: Path) -> pd.DataFrame:
+def table(variants: Mapping[str, str], folder: Path) -> pd.DataFrame:
     """Return how long everybody takes behind whom, and what more than behind its expert and people alone."""
     found = read_part(folder, "ramp")
     groups = {label: [label] for label in NAMED}
-    for variant in variants:
+    for variant, words in variants.items():
         own = [label for label in found if label.rpartition(" ")[0] == variant]
-        groups[f"{VARIANTS[variant].label}, {len(own)} trainings"] = own
+        groups[f"{words}, {len(own)} trainings"] = own
     return pd.DataFrame([_row(found, label, members) for label, members in groups.items()])
 
 
@@ -75,12 +75,12 @@ def _row(found: dict[str, Any], label: str, members: Sequence[str]) -> dict[str,
     }
 
 
-def ramp_trained(*variants: str) -> Study:
-    """Return the study of variants that learn on the on-ramp."""
+def ramp_trained(variants: Mapping[str, str]) -> Study:
+    """Return the study of variants that learn on the on-ramp, and what its table calls them."""
     return Study(
         title="what a residual is worth on the on-ramp at 5 % CAVs, beside the tuned law that it is added to",
-        runs=partial(planned, ["on-ramp"], variants),
-        write=partial(_write, variants),
+        runs=partial(planned, ["on-ramp"], tuple(variants)),
+        write=partial(_write, tuple(variants)),
         minutes=35.0,
         tables={"ramp": partial(table, variants)},
     )

@@ -194,7 +194,6 @@ VARIANTS: dict[str, Variant] = {
     **few_steps("jammed", 24_000, 768_000),
     **few_steps("eight", 6_000, 612_000, horizon=1500),
     "best-in-batches": Variant("ours, all its steps", "best", {"world": "batch"}, None),
-    "ramp": Variant("residual", "best", {}, None),
     "by-150-seconds": Variant("residual", "best", BY_150_SECONDS, None),
     "rings": Variant("residual", "rings", TWO_EACH, None),
     "shared-rings": Variant("residual", "shared-rings", TWO_EACH, None),

@@ -22,6 +22,7 @@ from unjam.manifest import manifest, package_versions
 from unjam.processes import LOCK, owned
 from unjam.reports.results import read_progress
 from unjam.scenarios import scenario_recipe
+from unjam.scenarios.on_ramp import OnRamp
 from unjam.scenarios.population import population_file
 from unjam.scenarios.scenario import Scenario
 from unjam.training.config import RunConfig, load_config, read_toml, to_toml
@@ -66,9 +67,13 @@ def check_possible(config: RunConfig) -> None:
         for name in road.evaluation.baselines:
             make_driver(name, scenario.decision_step)
         if config.virtual.model == "road" and config.virtual.virtual_ratio > 0:
-            from unjam.virtual.roads import check_roads  # which needs torch
+            from unjam.virtual.motorways import check_motorways  # which needs torch
+            from unjam.virtual.roads import check_roads
 
-            check_roads(scenario)
+            if isinstance(scenario, OnRamp):
+                check_motorways(scenario, config.virtual)
+            else:
+                check_roads(scenario)
     config.make_tasks()
 
 

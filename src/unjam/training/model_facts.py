@@ -17,6 +17,7 @@ from unjam.learners.imagination import RowImagination
 from unjam.learners.learner import under
 from unjam.learners.road_imagination import RoadImagination
 from unjam.reports.results import MODEL_FILE, read_model, read_progress
+from unjam.scenarios.on_ramp import OnRamp
 from unjam.scenarios.scenario import Scenario
 from unjam.training.config import RunConfig
 from unjam.training.folder import load_checkpoint
@@ -64,6 +65,12 @@ def newest_model_facts(folder: Path, config: RunConfig) -> dict[str, Any]:
     return kept
 
 
+def has_model_facts(config: RunConfig) -> bool:
+    """Return whether there is something to say: of the virtual environment of one road, not of an on-ramp."""
+    imagines = config.virtual.virtual_ratio > 0 and not config.tasks
+    return imagines and not isinstance(config.make_scenario(), OnRamp)
+
+
 def write_model_facts(folder: Path, config: RunConfig) -> None:
     """Write what `measure_model` finds into the run's `model.json`."""
     write_whole(folder / MODEL_FILE, to_json(measure_model(folder, config)))
@@ -73,8 +80,10 @@ def measure_model(folder: Path, config: RunConfig) -> dict[str, Any]:
     """Return the facts about the virtual environment in a run's newest checkpoint, to four digits.
 
     Raises:
-        InputError: the run has no checkpoint yet.
+        InputError: the run has no checkpoint yet, or nothing to measure.
     """
+    if not has_model_facts(config):
+        raise InputError(f"run: of the virtual environment of {str(folder)!r} nothing is measured")
     checkpoint = load_checkpoint(folder / "checkpoint")
     progress = read_progress(folder)
     if checkpoint is None or not progress:

@@ -238,26 +238,43 @@ def fit_roads(
     Raises:
         UnjamError: a loss is not finite.
     """
-    generator = np.random.default_rng(np.random.SeedSequence(list(seed)))
     rows, commanded = people_in(kept, model.base, scenario), scenario.human_control == "commanded"
-    held_out = is_held_out(rows.episode, settings.holdout)
-    if held_out.all() or not held_out.any():  # too few episodes: the last part of what was seen
-        held_out = np.arange(len(held_out)) >= (1.0 - settings.holdout) * len(held_out)
     moves = rows.moved > MOVES
     sigma = float((rows.after - rows.moved)[moves].std()) if moves.any() else 0.0
     if commanded:
         sigma = _noise(scenario)
+    return fit_people(model, rows, sigma, settings, seed, noise_known=not commanded)
+
+
+def fit_people(
+    model: RoadModel,
+    rows: PeopleRows,
+    sigma: float,
+    settings: VirtualSettings,
+    seed: Sequence[int],
+    noise_known: bool,
+    least: float = 0.0,
+) -> Fit:
+    """Teach `model` what the base leaves of rows, as `fit_roads` says.
+
+    `sigma` is the standard deviation of noise [m/s]; `noise_known` where rows are without it. Networks that
+    save less than the share `least` of the base's mean square error add nothing.
+    """
+    generator = np.random.default_rng(np.random.SeedSequence(list(seed)))
+    held_out = is_held_out(rows.episode, settings.holdout)
+    if held_out.all() or not held_out.any():  # too few episodes: the last part of what was seen
+        held_out = np.arange(len(held_out)) >= (1.0 - settings.holdout) * len(held_out)
     model.noise.fill_(sigma)
     targets = torch.from_numpy((rows.moved - rows.base)[:, None])
     found = teach(model, rows.inputs, targets, held_out, settings, generator)
-    if (
-        settings.fall_back and root_mean_square(found.wanted) < SMALLEST_CHANGE
-    ):  # rounding: the base knows all
+    left, before = root_mean_square(found.wanted - found.predicted), root_mean_square(found.wanted)
+    known = before < SMALLEST_CHANGE or left**2 > (1.0 - least) * before**2  # of rounding, the base knows all
+    if settings.fall_back and known:
         model.learned.zero_()
     wrong = found.wanted - found.predicted * model.learned.numpy()
     change = (rows.moved - rows.speed)[found.holdout]
     step = OneStep(root_mean_square(found.wanted), root_mean_square(wrong), float(change.std()))
-    if commanded:
+    if not noise_known:
         wrong = np.sqrt((np.square(wrong).mean((0, 1)) - sigma**2).clip(0.0))
     errors = {
         "unexplained": (root_mean_square(wrong) / max(step.change, SMALLEST_CHANGE)) ** 2,

@@ -16,9 +16,9 @@ class VirtualSettings:
     """The virtual environment: its model, how it is fitted, and the length of its rollouts."""
 
     model: Literal["row", "road"] = "row"
-    """what is imagined: the row of a CAV, its leader and its follower, as in the paper; or, on rings and
-    figures eight, whole roads, each of whose people drives by the base and by what all of them have taught
-    one ensemble"""
+    """what is imagined: the row of a CAV, its leader and its follower, as in the paper; or, on rings,
+    figures eight and on-ramps, whole roads, each of whose people drives by the base and by what all of them
+    have taught one ensemble"""
     base: BaseName = "idm"
     """what is known before learning: how the follower drives; `population`: as the typical driver of the
     road's calibrated population, residual included; `none`: nothing, all is learned"""

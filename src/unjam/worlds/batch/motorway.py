@@ -41,6 +41,11 @@ UNCAPPED = 1e6
 """[m/s]"""
 
 
+Learned = Callable[[Array, Array, Array, Array], Array]
+"""What people do besides: from own speed, leader's, gap, and speed after a decision as known, what it is
+beyond that [m/s]; arrays of shape (n,)"""
+
+
 class Waiting:
     """Those of W roads who want to enter, way by way in the order in which they come."""
 
@@ -139,8 +144,14 @@ class Motorways:
         step: float,
         draw: Callable[[tuple[int, ...]], Array],
         numbers: Numbers,
+        learned: Learned | None = None,
+        steps: int = 1,
     ) -> None:
-        """Take empty roads; `draw` returns standard normal numbers of a shape."""
+        """Take empty roads; `draw` returns standard normal numbers of a shape.
+
+        What was `learned` of people is of a decision, which takes so many `steps`.
+        """
+        self._learned, self._steps = learned, steps
         road = roads[0]
         self.stretch = Stretch(
             merge=BEFORE,
@@ -215,6 +226,8 @@ class Motorways:
             )
             leader[on_lane] = xp.where(stops < before, 0.0, leader[on_lane])
         new, started = self._finished(vehicles, safe, near, leader)
+        if self._learned is not None:
+            new = self._with_learned(new, row)
         errors = drivers.errors.after(new, self._draw((3, len(speed))), step)
         return vehicles._replace(
             place=place + new * step,
@@ -225,6 +238,21 @@ class Motorways:
             leader_error=errors.leader_speed,
             driving_error=errors.driving,
         )
+
+    def _with_learned(self, new: Array, row: Array) -> Array:
+        """Return the speeds after this step with what was learned of people who follow somebody."""
+        vehicles, steps = self.vehicles, self._steps
+        which = vehicles.extended & (row >= 0)
+        if not bool(which.any()):
+            return new
+        speed, leader = vehicles.speed[which], row[which]
+        gap = vehicles.place[leader] - self.stretch.vehicle_length - vehicles.place[which]
+        known = speed + (new[which] - speed) * steps
+        assert self._learned is not None
+        beyond = self._learned(speed, vehicles.speed[leader], gap, known) / steps
+        new = new + 0.0
+        new[which] = at_least(new[which] + beyond, 0.0)
+        return new
 
     def _wish(self, on_ramp: Array) -> Array:
         """Return the speeds that extended drivers want, who get used to a higher limit bit by bit."""

@@ -4,7 +4,7 @@ Rows of CAVs are in the order in which they entered, whatever their road.
 """
 
 from collections.abc import Collection, Sequence
-from typing import cast
+from typing import NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,7 @@ from unjam.physics.kinematics import next_speed
 from unjam.scenarios.on_ramp import OnRamp
 from unjam.scenarios.road import MotorwayRoad
 from unjam.worlds.batch.lanes import CONTACT
-from unjam.worlds.batch.motorway import UNCAPPED, Motorways
+from unjam.worlds.batch.motorway import UNCAPPED, Learned, Motorways
 from unjam.worlds.batch.motorway_record import MotorwayLog
 from unjam.worlds.batch.vehicles import Vehicles, chosen
 from unjam.worlds.record import Episode
@@ -25,6 +25,19 @@ from unjam.worlds.world import Driven, OnProgress
 
 PER_ROAD = 100_000
 """more than want to enter a road in an episode"""
+
+
+class Again(NamedTuple):
+    """What is otherwise where the people of an episode come once more, all at the same times."""
+
+    seeds: Sequence[tuple[Sequence[int], Sequence[int]]]
+    """of what people misjudge, and of exploration, for each road"""
+    decisions: int
+    """after which it ends"""
+    errs: bool
+    """whether people misjudge anything"""
+    learned: Learned | None
+    """what people do besides"""
 
 
 class MotorwayBatch:
@@ -41,19 +54,26 @@ class MotorwayBatch:
         seeds: Sequence[Sequence[int]],
         kind: type = np.float64,
         explore: Sequence[float] | None = None,
+        again: "Again | None" = None,
     ) -> None:
         """Take empty roads, one for each seed; numbers have the precision `kind`.
 
-        By `explore` exploration noise counts on each road; None: as it is drawn.
+        By `explore` exploration noise counts on each road; None: as it is drawn. `again`: what is otherwise
+        than in the episodes of these seeds.
         """
         self._explore = np.ones(len(seeds)) if explore is None else np.array(explore)
         self.scenario, self._seeds = scenario, seeds
         drawn = [scenario.of_seed(seed) for seed in seeds]
         self.roads = [cast(MotorwayRoad, road) for road, _ in drawn]
-        self._people = [np.random.default_rng(noise) for _, (noise, *_) in drawn]
-        self._exploration = [np.random.default_rng(seed) for _, (_, seed, *_) in drawn]
+        self._again, own = again, [(noise, seed) for _, (noise, seed, *_) in drawn]
+        self._people, self._exploration = (
+            [np.random.default_rng(seed) for seed in seeds]
+            for seeds in zip(*(own if again is None else again.seeds), strict=True)
+        )
         self._kind, step = kind, self.scenario.simulation_step
-        self._traffic = Motorways(self.roads, step, self._drawn, lambda values: values.astype(kind))
+        numbers, learned = lambda values: values.astype(kind), again and again.learned
+        taken = self.scenario.steps_per_decision
+        self._traffic = Motorways(self.roads, step, self._drawn, numbers, learned, taken)
         entries = max(len(road.entries) for road in self.roads)
         self._is_cav = np.zeros((len(drawn), entries), bool)
         for number, road in enumerate(self.roads):
@@ -73,6 +93,8 @@ class MotorwayBatch:
 
     def _drawn(self, shape: tuple[int, ...]) -> Floats:
         """Return the errors of all vehicles in this step: each road draws its own."""
+        if self._again is not None and not self._again.errs:
+            return np.zeros(shape, self._kind)
         counts = np.bincount(self._traffic.vehicles.road, minlength=len(self.roads))
         drawn = [
             generator.standard_normal((shape[0], count))
@@ -98,7 +120,8 @@ class MotorwayBatch:
     @property
     def ended(self) -> bool:
         """Whether the horizon is reached."""
-        return self.decisions >= self.scenario.horizon
+        horizon = self.scenario.horizon if self._again is None else self._again.decisions
+        return self.decisions >= horizon
 
     def perceive(self) -> LocalState:
         """Return what the CAVs perceive now: arrays of shape (CAVs,)."""

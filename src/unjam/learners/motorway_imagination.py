@@ -1,0 +1,159 @@
+"""Imagining on-ramps: the same people come once more, and misjudge and change lanes anew."""
+
+from collections.abc import Sequence
+from typing import Any, cast
+
+import numpy as np
+import torch
+
+from unjam.drivers.driver import Driver
+from unjam.drivers.network import Network
+from unjam.learners.experience import Experience, join
+from unjam.learners.imagination import (
+    EXPLORATION,
+    FIT,
+    NOISE,
+    STARTS,
+    AsExperience,
+    Imagination,
+    full_policy,
+)
+from unjam.learners.learner import under
+from unjam.scenarios.on_ramp import OnRamp
+from unjam.tree import pack, unpack
+from unjam.virtual.ensemble import torch_generator
+from unjam.virtual.fitting import Fit
+from unjam.virtual.motorways import (
+    MotorwayMoments,
+    check_motorways,
+    fit_motorways,
+    learned_of,
+    moments_of_motorway,
+)
+from unjam.virtual.roads import RoadModel
+from unjam.worlds.batch.motorway_world import Again, MotorwayBatch
+from unjam.worlds.batch.run import MOST_MOTORWAYS
+from unjam.worlds.drive import Drive, driven_to_the_end
+from unjam.worlds.episode import rewarded
+from unjam.worlds.record import Episode
+from unjam.worlds.reward import make_reward
+
+MOMENTS = "motorway-moments/"
+
+
+class MotorwayImagination(Imagination[RoadModel]):
+    """The virtual environment of a run on an on-ramp, and the actual data that it learns from."""
+
+    def __init__(self, *arguments: Any) -> None:
+        """Begin with the base alone, and without data; arguments are those of `Imagination`.
+
+        Raises:
+            InputError: an on-ramp cannot be imagined with these settings.
+        """
+        super().__init__(*arguments)
+        check_motorways(cast(OnRamp, self.scenario), self.settings)
+        self.moments: list[MotorwayMoments] = []
+        """of the episodes in D_a, oldest first"""
+        self._newest = 0
+
+    def _new_model(self) -> RoadModel:
+        return RoadModel(self.settings, self._seed(FIT))
+
+    def learn(self, episodes: Sequence[Episode], iteration: int) -> None:
+        """Add actual episodes to D_a, fit the model to it, and find the rollout length of Eq. 15."""
+        first, road = self.data.episodes, cast(OnRamp, self.scenario)
+        self._newest = len(episodes)
+        self.moments += [
+            moments_of_motorway(episode, first + place, road) for place, episode in enumerate(episodes)
+        ]
+        super().learn(episodes, iteration)
+
+    def _fit(self, seed: Sequence[int]) -> Fit:
+        oldest = self.data.recordings[0].episode
+        self.moments = [kept for kept in self.moments if kept.episode >= oldest]
+        return fit_motorways(self.model, self.moments, self.settings, seed)
+
+    def imagine(
+        self, network: Network, iteration: int, part: int, parts: int, how: AsExperience
+    ) -> Experience | None:
+        """Return what the policy `network` does where the people of actual episodes come once more.
+
+        In all `parts` of an iteration together there are `virtual_ratio` times as many episodes as newest
+        actual ones; None where they are not trusted.
+        """
+        driver = full_policy(self._task, self._policy, network)
+        decisions = min(self.k_star, self.scenario.horizon) // driver.hold * driver.hold
+        if decisions == 0:
+            return None
+        starts, noise, exploration = (
+            self._seed(iteration, each, part) for each in (STARTS, NOISE, EXPLORATION)
+        )
+        signs = self._policy.explores
+        count = max(1, round(self.settings.virtual_ratio * self._newest / parts / len(signs)))
+        chosen = np.random.default_rng(list(starts)).integers(len(self.moments), size=count).tolist()
+        kept = [self.moments[each] for each in chosen for _ in signs]
+        earned, found = list[float](), list[Experience]()
+        for begin in range(0, len(kept), MOST_MOTORWAYS):  # whole episodes take 40 MB each
+            some = kept[begin : begin + MOST_MOTORWAYS]
+            numbers = [number // len(signs) for number in range(begin, begin + len(some))]
+            seeds = [((*noise, number), (*exploration, number)) for number in numbers]
+            explore = [signs[number % len(signs)] for number in range(begin, begin + len(some))]
+            episodes = self.driven(driver, some, decisions, seeds, explore)
+            self.steps += sum(episode.steps for episode in episodes)
+            earned += [float(episode.reward.sum()) for episode in episodes]
+            found.append(how.of_episodes(episodes))
+        if part == 0:
+            self._note(kept, earned, decisions)
+        return join(found)
+
+    def driven(
+        self,
+        driver: Driver,
+        kept: Sequence[MotorwayMoments],
+        decisions: int,
+        seeds: Sequence[tuple[Sequence[int], Sequence[int]]],
+        explore: Sequence[float],
+    ) -> list[Episode]:
+        """Return what happens in so many decisions where the people of actual episodes come once more.
+
+        Args:
+            driver: of all CAVs, with its exploration.
+            kept: of whom.
+            decisions: of each road.
+            seeds: of what people misjudge, and of exploration, for each road.
+            explore: by how much exploration counts on each.
+        """
+        road = cast(OnRamp, self.scenario)
+        noise, *_ = seeds[0]
+        learned = learned_of(self.model, torch_generator(noise, "cpu"))
+        again = Again(seeds, decisions, self.settings.noise, learned)
+        world = MotorwayBatch(road, [each.seed for each in kept], explore=explore, again=again)
+        world.asked = driver.asks
+        found = driven_to_the_end(Drive(world, driver, 1.0))
+        earned = make_reward(self._task.reward or road.reward)
+        return [rewarded(episode, earned) for episode in found]
+
+    def _note(self, kept: Sequence[MotorwayMoments], earned: Sequence[float], decisions: int) -> None:
+        """Note what the policy that drove the newest actual episodes earned here and there."""
+        newest = self.moments[-self._newest :]
+        same = {each.episode for each in newest}
+        here = [value for value, each in zip(earned, kept, strict=True) if each.episode in same]
+        whole = decisions >= self.scenario.horizon and here
+        self.facts |= {
+            "return_virtual": float(np.mean(here)) if whole else None,
+            "return_actual": float(np.mean([each.earned for each in newest])) if whole else None,
+            "crash_share": 0.0,
+        }
+
+    def state(self) -> tuple[dict[str, Any], dict[str, torch.Tensor]]:
+        """Return all that a run must keep of it to go on, as JSON and tensors."""
+        facts, tensors = super().state()
+        kept, arrays = pack(self.moments)
+        tensors |= {f"{MOMENTS}{name}": torch.from_numpy(np.array(array)) for name, array in arrays.items()}
+        return {**facts, "moments": kept}, tensors
+
+    def restore(self, facts: dict[str, Any], tensors: dict[str, torch.Tensor]) -> None:
+        """Go on from what `state` returned."""
+        arrays = {name: tensor.numpy() for name, tensor in under(MOMENTS, tensors).items()}
+        self.moments = unpack(list[MotorwayMoments], facts["moments"], arrays)
+        super().restore(facts, {n: t for n, t in tensors.items() if not n.startswith(MOMENTS)})

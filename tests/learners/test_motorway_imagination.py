@@ -1,0 +1,133 @@
+"""On-ramps that are imagined: the same people come, drive as in actual episodes, and misjudge anew."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.learners.test_road_imagination import network_of
+from unjam.drivers.registry import named_driver
+from unjam.errors import InputError
+from unjam.learners.experience import experience_of, join
+from unjam.learners.imagination import AsExperience, full_policy
+from unjam.learners.motorway_imagination import MotorwayImagination
+from unjam.learners.settings import PolicySettings
+from unjam.physics.arrays import Floats
+from unjam.scenarios.on_ramp import ON_RAMP
+from unjam.virtual import motorways
+from unjam.virtual.motorways import moments_of_motorway
+from unjam.virtual.settings import VirtualSettings
+from unjam.worlds.batch.motorway_world import Again, MotorwayBatch
+from unjam.worlds.batch.run import run_batch
+from unjam.worlds.drive import Drive, driven_to_the_end
+from unjam.worlds.episode import Task
+from unjam.worlds.record import Episode
+from unjam.worlds.workers import EpisodeTask
+
+ROAD = replace(ON_RAMP, horizon=160, peak=(20.0, 160.0), cav_share=0.2)
+EXPERT = named_driver("jam-ahead", 1.0)
+POLICY = PolicySettings(hidden=(8,), observe=("local",), hold=5.0, exploration="mirrored")
+VIRTUAL = VirtualSettings(model="road", begin="first", k_max=160, virtual_ratio=1.0, fit_rows=2000)
+HOW = AsExperience(
+    lambda drawn: drawn,
+    lambda episodes: join(
+        [experience_of(each.trajectories, np.zeros((len(each.trajectories), 0))) for each in episodes]
+    ),
+)
+
+
+@pytest.fixture(scope="module")
+def actual() -> list[Episode]:
+    return run_batch([EpisodeTask(ROAD, EXPERT, (seed,)) for seed in range(4)], statistical=True)
+
+
+@pytest.fixture
+def often(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(motorways, "EVERY", 10)
+
+
+def again(errs: bool, beyond: float = 0.0, seed: int = 9) -> Episode:
+    def learned(speed: Floats, leader_speed: Floats, gap: Floats, known: Floats) -> Floats:
+        return np.full(len(speed), beyond)
+
+    about = Again([((seed,), (8,))], ROAD.horizon, errs, learned if beyond else None)
+    world = MotorwayBatch(ROAD, [(0,)], again=about)
+    world.asked = EXPERT.asks
+    (episode,) = driven_to_the_end(Drive(world, EXPERT))
+    return episode
+
+
+def test_the_same_people_come_at_the_same_times_and_err_anew(actual: list[Episode]) -> None:
+    one, other = again(True), again(True, seed=10)
+    for episode in (one, other):
+        assert set(episode.vehicle_ids[:40]) == set(actual[0].vehicle_ids[:40])
+        assert episode.cav_ids[:3] == actual[0].cav_ids[:3]
+    moments = min(len(each.speeds) for each in (one, other)) // 2
+    assert np.nanmean(one.speeds[:moments]) == pytest.approx(np.nanmean(other.speeds[:moments]), rel=0.05)
+    assert np.nanmean(one.speeds) != np.nanmean(other.speeds)
+    np.testing.assert_array_equal(again(False).speeds, again(False, seed=10).speeds)
+
+
+def test_what_is_learned_moves_people_by_so_much_in_a_decision() -> None:
+    calm, pushed = again(False), again(False, beyond=-0.05)
+    assert np.nanmean(pushed.speeds[40:]) < np.nanmean(calm.speeds[40:]) - 0.2
+    assert np.nanmean(again(False, beyond=1e-9).speeds) == pytest.approx(np.nanmean(calm.speeds), rel=1e-6)
+
+
+@pytest.mark.usefixtures("often")
+def test_a_step_of_the_base_is_what_people_did_but_for_what_they_misjudge(actual: list[Episode]) -> None:
+    kept = moments_of_motorway(actual[0], 0, ROAD)
+    wrong = kept.people.after - kept.people.base
+    assert len(wrong) > 200
+    change = float((kept.people.after - kept.people.speed).std())
+    assert float(np.median(np.abs(wrong))) < 0.4 * change
+    assert 0.3 < kept.noise / float(np.square(wrong).mean()) < 1.5
+
+
+@pytest.mark.usefixtures("often")
+def test_people_who_err_in_nothing_are_foreseen_but_for_what_they_remember() -> None:
+    kept = moments_of_motorway(replace(again(False), seed=(0,), trajectories=()), 0, ROAD)
+    wrong = np.abs(kept.people.after - kept.people.base)
+    # What they remember of lane changes, and when they last began to start, is not in the record.
+    assert float(np.median(wrong)) < 1e-3
+    assert float(np.quantile(wrong, 0.9)) < 0.2
+
+
+@pytest.mark.usefixtures("often")
+def test_it_imagines_as_many_episodes_as_are_asked_for_in_mirrored_pairs(actual: list[Episode]) -> None:
+    task = Task(ROAD, EXPERT)
+    imagination = MotorwayImagination(replace(VIRTUAL, virtual_ratio=2.0), task, POLICY, 0)
+    imagination.learn(actual, 1)
+    assert imagination.k_star == 160
+    network = replace(network_of(0.05, POLICY), lasts=True)
+    found = imagination.imagine(network, 1, 0, 1, HOW)
+    assert found is not None
+    assert imagination.steps == 2 * len(actual) * 160
+    assert imagination.facts["return_virtual"] == pytest.approx(imagination.facts["return_actual"], rel=0.1)
+    facts, tensors = imagination.state()
+    other = MotorwayImagination(replace(VIRTUAL, virtual_ratio=2.0), task, POLICY, 0)
+    other.restore(facts, tensors)
+    other._newest, other.k_star = len(actual), imagination.k_star
+    repeated = other.imagine(network, 1, 0, 1, HOW)
+    assert repeated is not None
+    np.testing.assert_array_equal(repeated.observations, found.observations)
+    np.testing.assert_array_equal(repeated.rewards, found.rewards)
+    driver = full_policy(task, POLICY, network)
+    seeds = [((1,), (2,)), ((1,), (2,))]
+    one, mirrored = imagination.driven(driver, imagination.moments[:1] * 2, 20, seeds, [1.0, -1.0])
+    first, second = one.trajectories[0], mirrored.trajectories[0]
+    calm = network(first.observations[:1])
+    assert first.residual[0] + second.residual[0] == pytest.approx(2.0 * calm[0])
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        (replace(VIRTUAL, begin="newest"), "virtual.begin: newest is not allowed"),
+        (replace(VIRTUAL, base="none"), "virtual.base"),
+        (replace(VIRTUAL, calibrate=True), "not calibrated"),
+    ],
+)
+def test_what_cannot_be_imagined_is_refused(settings: VirtualSettings, words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        MotorwayImagination(settings, Task(ROAD, EXPERT), POLICY, 0)
