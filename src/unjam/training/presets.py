@@ -216,7 +216,7 @@ BEST: dict[str, dict[str, Any]] = {
 """the preset `best`: what is known to reach furthest, road by road"""
 
 QUICK: dict[str, dict[str, Any]] = {
-    **BEST,
+    "merge": BEST["merge"],
     # The expert is tuned: what a residual on it gains, no parameter does. It is easily upset: seven times the
     # noise makes the first 40 iterations unlearn what it can, and noise that is learned vanishes too soon.
     "ring": {
