@@ -79,9 +79,10 @@ class Drive:
             self.memories.append(mapped(lambda values: np.array(values[row], np.float64), self.memory))  # noqa: B023
 
 
-def _times(factor: float, noise: Callable[[int], Any], lasting: int) -> Any:
+def _times(factor: float, noise: Callable[..., Any], lasting: int) -> Any:
     """Return noise times a factor."""
-    return noise(lasting) if factor == 1.0 else factor * noise(lasting)
+    drawn = noise(lasting) if lasting else noise()
+    return drawn if factor == 1.0 else factor * drawn
 
 
 def drive(
