@@ -66,6 +66,7 @@ STUDIES: dict[str, Study] = {
     "imagined": imagined("ring", "best"),
     "imagined-jammed": imagined("ring-jammed", "jammed"),
     "imagined-eight": imagined("figure-eight", "eight"),
+    "imagined-ramp": imagined("on-ramp", "ramp"),
     "eq16": comparison_of(
         "Eq. 16 as it is printed and as it is meant, on the ring",
         ("trpo-eq16", "trpo-as-printed", "proposed-eq16", "proposed-as-printed"),

@@ -40,7 +40,7 @@ SECONDS: dict[str, dict[str, float]] = {
 batches [s]"""
 VIRTUAL_SECONDS = 60.0
 """what the virtual environment adds, for each virtual decision per actual one up to one [s]"""
-DRIVE_SECONDS = {"ring": 60.0, "figure-eight": 60.0, "merge": 400.0}
+DRIVE_SECONDS = {"ring": 60.0, "figure-eight": 60.0, "merge": 400.0, "on-ramp": 1500.0}
 """what the drivers that do not learn take on a road [s]"""
 
 
@@ -77,8 +77,9 @@ def studies_of(names: Sequence[str]) -> dict[str, Study]:
 def estimated_seconds(run: PlannedRun) -> float:
     """Return about how long a training takes on one core [s]."""
     config = run.config
-    virtual = VIRTUAL_SECONDS * min(1.0, config.virtual.virtual_ratio)
-    return config.steps / 300_000 * (SECONDS[config.agent][_kind(run.road)] + virtual)
+    actual, virtual = SECONDS[config.agent][_kind(run.road)], config.virtual
+    rows, roads = VIRTUAL_SECONDS * min(1.0, virtual.virtual_ratio), actual * virtual.virtual_ratio
+    return config.steps / 300_000 * (actual + (roads if virtual.model == "road" else rows))
 
 
 def _kind(road: str) -> str:

@@ -193,6 +193,7 @@ VARIANTS: dict[str, Variant] = {
     **few_steps("best", 12_000, 756_000),
     **few_steps("jammed", 24_000, 768_000),
     **few_steps("eight", 6_000, 612_000, horizon=1500),
+    **few_steps("ramp", 19_200, 576_000, horizon=2400),
     "best-in-batches": Variant("ours, all its steps", "best", {"world": "batch"}, None),
     "by-150-seconds": Variant("residual", "best", BY_150_SECONDS, None),
     "rings": Variant("residual", "rings", TWO_EACH, None),
