@@ -104,6 +104,7 @@ def test_it_imagines_as_many_episodes_as_are_asked_for_in_mirrored_pairs(actual:
     assert found is not None
     assert imagination.steps == 2 * len(actual) * 160
     assert imagination.facts["return_virtual"] == pytest.approx(imagination.facts["return_actual"], rel=0.1)
+    assert imagination.facts["crash_share"] == 0.0
     facts, tensors = imagination.state()
     other = MotorwayImagination(replace(VIRTUAL, virtual_ratio=2.0), task, POLICY, 0)
     other.restore(facts, tensors)

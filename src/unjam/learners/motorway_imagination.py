@@ -92,7 +92,7 @@ class MotorwayImagination(Imagination[RoadModel]):
         count = max(1, round(self.settings.virtual_ratio * self._newest / parts / len(signs)))
         chosen = np.random.default_rng(list(starts)).integers(len(self.moments), size=count).tolist()
         kept = [self.moments[each] for each in chosen for _ in signs]
-        earned, found = list[float](), list[Experience]()
+        earned, crashed, found = list[float](), list[bool](), list[Experience]()
         for begin in range(0, len(kept), MOST_MOTORWAYS):  # whole episodes take 40 MB each
             some = kept[begin : begin + MOST_MOTORWAYS]
             numbers = [number // len(signs) for number in range(begin, begin + len(some))]
@@ -101,9 +101,11 @@ class MotorwayImagination(Imagination[RoadModel]):
             episodes = self.driven(driver, some, decisions, seeds, explore)
             self.steps += sum(episode.steps for episode in episodes)
             earned += [float(episode.reward.sum()) for episode in episodes]
+            crashed += [episode.status == "collision" for episode in episodes]
             found.append(how.of_episodes(episodes))
         if part == 0:
             self._note(kept, earned, decisions)
+            self.facts["crash_share"] = float(np.mean(crashed))
         return join(found)
 
     def driven(
@@ -142,7 +144,6 @@ class MotorwayImagination(Imagination[RoadModel]):
         self.facts |= {
             "return_virtual": float(np.mean(here)) if whole else None,
             "return_actual": float(np.mean([each.earned for each in newest])) if whole else None,
-            "crash_share": 0.0,
         }
 
     def state(self) -> tuple[dict[str, Any], dict[str, torch.Tensor]]:
