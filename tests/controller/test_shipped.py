@@ -37,7 +37,8 @@ def test_each_is_whole_and_says_what_it_was_trained_on(name: str) -> None:
 
 
 def test_there_is_one_for_each_preset_that_is_known_to_reach_furthest() -> None:
-    best = {f"{scenario}-best" for scenario in BEST if scenario != "merge"}  # where nothing is drivable
+    without = {"merge", "on-ramp"}  # where nothing is drivable, and where nothing learned is shown to gain
+    best = {f"{scenario}-best" for scenario in BEST.keys() - without}
     assert {name for name in shipped_names() if not name.endswith("-tuned")} == {"best", *best}
 
 

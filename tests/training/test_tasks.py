@@ -170,13 +170,15 @@ def test_each_road_is_judged_in_a_folder_of_its_own(tmp_path: Path) -> None:
     assert "2 results compared" in page
 
 
-@pytest.mark.parametrize("exploration", ["anew", "mirrored"])
-def test_a_training_in_the_batch_is_that_in_sumo(exploration: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("agent", "exploration"), [("trpo", "anew"), ("trpo", "mirrored"), ("ppo", "mirrored")]
+)
+def test_a_training_in_the_batch_is_that_in_sumo(agent: str, exploration: str, tmp_path: Path) -> None:
     mixture = {"tasks": [{"road": {"length": [120, 125]}}, {"road": {"vehicles": 7}, "name": "fewer"}]}
     runs = {}
     for world in ("sumo", "batch"):
         with Workers(1) as workers:
-            how = {"world": world, "policy.exploration": exploration}
+            how = {"world": world, "agent": agent, "policy.exploration": exploration}
             learn_with(workers, tmp_path / world, small_config(**mixture, **how))
         runs[world] = read_progress(tmp_path / world)
     for one, other in zip(runs["sumo"], runs["batch"], strict=True):
