@@ -24,3 +24,6 @@ drive other-people on-ramp -d human -d jam-ahead --set following=IDM --set time_
     --set accelerations=[1.8,2.8] --set decelerations=[2.5,3.5] --set gaps=[2.5,3.2] --set inflow=3600
 drive no-jam on-ramp -d human -d jam-ahead --set inflow=1800 --set ramp_flow=250
 drive tuned-05 on-ramp --cav-share 0.05 -d unjam:on-ramp-tuned
+# what longer tuning finds; the last --episodes counts
+long=$(python -c "from unjam.training.presets import ON_RAMP_LONG; print(ON_RAMP_LONG)")
+drive tuned-long-05 on-ramp --cav-share 0.05 --episodes 40 -d human -d unjam:on-ramp-tuned -d "$long"

@@ -19,12 +19,16 @@ from unjam.measures.statistics import crossed_estimate, estimate
 from unjam.measures.table import PEOPLE, cell_of
 from unjam.scenarios.on_ramp import ON_RAMP
 from unjam.studies.study import Study, StudyFolder, judged, planned, read_part
+from unjam.training.presets import ON_RAMP_LONG
 from unjam.worlds.workers import Workers
 
 ROAD = replace(ON_RAMP, cav_share=0.05)
 SEEDS = 60
-TUNED, TUNED_LONG = "its expert, tuned", "the same, tuned with as many steps"
-NAMED = {PEOPLE: "human", "own ACC": "cruise", TUNED: "unjam:on-ramp-tuned"}
+TUNED, SHORTER = "its expert, tuned with as many steps", "the same, tuned with a sixth of them"
+NAMED = {
+    **{PEOPLE: "human", "own ACC": "cruise", SHORTER: "unjam:on-ramp-tuned"},
+    TUNED: ON_RAMP_LONG,
+}
 TIME, FLOW, BRAKING = "travel_time", "throughput_veh_per_h", "people_beyond_4_5"
 KEPT = (TIME, FLOW, BRAKING, "mean_speed", "fuel_ml_per_km", "drivable", "min_headway", "cav_max_braking")
 """of each episode"""

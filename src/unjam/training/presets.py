@@ -129,6 +129,13 @@ PRESETS["everywhere"] = {
 GATHERING_PACER = "pacer:varying=true,gathering_speed=1.934,gathering_gap=0.445,regathering_gap=0.6469"
 """the expert that was tuned on the figure eight, but for its time constant"""
 
+ON_RAMP_LONG = (
+    "jam-ahead:first=3,last=4,margin=-1.536,margin_by_share=19.83,lowest=2.568,slowing=1.106,"
+    "time_constant=1.681"
+)
+"""what `unjam tune on-ramp --expert jam-ahead --set cav_share=0.05 --steps 4608000` finds, mostly in batches;
+with 710,400 steps, all in SUMO, it is `unjam:on-ramp-tuned`"""
+
 CLOSING_ABSORBER = "jam-absorber:gap_gain=0,push=0.9,speed_gain=0.8"
 """the expert that gets furthest on the merge"""
 
@@ -184,7 +191,7 @@ BEST: dict[str, dict[str, Any]] = {
         "steps": 4_608_000,
         "world": "batch",
         "road": {"cav_share": 0.05},
-        "expert": "unjam:on-ramp-tuned",
+        "expert": ON_RAMP_LONG,
         "policy": {
             "observe": ["approach"],
             "exploration": "mirrored",
