@@ -7,7 +7,7 @@ import sys
 import tempfile
 import threading
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any, Self, TypeVar
 
@@ -91,8 +91,10 @@ class Workers:
         def run_one(index: int, task: EpisodeTask) -> Kept:
             return keep(index, self._run_one(index, task, progress))
 
-        futures = [self._threads.submit(run_one, index, task) for index, task in enumerate(tasks)]
+        futures = list[Future[Kept]]()
         try:
+            for index, task in enumerate(tasks):  # it takes a while: an interrupt may come already
+                futures.append(self._threads.submit(run_one, index, task))
             return [future.result() for future in futures]
         except BaseException:
             for future in futures:
