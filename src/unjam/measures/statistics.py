@@ -210,6 +210,14 @@ def crossed_estimate(values: Any) -> Estimate:
     return replace(found, low=mean - half, high=mean + half)
 
 
+def estimate_on_shared_seeds(values: Any) -> Estimate:
+    """Return `crossed_estimate` of several trainings, `estimate` of a single driver.
+
+    Values have the shape (drivers, seeds).
+    """
+    return crossed_estimate(values) if len(values) > 1 else estimate(values[0].tolist())
+
+
 def _crossed_variance(table: Any) -> tuple[float, float]:
     """Return the variance of the mean, (MS_T + MS_S - MS_R) / (T S), and its degrees of freedom."""
     trainings, seeds = table.shape

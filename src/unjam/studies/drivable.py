@@ -4,7 +4,7 @@ Every driver on every length or radius on the same seeds; the seeds are shared b
 intervals know. The ring's ceiling leads all to the limit of the length, which no car can know.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from math import inf, isinf
@@ -19,7 +19,7 @@ from unjam.drivers.driver import Driver
 from unjam.drivers.follower_stopper import FollowerStopper
 from unjam.files import to_json, write_whole
 from unjam.measures.drivable import DRIVABLE
-from unjam.measures.statistics import crossed_estimate, estimate
+from unjam.measures.statistics import estimate_on_shared_seeds
 from unjam.measures.table import PEOPLE, cell_of
 from unjam.physics.arrays import Floats
 from unjam.scenarios.figure_eight import FigureEight
@@ -172,14 +172,12 @@ def _row(road: JudgedRoad, episodes: pd.DataFrame, label: str, members: list[str
         own.mean(numeric_only=True),
         np.nanmin(np.asarray(own["min_headway"], np.float64), initial=inf),
     )
-    worst = [verdict for verdict in own["verdict"] if verdict != DRIVABLE]
 
     def beyond(baseline: str, name: str, digits: int) -> str:
         """Return what they are beyond another driver, on each seed over all sizes."""
         by_seed = episodes.pivot_table(name, "driver", "seed")
         values = (by_seed.loc[members] - by_seed.loc[baseline]).to_numpy()
-        found = crossed_estimate(values) if len(members) > 1 else estimate(values[0])
-        return str(cell_of(found, digits, sign="+"))
+        return str(cell_of(estimate_on_shared_seeds(values), digits, sign="+"))
 
     return {
         "driver": label,
@@ -195,8 +193,13 @@ def _row(road: JudgedRoad, episodes: pd.DataFrame, label: str, members: list[str
         "fuel [ml/km]": f"{mean['fuel_ml_per_km']:.0f}",
         "dissolved after [s]": _dissolved(np.asarray(own["time_to_dissolve"], np.float64)),
         "smallest headway [s]": NOTHING if isinf(closest) else f"{closest:.2f}",
-        "drivable": (worst[0] or NOTHING) if worst else "yes",
+        "drivable": in_a_word(own["verdict"]),
     }
+
+
+def in_a_word(verdicts: Iterable[str]) -> str:
+    """Return `yes` where all are drivable, else the first reason why not."""
+    return next((verdict or NOTHING for verdict in verdicts if verdict != DRIVABLE), "yes")
 
 
 def _dissolved(times: Floats) -> str:

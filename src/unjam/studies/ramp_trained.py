@@ -14,10 +14,10 @@ import pandas as pd
 
 from unjam.controller import make_driver
 from unjam.files import to_json, write_whole
-from unjam.measures.drivable import DRIVABLE
-from unjam.measures.statistics import crossed_estimate, estimate
+from unjam.measures.statistics import estimate_on_shared_seeds
 from unjam.measures.table import PEOPLE, cell_of
 from unjam.scenarios.on_ramp import ON_RAMP
+from unjam.studies.drivable import NOTHING, in_a_word
 from unjam.studies.study import Study, StudyFolder, judged, planned, read_part
 from unjam.training.presets import ON_RAMP_LONG
 from unjam.worlds.workers import Workers
@@ -61,21 +61,19 @@ def _row(found: dict[str, Any], label: str, members: Sequence[str]) -> dict[str,
         return np.array([[row[name] for row in found[each]["episodes"]] for each in labels], np.float64)
 
     def beyond(baseline: str, name: str, digits: int) -> str:
-        values = of(members, name) - of([baseline], name)
-        same = [baseline] == list(members)
-        more = crossed_estimate(values) if len(members) > 1 else estimate(values[0])
-        return "–" if same else str(cell_of(more, digits, sign="+"))
+        more = estimate_on_shared_seeds(of(members, name) - of([baseline], name))
+        return NOTHING if [baseline] == list(members) else str(cell_of(more, digits, sign="+"))
 
-    worst = [found[each]["drivable"] for each in members if found[each]["drivable"] != DRIVABLE]
+    closest = f"{np.nanmin(of(members, 'min_headway')):.2f}" if label != PEOPLE else NOTHING
     return {
         "driver": label,
         "travel time [s]": f"{of(members, TIME).mean():.1f}",
         "beyond its expert [s]": beyond(TUNED, TIME, 1),
         "beyond people [s]": beyond(PEOPLE, TIME, 1),
         "flow beyond people [veh/h]": beyond(PEOPLE, FLOW, 0),
-        "smallest headway [s]": f"{np.nanmin(of(members, 'min_headway')):.2f}" if label != PEOPLE else "–",
+        "smallest headway [s]": closest,
         "people beyond 4.5 m/s²": f"{of(members, BRAKING).mean():.0f}",
-        "drivable": (worst[0] or "–") if worst else "yes",
+        "drivable": in_a_word(found[each]["drivable"] for each in members),
     }
 
 

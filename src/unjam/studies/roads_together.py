@@ -15,7 +15,7 @@ import pandas as pd
 
 from unjam.measures.drivable import DRIVABLE
 from unjam.measures.gain import Rows
-from unjam.measures.statistics import crossed_estimate, estimate, signed
+from unjam.measures.statistics import estimate_on_shared_seeds, signed
 from unjam.measures.table import PEOPLE
 from unjam.physics.arrays import Floats
 from unjam.studies.everywhere import (
@@ -193,4 +193,4 @@ def _named(who: str, label: str) -> bool:
 
 def _cell(values: Floats) -> str:
     """Return the mean of drivers on seeds, shape (drivers, seeds), with its interval."""
-    return signed(crossed_estimate(values) if len(values) > 1 else estimate(values[0].tolist()), 2)
+    return signed(estimate_on_shared_seeds(values), 2)
