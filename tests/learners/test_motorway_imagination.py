@@ -108,7 +108,7 @@ def test_it_imagines_as_many_episodes_as_are_asked_for_in_mirrored_pairs(actual:
     facts, tensors = imagination.state()
     other = MotorwayImagination(replace(VIRTUAL, virtual_ratio=2.0), task, POLICY, 0)
     other.restore(facts, tensors)
-    other._newest, other.k_star = len(actual), imagination.k_star
+    other._first, other.k_star = 0, imagination.k_star
     repeated = other.imagine(network, 1, 0, 1, HOW)
     assert repeated is not None
     np.testing.assert_array_equal(repeated.observations, found.observations)

@@ -2,6 +2,7 @@
 
 import itertools
 import json
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -12,7 +13,7 @@ from unjam.drivers.network import Network
 from unjam.drivers.observation import observation_size
 from unjam.drivers.safety import SafetyFilter
 from unjam.drivers.sensors import Sensors
-from unjam.learners.experience import join
+from unjam.learners.experience import Experience, experience_of
 from unjam.learners.imagination import AsExperience, full_policy
 from unjam.learners.road_imagination import RoadImagination
 from unjam.learners.settings import PolicySettings
@@ -34,7 +35,6 @@ WRONG = replace(
     RING, sensors=Sensors(0.5, 0.5, dropout=0.1), safety=SafetyFilter(gap_error=0.5, speed_error=0.5)
 )
 POLICY = PolicySettings(hidden=(8,))
-AS_DRAWN = AsExperience(lambda drawn: drawn, lambda episodes: join([]))
 VIRTUAL = VirtualSettings(model="road", k_max=DECISIONS, virtual_ratio=1.0)
 
 
@@ -46,6 +46,17 @@ def network_of(exploration_std: float, policy: PolicySettings = POLICY) -> Netwo
         for before, after in itertools.pairwise(sizes)
     ]
     return Network(tuple(layers), 1.0, exploration_std)
+
+
+def as_drawn(road: Loop) -> AsExperience:
+    """How imagined episodes become experience whose critic sees what they drew."""
+
+    def of_episodes(episodes: Sequence[Episode]) -> Experience:
+        pairs = [(episode, each) for episode in episodes for each in episode.trajectories]
+        drawn = np.array([road.drawn_scaled(episode.drawn) for episode, _ in pairs])
+        return experience_of([each for _, each in pairs], drawn)
+
+    return AsExperience(lambda drawn: drawn, of_episodes)
 
 
 def imagined(road: Loop, network: Network) -> tuple[RoadImagination, list[Episode]]:
@@ -82,7 +93,7 @@ def test_the_policy_goes_on_with_what_it_remembered() -> None:
     network = network_of(0.0)
     imagination, episodes = imagined(replace(RING, noise=0.0), network)
     imagination.k_star = DECISIONS
-    found = imagination.imagine(network, 1, 0, 1, AS_DRAWN)
+    found = imagination.imagine(network, 1, 0, 1, as_drawn(RING))
     assert found is not None
     actual = [each.choices[1] for episode in episodes for each in episode.trajectories]
     same = 0
@@ -98,7 +109,7 @@ def test_the_policy_goes_on_with_what_it_remembered() -> None:
 )
 def test_with_noise_returns_are_those_of_the_road(road: Loop) -> None:
     imagination, _ = imagined(road, network_of(0.05))
-    found = imagination.imagine(network_of(0.05), 1, 0, 1, AS_DRAWN)
+    found = imagination.imagine(network_of(0.05), 1, 0, 1, as_drawn(road))
     assert found is not None
     assert len(found.rewards) == 2 * 4 * 400 / 10
     assert found.observations.shape[1] == observation_size(POLICY.observe, PISaturation()) + 1
@@ -118,7 +129,7 @@ def test_each_imagined_road_misreads_in_its_own_way() -> None:
 def test_a_model_that_is_not_trusted_imagines_nothing() -> None:
     imagination, _ = imagined(RING, network_of(0.0))
     imagination.k_star = 9
-    assert imagination.imagine(network_of(0.0), 1, 0, 1, AS_DRAWN) is None
+    assert imagination.imagine(network_of(0.0), 1, 0, 1, as_drawn(RING)) is None
 
 
 @pytest.mark.parametrize("road", [RING, EIGHT], ids=["a ring", "a figure eight"])

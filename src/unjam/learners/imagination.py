@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 from math import ceil
-from typing import Any, Generic, NamedTuple, TypeVar
+from typing import Any, Generic, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 import torch
@@ -17,11 +17,13 @@ from unjam.learners.experience import Experience
 from unjam.learners.learner import under
 from unjam.learners.settings import PolicySettings
 from unjam.physics.idm import IDMParameters
+from unjam.tree import pack, unpack
 from unjam.virtual.comparison import return_gap
 from unjam.virtual.data import ActualData, pack_data, unpack_data
 from unjam.virtual.ensemble import Ensemble, torch_generator
 from unjam.virtual.fitting import Fit, fit
 from unjam.virtual.model import EnvironmentModel
+from unjam.virtual.roads import RoadModel
 from unjam.virtual.rollout import Rollouts, begin, draw_starts, imagine, return_bound, rollout_length
 from unjam.virtual.settings import VirtualSettings
 from unjam.virtual.world import VirtualDynamics
@@ -30,7 +32,8 @@ from unjam.worlds.record import Episode, Floats
 
 FIT, STARTS, NOISE, EXPLORATION = 2, 3, 4, 5
 """what the random numbers of an iteration are for, in their seeds"""
-DATA = "data/"
+DATA, MOMENTS = "data/", "moments/"
+"""prefixes of tensors in checkpoints"""
 
 
 class AsExperience(NamedTuple):
@@ -176,6 +179,66 @@ class Imagination(Generic[Model]):
         self.steps = facts["steps"]
         self.scenario = replace(self.scenario, humans=IDMParameters(**facts["people"]))
         self.model.load_state_dict({n: t for n, t in tensors.items() if not n.startswith(DATA)})
+
+
+class OfAnEpisode(Protocol):
+    """What is kept of an actual episode."""
+
+    @property
+    def episode(self) -> int:
+        """Number of the episode."""
+        ...
+
+
+Kept = TypeVar("Kept", bound=OfAnEpisode)
+
+
+class WholeRoads(Imagination[RoadModel], Generic[Kept]):
+    """The virtual environment of a run as whole roads, of which more is kept than what CAVs perceived."""
+
+    kind: type[Kept]
+    """of what is kept of each episode"""
+
+    def __init__(self, *arguments: Any) -> None:
+        """Begin with the base alone, and without data; arguments are those of `Imagination`."""
+        super().__init__(*arguments)
+        self.moments: list[Kept] = []
+        """of the episodes in D_a, oldest first"""
+
+    def _new_model(self) -> RoadModel:
+        return RoadModel(self.settings, self._seed(FIT))
+
+    def _kept_of(self, episode: Episode, number: int) -> Kept:
+        """Return what is kept of an actual episode, the so many-th."""
+        raise NotImplementedError
+
+    def _fit_moments(self, seed: Sequence[int]) -> Fit:
+        """Fit the model to what is kept of D_a as it is now."""
+        raise NotImplementedError
+
+    def learn(self, episodes: Sequence[Episode], iteration: int) -> None:
+        """Add actual episodes to D_a, fit the model to it, and find the rollout length of Eq. 15."""
+        first = self.data.episodes
+        self.moments += [self._kept_of(episode, first + place) for place, episode in enumerate(episodes)]
+        super().learn(episodes, iteration)
+
+    def _fit(self, seed: Sequence[int]) -> Fit:
+        oldest = self.data.recordings[0].episode
+        self.moments = [kept for kept in self.moments if kept.episode >= oldest]
+        return self._fit_moments(seed)
+
+    def state(self) -> tuple[dict[str, Any], dict[str, torch.Tensor]]:
+        """Return all that a run must keep of it to go on, as JSON and tensors."""
+        facts, tensors = super().state()
+        kept, arrays = pack(self.moments)
+        tensors |= {f"{MOMENTS}{name}": torch.from_numpy(np.array(array)) for name, array in arrays.items()}
+        return {**facts, "moments": kept}, tensors
+
+    def restore(self, facts: dict[str, Any], tensors: dict[str, torch.Tensor]) -> None:
+        """Go on from what `state` returned."""
+        arrays = {name: tensor.numpy() for name, tensor in under(MOMENTS, tensors).items()}
+        self.moments = unpack(list[self.kind], facts["moments"], arrays)
+        super().restore(facts, {n: t for n, t in tensors.items() if not n.startswith(MOMENTS)})
 
 
 class RowImagination(Imagination[EnvironmentModel]):

@@ -4,23 +4,19 @@ from collections.abc import Sequence
 from typing import Any, cast
 
 import numpy as np
-import torch
 
 from unjam.drivers.driver import Driver
 from unjam.drivers.network import Network
 from unjam.learners.experience import Experience, join
 from unjam.learners.imagination import (
     EXPLORATION,
-    FIT,
     NOISE,
     STARTS,
     AsExperience,
-    Imagination,
+    WholeRoads,
     full_policy,
 )
-from unjam.learners.learner import under
 from unjam.scenarios.on_ramp import OnRamp
-from unjam.tree import pack, unpack
 from unjam.virtual.ensemble import torch_generator
 from unjam.virtual.fitting import Fit
 from unjam.virtual.motorways import (
@@ -30,7 +26,6 @@ from unjam.virtual.motorways import (
     learned_of,
     moments_of_motorway,
 )
-from unjam.virtual.roads import RoadModel
 from unjam.worlds.batch.motorway_world import Again, MotorwayBatch
 from unjam.worlds.batch.run import MOST_MOTORWAYS
 from unjam.worlds.drive import Drive, driven_to_the_end
@@ -38,11 +33,11 @@ from unjam.worlds.episode import rewarded
 from unjam.worlds.record import Episode
 from unjam.worlds.reward import make_reward
 
-MOMENTS = "motorway-moments/"
 
+class MotorwayImagination(WholeRoads[MotorwayMoments]):
+    """The virtual environment of a run on an on-ramp."""
 
-class MotorwayImagination(Imagination[RoadModel]):
-    """The virtual environment of a run on an on-ramp, and the actual data that it learns from."""
+    kind = MotorwayMoments
 
     def __init__(self, *arguments: Any) -> None:
         """Begin with the base alone, and without data; arguments are those of `Imagination`.
@@ -52,25 +47,11 @@ class MotorwayImagination(Imagination[RoadModel]):
         """
         super().__init__(*arguments)
         check_motorways(cast(OnRamp, self.scenario), self.settings)
-        self.moments: list[MotorwayMoments] = []
-        """of the episodes in D_a, oldest first"""
-        self._newest = 0
 
-    def _new_model(self) -> RoadModel:
-        return RoadModel(self.settings, self._seed(FIT))
+    def _kept_of(self, episode: Episode, number: int) -> MotorwayMoments:
+        return moments_of_motorway(episode, number, cast(OnRamp, self.scenario))
 
-    def learn(self, episodes: Sequence[Episode], iteration: int) -> None:
-        """Add actual episodes to D_a, fit the model to it, and find the rollout length of Eq. 15."""
-        first, road = self.data.episodes, cast(OnRamp, self.scenario)
-        self._newest = len(episodes)
-        self.moments += [
-            moments_of_motorway(episode, first + place, road) for place, episode in enumerate(episodes)
-        ]
-        super().learn(episodes, iteration)
-
-    def _fit(self, seed: Sequence[int]) -> Fit:
-        oldest = self.data.recordings[0].episode
-        self.moments = [kept for kept in self.moments if kept.episode >= oldest]
+    def _fit_moments(self, seed: Sequence[int]) -> Fit:
         return fit_motorways(self.model, self.moments, self.settings, seed)
 
     def imagine(
@@ -89,7 +70,7 @@ class MotorwayImagination(Imagination[RoadModel]):
             self._seed(iteration, each, part) for each in (STARTS, NOISE, EXPLORATION)
         )
         signs = self._policy.explores
-        count = max(1, round(self.settings.virtual_ratio * self._newest / parts / len(signs)))
+        count = max(1, round(self.settings.virtual_ratio * len(self._newest) / parts / len(signs)))
         chosen = np.random.default_rng(list(starts)).integers(len(self.moments), size=count).tolist()
         kept = [self.moments[each] for each in chosen for _ in signs]
         earned, crashed, found = list[float](), list[bool](), list[Experience]()
@@ -135,26 +116,16 @@ class MotorwayImagination(Imagination[RoadModel]):
         earned = make_reward(self._task.reward or road.reward)
         return [rewarded(episode, earned) for episode in found]
 
+    @property
+    def _newest(self) -> list[MotorwayMoments]:
+        """Those of the newest policy's episodes."""
+        return [each for each in self.moments if each.episode >= self._first]
+
     def _note(self, kept: Sequence[MotorwayMoments], earned: Sequence[float], decisions: int) -> None:
         """Note what the policy that drove the newest actual episodes earned here and there."""
-        newest = self.moments[-self._newest :]
-        same = {each.episode for each in newest}
-        here = [value for value, each in zip(earned, kept, strict=True) if each.episode in same]
+        here = [value for value, each in zip(earned, kept, strict=True) if each.episode >= self._first]
         whole = decisions >= self.scenario.horizon and here
         self.facts |= {
             "return_virtual": float(np.mean(here)) if whole else None,
-            "return_actual": float(np.mean([each.earned for each in newest])) if whole else None,
+            "return_actual": float(np.mean([each.earned for each in self._newest])) if whole else None,
         }
-
-    def state(self) -> tuple[dict[str, Any], dict[str, torch.Tensor]]:
-        """Return all that a run must keep of it to go on, as JSON and tensors."""
-        facts, tensors = super().state()
-        kept, arrays = pack(self.moments)
-        tensors |= {f"{MOMENTS}{name}": torch.from_numpy(np.array(array)) for name, array in arrays.items()}
-        return {**facts, "moments": kept}, tensors
-
-    def restore(self, facts: dict[str, Any], tensors: dict[str, torch.Tensor]) -> None:
-        """Go on from what `state` returned."""
-        arrays = {name: tensor.numpy() for name, tensor in under(MOMENTS, tensors).items()}
-        self.moments = unpack(list[MotorwayMoments], facts["moments"], arrays)
-        super().restore(facts, {n: t for n, t in tensors.items() if not n.startswith(MOMENTS)})

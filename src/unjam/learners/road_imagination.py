@@ -11,26 +11,23 @@ from numpy.typing import NDArray
 from unjam.drivers.driver import Driver, Memory
 from unjam.drivers.network import Network
 from unjam.drivers.residual import AGE, EXPERT, RESIDUAL
-from unjam.learners.experience import Experience, experience_of
+from unjam.learners.experience import Experience
 from unjam.learners.imagination import (
     EXPLORATION,
-    FIT,
     NOISE,
     STARTS,
     AsExperience,
-    Imagination,
+    WholeRoads,
     full_policy,
 )
-from unjam.learners.learner import under
 from unjam.scenarios.ring import Loop
-from unjam.tree import mapped, pack, unpack
+from unjam.tree import mapped
 from unjam.virtual.comparison import Replayed
 from unjam.virtual.data import is_held_out, remembered
 from unjam.virtual.ensemble import torch_generator
 from unjam.virtual.fitting import Fit
 from unjam.virtual.roads import (
     Moments,
-    RoadModel,
     check_roads,
     fit_roads,
     known_speed,
@@ -47,11 +44,11 @@ from unjam.worlds.episode import rewarded
 from unjam.worlds.record import Episode
 from unjam.worlds.reward import make_reward
 
-MOMENTS = "moments/"
 
+class RoadImagination(WholeRoads[Moments]):
+    """The virtual environment of a run as whole closed roads."""
 
-class RoadImagination(Imagination[RoadModel]):
-    """The virtual environment of a run as whole roads, and the actual data that it learns from."""
+    kind = Moments
 
     def __init__(self, *arguments: Any) -> None:
         """Begin with the base alone, and without data; arguments are those of `Imagination`.
@@ -61,22 +58,11 @@ class RoadImagination(Imagination[RoadModel]):
         """
         super().__init__(*arguments)
         check_roads(self.scenario)
-        self.moments: list[Moments] = []
-        """of the episodes in D_a, oldest first"""
 
-    def _new_model(self) -> RoadModel:
-        return RoadModel(self.settings, self._seed(FIT))
+    def _kept_of(self, episode: Episode, number: int) -> Moments:
+        return moments_of(episode, number, cast(Loop, self.scenario))
 
-    def learn(self, episodes: Sequence[Episode], iteration: int) -> None:
-        """Add actual episodes to D_a, fit the model to it, and find the rollout length of Eq. 15."""
-        first = self.data.episodes
-        road = cast(Loop, self.scenario)
-        self.moments += [moments_of(episode, first + place, road) for place, episode in enumerate(episodes)]
-        super().learn(episodes, iteration)
-
-    def _fit(self, seed: Sequence[int]) -> Fit:
-        oldest = self.data.recordings[0].episode
-        self.moments = [kept for kept in self.moments if kept.episode >= oldest]
+    def _fit_moments(self, seed: Sequence[int]) -> Fit:
         return fit_roads(self.model, self.moments, self.settings, self.scenario, seed)
 
     def imagine(
@@ -104,14 +90,7 @@ class RoadImagination(Imagination[RoadModel]):
             earned = np.array([episode.reward.sum() for episode in episodes])
             crashed = [episode.status == "collision" for episode in episodes]
             self._compare(earned, choices, driven, float(np.mean(crashed)))
-        places = [place for place, _ in choices]
-        pairs = [
-            (trajectory, self.data.recordings[place].drawn)
-            for place, episode in zip(places, episodes, strict=True)
-            for trajectory in episode.trajectories
-        ]
-        drawn = np.array([each for _, each in pairs])
-        return experience_of([trajectory for trajectory, _ in pairs], how.seen_by_critic(drawn))
+        return how.of_episodes(episodes)
 
     def driven(
         self,
@@ -193,17 +172,8 @@ class RoadImagination(Imagination[RoadModel]):
         ]
         return mapped(lambda *values: np.concatenate(values), each[0], *each[1:])
 
-    def state(self) -> tuple[dict[str, Any], dict[str, torch.Tensor]]:
-        """Return all that a run must keep of it to go on, as JSON and tensors."""
-        facts, tensors = super().state()
-        kept, arrays = pack(self.moments)
-        tensors |= {f"{MOMENTS}{name}": torch.from_numpy(np.array(array)) for name, array in arrays.items()}
-        return {**facts, "moments": kept}, tensors
-
     def restore(self, facts: dict[str, Any], tensors: dict[str, torch.Tensor]) -> None:
         """Go on from what `state` returned."""
-        arrays = {name: tensor.numpy() for name, tensor in under(MOMENTS, tensors).items()}
         # Earlier versions imagined rings alone, where size is length and nobody waits.
         kept = [{"size": round(each["length"]), "waits": None, **each} for each in facts["moments"]]
-        self.moments = unpack(list[Moments], kept, arrays)
-        super().restore(facts, {n: t for n, t in tensors.items() if not n.startswith(MOMENTS)})
+        super().restore({**facts, "moments": kept}, tensors)
