@@ -23,9 +23,9 @@ from unjam.virtual.motorways import (
     MotorwayMoments,
     check_motorways,
     fit_motorways,
-    learned_of,
     moments_of_motorway,
 )
+from unjam.virtual.roads import residual_of
 from unjam.worlds.batch.motorway_world import Again, MotorwayBatch
 from unjam.worlds.batch.run import MOST_MOTORWAYS
 from unjam.worlds.drive import Drive, driven_to_the_end
@@ -108,7 +108,7 @@ class MotorwayImagination(WholeRoads[MotorwayMoments]):
         """
         road = cast(OnRamp, self.scenario)
         noise, *_ = seeds[0]
-        learned = learned_of(self.model, torch_generator(noise, "cpu"))
+        learned = residual_of(self.model, torch_generator(noise, "cpu"))
         again = Again(seeds, decisions, self.settings.noise, learned)
         world = MotorwayBatch(road, [each.seed for each in kept], explore=explore, again=again)
         world.asked = driver.asks

@@ -10,18 +10,16 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple, cast
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from unjam.errors import InputError
 from unjam.physics.arrays import Floats
 from unjam.scenarios.on_ramp import RAMP_SPEED, OnRamp
 from unjam.scenarios.road import MotorwayRoad
-from unjam.virtual.ensemble import predict, random_members
 from unjam.virtual.fitting import Fit
 from unjam.virtual.roads import PeopleRows, RoadModel, fit_people
 from unjam.virtual.settings import VirtualSettings
-from unjam.worlds.batch.motorway import NEVER, UNCAPPED, Learned, Motorways
+from unjam.worlds.batch.motorway import NEVER, UNCAPPED, Motorways
 from unjam.worlds.batch.vehicles import FREELY, Vehicles, around, chosen
 from unjam.worlds.record import Episode
 
@@ -196,17 +194,3 @@ def fit_motorways(
     rows = PeopleRows(*(np.concatenate(each) for each in zip(*(one.people for one in kept), strict=True)))
     sigma = float(np.sqrt(np.mean([one.noise for one in kept])))
     return fit_people(model, rows, sigma, settings, seed, noise_known=False, least=LEAST)
-
-
-def learned_of(model: RoadModel, generator: torch.Generator) -> Learned | None:
-    """Return what networks, a random one for each vehicle, add to speeds after a decision, if anything."""
-    if not model.learned.any():
-        return None
-    layers = model.layers()
-
-    def beyond(speed: Floats, leader_speed: Floats, gap: Floats, known: Floats) -> Floats:
-        members = random_members(model.members, speed.size, generator)
-        seen = torch.from_numpy(np.stack([speed, leader_speed, gap, known], 1)).float()
-        return predict(layers, seen, members).double().numpy().ravel()
-
-    return beyond

@@ -37,6 +37,7 @@ from unjam.virtual.fitting import (
 from unjam.virtual.model import BASES
 from unjam.virtual.settings import VirtualSettings
 from unjam.worlds.batch.crossing import Memory
+from unjam.worlds.batch.motorway import Learned
 from unjam.worlds.batch.movement import commanded_speed, heeded, waits_of
 from unjam.worlds.batch.people import People, people_speed
 from unjam.worlds.batch.possible import statistical_why_not
@@ -176,18 +177,29 @@ def _inputs(speed: Array, leader_speed: Array, gap: Array, known: Array) -> Tens
     return torch.from_numpy(np.stack([each.ravel() for each in (speed, leader_speed, gap, known)], 1))
 
 
+def residual_of(model: RoadModel, generator: torch.Generator) -> Learned | None:
+    """Return what the networks add, a random one for each vehicle; None where that is nothing."""
+    if not model.learned.any():
+        return None
+    layers = model.layers()
+
+    def residual(speed: Floats, leader_speed: Floats, gap: Floats, known: Floats) -> Floats:
+        members = random_members(model.members, speed.size, generator)
+        found = predict(layers, _inputs(speed, leader_speed, gap, known).float(), members)
+        return found.numpy().reshape(speed.shape)
+
+    return residual
+
+
 def people_of(model: RoadModel, scenario: Scenario, generator: torch.Generator) -> People:
     """Return how people drive in the virtual environment: the base, and what a random network adds to it."""
-    known = known_speed(model.base, scenario)
-    if not model.learned.any():
+    known, residual = known_speed(model.base, scenario), residual_of(model, generator)
+    if residual is None:
         return known
-    layers = model.layers()
 
     def driven(speed: Floats, leader_speed: Floats, gap: Floats) -> Floats:
         base = known(speed, leader_speed, gap)
-        members = random_members(model.members, speed.size, generator)
-        residual = predict(layers, _inputs(speed, leader_speed, gap, base).float(), members)
-        return np.maximum(base + residual.numpy().reshape(speed.shape), 0.0)
+        return np.maximum(base + residual(speed, leader_speed, gap, base), 0.0)
 
     return driven
 
