@@ -19,8 +19,8 @@ from unjam.scenarios.road import MotorwayRoad
 from unjam.virtual.fitting import Fit
 from unjam.virtual.roads import PeopleRows, RoadModel, fit_people
 from unjam.virtual.settings import VirtualSettings
-from unjam.worlds.batch.motorway import NEVER, UNCAPPED, Motorways
-from unjam.worlds.batch.vehicles import FREELY, Vehicles, around, chosen
+from unjam.worlds.batch.motorway import Motorways, begun, driven_by, let_acc_drive
+from unjam.worlds.batch.vehicles import Vehicles, around, chosen, number_of, rows_of
 from unjam.worlds.record import Episode
 
 EVERY = 60
@@ -120,50 +120,17 @@ def _vehicles(
     """Return the vehicles of moments as a batch has them, each moment a road; nobody errs or remembers."""
     numbers = {entry.name: number for number, entry in enumerate(road.entries)}
     entries = np.array([numbers[name] for name in episode.vehicle_ids])
-    people = [road.kinds[road.entries[number].kind] for number in entries.tolist()]
-    acc = scenario.cruise
-    kinds = [
-        (acc.time_headway, acc.acceleration, acc.deceleration, acc.gap, one.speed_factor, False)
-        if name in episode.cav_ids
-        else (
-            *(one.time_headway, one.acceleration, one.deceleration, one.gap, one.speed_factor),
-            one.model == "EIDM",
-        )
-        for name, one in zip(episode.vehicle_ids, people, strict=True)
-    ]
-    headway, most, braking, gap, factor, extended = np.array(kinds, np.float64)[those.vehicle].T
+    people = np.array([driven_by(road.kinds[road.entries[number].kind]) for number in entries.tolist()])
+    *follows, factor, extended = people[those.vehicle].T
     way = (len(road.ways) - 1 - episode.lanes[now]).astype(np.intp)
     place, speed = episode.positions[now] + road.merge, episode.speeds[now]
-    earlier = episode.speeds[now[0] - 1, now[1]]
+    change = np.nan_to_num(speed - episode.speeds[now[0] - 1, now[1]]) / episode.step
     limit = np.where((way == 0) & (place < road.merge), RAMP_SPEED, road.limit_speed)
-    none = np.zeros(len(way))
-    return Vehicles(
-        road=those.moment,
-        entry=entries[those.vehicle],
-        way=way,
-        place=place,
-        speed=speed,
-        acceleration=np.nan_to_num(speed - earlier) / episode.step,
-        time_headway=headway,
-        most=most,
-        braking=braking,
-        gap=gap,
-        factor=factor,
-        extended=extended > 0.0,
-        cap=none + UNCAPPED,
-        wish=limit * factor,
-        started=none + NEVER,
-        gap_error=none,
-        leader_error=none,
-        driving_error=none,
-        gain=none,
-        keep=none,
-        look=speed,
-        own_advice=none + FREELY,
-        told_advice=none + FREELY,
-        beside_advice=none + FREELY,
-        leans=none,
-    )
+    where = those.moment, entries[those.vehicle], way, place, speed, change
+    found = begun(*where, *follows, factor, extended, limit * factor)
+    cavs = np.isin(np.array(episode.vehicle_ids), episode.cav_ids)
+    let_acc_drive(found, cavs[those.vehicle], scenario.cruise)
+    return found
 
 
 def _stepped(
@@ -175,11 +142,9 @@ def _stepped(
     traffic.vehicles = vehicles.each(np.copy)
     for _ in range(scenario.steps_per_decision):
         traffic.step()
-    after, most = traffic.vehicles, 1 + int(vehicles.entry.max(initial=0))
-    keys, found = (each.road * most + each.entry for each in (vehicles, after))
-    order = np.argsort(found)
-    row = order[np.searchsorted(found[order], keys).clip(0, max(len(found) - 1, 0))]
-    keeps = (found[row] == keys) & (after.way[row] == vehicles.way)
+    after = traffic.vehicles
+    row = rows_of(number_of(vehicles), after)
+    keeps = (row >= 0) & (after.way[row] == vehicles.way)
     return np.where(keeps, after.speed[row], np.nan)
 
 

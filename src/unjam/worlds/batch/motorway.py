@@ -12,7 +12,8 @@ import numpy as np
 
 from unjam.physics.arrays import Array, at_least, namespace
 from unjam.scenarios.on_ramp import AFTER, BEFORE, MERGING, RAMP, RAMP_SPEED
-from unjam.scenarios.road import MotorwayRoad
+from unjam.scenarios.road import MotorwayRoad, Person
+from unjam.scenarios.scenario import CruiseControl
 from unjam.worlds.batch.beside import Stretch
 from unjam.worlds.batch.extended import (
     HALTING,
@@ -98,24 +99,44 @@ class Waiting:
                 wanted = allowed if entry.speed == "last" else float(entry.speed)
                 if entry.speed == "last" and own >= 0:
                     wanted = min(wanted, float(speed[own]))
-                new.append(
-                    (
-                        *(each, self._lines[number][each][self._next[number, each]], number, begins),
-                        *(min(wanted, allowed), 0.0, person.time_headway, person.acceleration),
-                        *(person.deceleration, person.gap, person.speed_factor),
-                        *(person.model == "EIDM", UNCAPPED, allowed, NEVER, 0.0, 0.0, 0.0),
-                        *(0.0, 0.0, 0.0, FREELY, FREELY, FREELY, 0.0),
-                    )
-                )
+                where = each, self._lines[number][each][self._next[number, each]], number, begins
+                new.append((*where, min(wanted, allowed), 0.0, *driven_by(person), allowed))
                 self._next[number, each] += 1
         if not new:
             return vehicles
         xp = namespace(vehicles.speed)
-        columns = Vehicles(*(np.array(column) for column in zip(*new, strict=True)))
+        newcomers = begun(*map(np.array, zip(*new, strict=True)))
         added = vehicles.each(
-            lambda old, new: xp.concatenate([old, _alike(new, old, self._numbers)]), columns
+            lambda old, new: xp.concatenate([old, _alike(new, old, self._numbers)]), newcomers
         )
         return in_order(added)
+
+
+def driven_by(person: Person) -> tuple[float, ...]:
+    """Return how a person drives as a table of vehicles has it, from `time_headway` to `extended`."""
+    follows = person.time_headway, person.acceleration, person.deceleration, person.gap
+    return (*follows, person.speed_factor, person.model == "EIDM")
+
+
+def begun(*columns: np.ndarray) -> Vehicles:
+    """Return vehicles that remember nothing and err in nothing, and are told nothing.
+
+    `columns` are those of a table up to `extended`, then the speeds that they want there.
+    """
+    *known, extended, allowed = columns
+    none = 0.0 * allowed
+    advice = dict.fromkeys(("own_advice", "told_advice", "beside_advice"), none + FREELY)
+    named = {"cap": none + UNCAPPED, "wish": allowed, "started": none + NEVER, **advice}
+    nothing = dict.fromkeys(Vehicles._fields, none)
+    first = dict(zip(Vehicles._fields, [*known, extended.astype(bool)], strict=False))
+    return Vehicles(**(nothing | named | first))
+
+
+def let_acc_drive(vehicles: Vehicles, rows: np.ndarray, cruise: CruiseControl) -> None:
+    """Let the own ACCs of some vehicles drive instead of people."""
+    vehicles.extended[rows] = False
+    vehicles.time_headway[rows], vehicles.most[rows] = cruise.time_headway, cruise.acceleration
+    vehicles.braking[rows], vehicles.gap[rows] = cruise.deceleration, cruise.gap
 
 
 def _alike(column: np.ndarray, old: Array, numbers: Numbers) -> Array:

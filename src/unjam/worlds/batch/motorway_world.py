@@ -17,14 +17,11 @@ from unjam.physics.kinematics import next_speed
 from unjam.scenarios.on_ramp import OnRamp
 from unjam.scenarios.road import MotorwayRoad
 from unjam.worlds.batch.lanes import CONTACT
-from unjam.worlds.batch.motorway import UNCAPPED, Learned, Motorways
+from unjam.worlds.batch.motorway import UNCAPPED, Learned, Motorways, let_acc_drive
 from unjam.worlds.batch.motorway_record import MotorwayLog
-from unjam.worlds.batch.vehicles import Vehicles, chosen
+from unjam.worlds.batch.vehicles import PER_ROAD, Vehicles, chosen, number_of, rows_of
 from unjam.worlds.record import Episode
 from unjam.worlds.world import Driven, OnProgress
-
-PER_ROAD = 100_000
-"""more than want to enter a road in an episode"""
 
 
 class Again(NamedTuple):
@@ -140,7 +137,7 @@ class MotorwayBatch:
             left = self._traffic.step()
             vehicles = self._traffic.vehicles
             ahead = chosen(self._traffic.near.ahead, vehicles.way)
-            self._log.note_step(vehicles, ahead, left, self._rows_of_cavs(vehicles), self._controlled)
+            self._log.note_step(vehicles, ahead, left, rows_of(self._cavs, vehicles), self._controlled)
         self.decisions += 1
         self._look()
         after, kept = before.copy(), slice(len(before)) if self.kept is None else self.kept
@@ -157,12 +154,12 @@ class MotorwayBatch:
         names = [str(number) for number in self._cavs]
         least = self.scenario.cruise.time_headway
         headways = time_headways(command, least, names, self.decisions)
-        self._traffic.vehicles.time_headway[self._rows_of_cavs(self._traffic.vehicles)] = headways
+        self._traffic.vehicles.time_headway[rows_of(self._cavs, self._traffic.vehicles)] = headways
 
     def _hold_back(self, wanted: Floats) -> None:
         """Give each CAV a set speed, or none where its ACC may drive as it likes or a lane closes."""
         vehicles, cruise, step = self._traffic.vehicles, self.scenario.cruise, self.scenario.simulation_step
-        found = self._rows_of_cavs(vehicles)
+        found = rows_of(self._cavs, vehicles)
         there = found >= 0
         rows, wanted = found[there], wanted[there]
         speed, stretch = vehicles.speed[rows].astype(np.float64), self._traffic.stretch
@@ -170,20 +167,11 @@ class MotorwayBatch:
         beside = (vehicles.place[rows] >= stretch.merge) & (vehicles.place[rows] < stretch.closes)
         vehicles.cap[rows] = np.where(beside, UNCAPPED, np.minimum(asked, UNCAPPED))
 
-    def _rows_of_cavs(self, vehicles: Vehicles) -> NDArray[np.intp]:
-        """Return the row of each CAV among vehicles; -1 where it has left."""
-        keys = vehicles.road * PER_ROAD + vehicles.entry
-        if not len(keys):
-            return np.full(len(self._cavs), -1)
-        order = keys.argsort()
-        found = order[np.searchsorted(keys[order], self._cavs).clip(0, len(keys) - 1)]
-        return np.where(keys[found] == self._cavs, found, -1)
-
     def _look(self) -> None:
         """Note who is where after a decision, and take control of the CAVs that have entered."""
         vehicles = self._traffic.vehicles
-        there = self._rows_of_cavs(vehicles) >= 0
-        keys = vehicles.road * PER_ROAD + vehicles.entry
+        there = rows_of(self._cavs, vehicles) >= 0
+        keys = number_of(vehicles)
         chosen_ones = np.flatnonzero(self._is_cav[vehicles.road, vehicles.entry])
         new = chosen_ones[~np.isin(keys[chosen_ones], self._cavs)]
         new = new[np.argsort(keys[new], kind="stable")]
@@ -191,7 +179,7 @@ class MotorwayBatch:
         self._cavs = np.concatenate([self._cavs[there], keys[new]])
         self.entered += len(new)
         if self._controlled and len(new):
-            self._take_control(vehicles, new)
+            let_acc_drive(vehicles, new, self.scenario.cruise)
         self._came += np.bincount(vehicles.road[new], minlength=len(self.roads))
         means = self._main_road.means(
             vehicles.way, vehicles.place, vehicles.speed, self._traffic.stretch.limit, vehicles.road
@@ -204,13 +192,6 @@ class MotorwayBatch:
         self._log.ends[touched] = np.minimum(self._log.ends[touched], self.decisions)
         self._log.note_moment(vehicles, gaps, waiting, self._cavs, self._perceived)
 
-    def _take_control(self, vehicles: Vehicles, rows: NDArray[np.intp]) -> None:
-        """Let CAVs' own ACCs drive instead of people."""
-        cruise = self.scenario.cruise
-        vehicles.extended[rows] = False
-        vehicles.time_headway[rows], vehicles.most[rows] = cruise.time_headway, cruise.acceleration
-        vehicles.braking[rows], vehicles.gap[rows] = cruise.deceleration, cruise.gap
-
     def _gaps(self, vehicles: Vehicles) -> Floats:
         """Return the gaps of all to those ahead on their ways [m]; NaN where nobody is."""
         if not len(vehicles.road):
@@ -221,15 +202,11 @@ class MotorwayBatch:
 
     def _state(self, vehicles: Vehicles) -> LocalState:
         """Return what exact sensors of the CAVs would read now."""
-        rows, road = self._rows_of_cavs(vehicles), self.roads[0]
+        rows, road = rows_of(self._cavs, vehicles), self.roads[0]
         if not len(rows):
             return _nobody()
-        near, way, place, speed = (
-            self._traffic.near,
-            vehicles.way[rows],
-            vehicles.place[rows],
-            vehicles.speed[rows],
-        )
+        near = self._traffic.near
+        way, place, speed = vehicles.way[rows], vehicles.place[rows], vehicles.speed[rows]
 
         def other(neighbours: NDArray[np.intp], beside: int, towards: float) -> tuple[Floats, Floats]:
             row = chosen(neighbours, vehicles.way + beside)[rows]

@@ -14,6 +14,8 @@ from unjam.worlds.batch.extended import Ahead, Errors, Wish
 from unjam.worlds.batch.people import SMALLEST_GAP
 
 NOBODY = -1
+PER_ROAD = 100_000
+"""more than want to enter a road in an episode"""
 FREELY = 1e6
 """what nobody is told, an acceleration [m/s2]"""
 NO_ROOM = 0.01
@@ -176,6 +178,21 @@ class Around(NamedTuple):
 
     ahead: Array
     behind: Array
+
+
+def number_of(vehicles: Vehicles) -> Array:
+    """Return road and entry of each as one number."""
+    return vehicles.road * PER_ROAD + vehicles.entry
+
+
+def rows_of(numbers: Array, vehicles: Vehicles) -> Array:
+    """Return the rows of vehicles of certain numbers; `NOBODY` where one is not among them."""
+    there, xp = number_of(vehicles), namespace(vehicles.road)
+    if not len(there):
+        return 0 * numbers + NOBODY
+    order = there.argsort()
+    found = order[xp.searchsorted(there[order], numbers).clip(0, len(there) - 1)]
+    return xp.where(there[found] == numbers, found, NOBODY)
 
 
 def in_order(vehicles: Vehicles) -> Vehicles:
