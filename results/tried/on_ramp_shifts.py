@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from pydantic.dataclasses import dataclass as settings
 
-from unjam.controller import load_controller
+from unjam.controller import make_driver
 from unjam.drivers.driver import Memory
 from unjam.drivers.local_state import LocalState
 from unjam.drivers.road_experts import JamAhead
@@ -36,7 +36,6 @@ SURVEYED, FIRST = 512, 7000
 CHOSEN = (-1.5, -1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 1.0)
 """[m/s], from the ramp on upstream"""
 JUDGED, FIRST_JUDGED = 60, 6000
-PACKAGE = Path(__file__).resolve().parents[2] / "src" / "unjam"
 
 
 @dataclass(frozen=True)
@@ -63,7 +62,7 @@ class ShiftedJamAhead(JamAhead):
 
 def driver(shifts: tuple[float, ...]) -> JamAhead:
     """Return the shipped expert with shifts of its cap."""
-    tuned = load_controller(PACKAGE / "controllers" / "on-ramp-tuned.unjam")
+    tuned = make_driver("unjam:on-ramp-tuned", ROAD.decision_step)
     assert isinstance(tuned, JamAhead)
     return ShiftedJamAhead(**asdict(tuned), shifts=shifts)
 

@@ -14,9 +14,9 @@ from unjam.files import to_json
 from unjam.reports.model import wave_rows, waves
 from unjam.reports.results import MODEL_FILE, read_progress
 from unjam.training import model_facts
-from unjam.training.config import RunConfig
+from unjam.training.config import RunConfig, load_config
 from unjam.training.folder import read_config
-from unjam.training.model_facts import decisions_ahead, measure_model, newest_model_facts
+from unjam.training.model_facts import decisions_ahead, measure_model, newest_model_facts, why_no_facts
 from unjam.worlds.workers import Workers
 
 CONFIG = small_config(virtual__virtual_ratio=1.0, virtual__epochs=4, virtual__members=3, steps=2 * STEPS)
@@ -120,6 +120,13 @@ def without_virtual() -> RunConfig:
 def test_a_run_without_a_virtual_environment_says_so(run: Path) -> None:
     with pytest.raises(InputError, match="has no virtual environment"):
         newest_model_facts(run, without_virtual())
+
+
+def test_of_on_ramps_rows_are_measured_and_whole_roads_are_not() -> None:
+    rows = {"scenario": "on-ramp", "expert": "jam-ahead", "policy.observe": ["local"]}
+    whole = {"virtual.model": "road", "virtual.begin": "first", "world": "batch"}
+    assert why_no_facts(load_config(changes=rows)) == ""
+    assert why_no_facts(load_config(changes=rows | whole)).startswith("imagines an on-ramp as a whole")
 
 
 def test_a_run_that_has_only_begun_says_so(run: Path, tmp_path: Path) -> None:

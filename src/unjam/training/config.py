@@ -115,13 +115,14 @@ class RunConfig(Agents):
     @model_validator(mode="after")
     def _possible(self) -> "RunConfig":
         why_none = why_not if self.tasks else statistical_why_not
-        whys = [why_none(road.make_scenario()) for road in self.roads().values()]
+        scenarios = [road.make_scenario() for road in self.roads().values()]
+        whys = [why_none(scenario) for scenario in scenarios]
         if self.world == "batch" and all(whys):
             raise ValueError(f"world: batch is not allowed; allowed: sumo, for {whys[0]}")
         imagines = self.virtual.model if self.virtual.virtual_ratio > 0 else ""
         if self.policy.afterwards and imagines == "row":
             raise ValueError("policy.afterwards: true is not allowed; allowed: false where rows are imagined")
-        ramps = any(isinstance(road.make_scenario(), OnRamp) for road in self.roads().values())
+        ramps = any(isinstance(scenario, OnRamp) for scenario in scenarios)
         if imagines == "road" and ramps and self.world != "batch":
             raise ValueError("world: sumo is not allowed; allowed: batch, where an on-ramp is imagined")
         if self.policy.lasts and self.agent not in ("trpo", "ppo"):

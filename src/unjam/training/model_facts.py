@@ -49,14 +49,11 @@ def newest_model_facts(folder: Path, config: RunConfig) -> dict[str, Any]:
     """Return the facts about a run's virtual environment, measured anew if they are missing or old.
 
     Raises:
-        InputError: the run has no virtual environment, or no checkpoint yet.
+        InputError: of the run's virtual environment, if it has one, nothing is measured, or it has no
+            checkpoint yet.
     """
-    if config.tasks:
-        raise InputError(f"run: {str(folder)!r} is of several roads; allowed: a run of one")
-    if config.virtual.virtual_ratio == 0:
-        raise InputError(
-            f"run: {str(folder)!r} has no virtual environment: its virtual.virtual_ratio is 0; allowed: > 0"
-        )
+    if why := why_no_facts(config):
+        raise InputError(f"run: {str(folder)!r} {why}")
     kept, progress = read_model(folder), read_progress(folder)
     if kept is None or not progress or kept.get("iteration") != progress[-1]["iteration"]:
         write_model_facts(folder, config)
@@ -65,10 +62,15 @@ def newest_model_facts(folder: Path, config: RunConfig) -> dict[str, Any]:
     return kept
 
 
-def has_model_facts(config: RunConfig) -> bool:
-    """Return whether there is something to say: of the virtual environment of one road, not of an on-ramp."""
-    imagines = config.virtual.virtual_ratio > 0 and not config.tasks
-    return imagines and not isinstance(config.make_scenario(), OnRamp)
+def why_no_facts(config: RunConfig) -> str:
+    """Return why there is nothing to say of a run's virtual environment; empty where there is."""
+    if config.tasks:
+        return "is of several roads; allowed: a run of one"
+    if config.virtual.virtual_ratio == 0:
+        return "has no virtual environment: its virtual.virtual_ratio is 0; allowed: > 0"
+    if config.virtual.model == "road" and isinstance(config.make_scenario(), OnRamp):
+        return "imagines an on-ramp as a whole; allowed: other roads, or rows"
+    return ""
 
 
 def write_model_facts(folder: Path, config: RunConfig) -> None:
@@ -80,10 +82,8 @@ def measure_model(folder: Path, config: RunConfig) -> dict[str, Any]:
     """Return the facts about the virtual environment in a run's newest checkpoint, to four digits.
 
     Raises:
-        InputError: the run has no checkpoint yet, or nothing to measure.
+        InputError: the run has no checkpoint yet.
     """
-    if not has_model_facts(config):
-        raise InputError(f"run: of the virtual environment of {str(folder)!r} nothing is measured")
     checkpoint = load_checkpoint(folder / "checkpoint")
     progress = read_progress(folder)
     if checkpoint is None or not progress:

@@ -43,7 +43,7 @@ from unjam.training.folder import (
     save_checkpoint,
     start_folder,
 )
-from unjam.training.model_facts import has_model_facts, write_model_facts
+from unjam.training.model_facts import why_no_facts, write_model_facts
 from unjam.training.sampling import Sampler, episodes_of, iterations_ahead
 from unjam.training.seeds import VALIDATE
 from unjam.worlds.batch.run import run_where_possible
@@ -158,7 +158,7 @@ def _train_owned(
         for name, road in config.roads().items():
             of_road = partial(_on_road, progress, name) if progress else None
             rows[name] = judge(folder / name, road, workers, progress=of_road).rows
-    if has_model_facts(config):
+    if not why_no_facts(config):
         write_model_facts(folder, config)
     write_report([folder / name for name in rows], folder / "report.html")
     return rows

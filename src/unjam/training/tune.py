@@ -194,8 +194,8 @@ def tune(
     optuna, settings = quiet_optuna("tune"), list[Setting]()
     sampler = optuna.samplers.TPESampler(seed=seed, multivariate=True)
     study = optuna.create_study(direction="maximize", sampler=sampler)
-    few = not any(isinstance(roads[road], OnRamp) for road in screened)  # they take as long as many
-    at_once = 1 if few and not screen else SCREENED
+    motorways = any(isinstance(roads[road], OnRamp) for road in screened)  # many take as long as few
+    at_once = SCREENED if screen or motorways else 1
     for first in range(0, trials, at_once):
         asked = [study.ask() for _ in range(first, min(first + at_once, trials))]
         for trial in asked:

@@ -1,12 +1,12 @@
 """Driving: the one loop in which a driver and a world meet."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from functools import partial
 from typing import Any
 
 import numpy as np
 
-from unjam.drivers.driver import Decision, Driver, Memory, carried, single_row
+from unjam.drivers.driver import Decision, Driver, Memory, Noise, carried, single_row
 from unjam.drivers.residual import EXPERT
 from unjam.tree import mapped
 from unjam.worlds.world import Driven, OnProgress, Recorded, World
@@ -32,7 +32,7 @@ class Drive:
         what the world began with. `on_progress` is called now and then with the number of decisions made.
         """
         self.world, self.driver, self._on_progress = world, driver, on_progress
-        self._noise = partial(_times, explore, world.noise, driver.lasting_noise) if explore else None
+        self._noise = _noise_of(world, driver, explore)
         history = world.start(not driver.native, on_progress)
         self.memory = driver.initial_memory(world.rows) if memory is None else memory
         if history is not None:
@@ -79,10 +79,13 @@ class Drive:
             self.memories.append(mapped(lambda values: np.array(values[row], np.float64), self.memory))  # noqa: B023
 
 
-def _times(factor: float, noise: Callable[..., Any], lasting: int) -> Any:
-    """Return noise times a factor."""
-    drawn = noise(lasting) if lasting else noise()
-    return drawn if factor == 1.0 else factor * drawn
+def _noise_of(world: World[Any], driver: Driver, explore: float) -> Noise | None:
+    """Return what draws exploration noise, times `explore`, for each look of the driver's network."""
+    lasting = driver.lasting_noise
+    drawn = partial(world.noise, lasting) if lasting else world.noise
+    if explore in (0.0, 1.0):
+        return drawn if explore else None
+    return lambda: explore * drawn()
 
 
 def drive(
