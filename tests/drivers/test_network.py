@@ -54,11 +54,12 @@ def test_exploration_adds_scaled_noise() -> None:
 def test_noise_that_lasts_changes_what_the_last_hidden_layer_is_weighed_with() -> None:
     network = replace(random_network(5), lasts=True)
     generator = np.random.default_rng(1)
-    observation, noise = generator.normal(size=(7, 5)), generator.normal(size=(7, 16))
+    observation, noise = generator.normal(size=(7, 5)), generator.normal(size=(7, 17))
     hidden = observation
     for weight, bias in network.layers[:-1]:
         hidden = np.maximum(0.0, hidden @ weight + bias)
-    assert network.noise_numbers == 16
+    hidden = np.hstack([hidden, np.ones((7, 1))])  # the bias
+    assert network.noise_numbers == 17
     found = network.explore(observation, noise)
     np.testing.assert_allclose(found, network(observation) + 0.2 * (hidden * noise).sum(1), atol=1e-12)
     plain = network.explore(tuple(observation[3].tolist()), noise[3])

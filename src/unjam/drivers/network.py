@@ -33,8 +33,8 @@ class Network:
     exploration_std: float = 0.0
     """standard deviation of the exploration noise [m/s2], where the network does not give it"""
     lasts: bool = False
-    """whether noise changes what the last hidden layer is weighed with; `exploration_std` is then that of
-    each weight"""
+    """whether noise changes what the last hidden layer is weighed with, and the bias; `exploration_std` is
+    then that of each of them"""
     squashes_noise: bool = field(init=False)
     """whether the network gives its noise's log standard deviation, and adds the noise before the tanh"""
     _hidden: tuple[Floats, ...] = field(init=False, repr=False, compare=False)
@@ -63,8 +63,8 @@ class Network:
         """Return the residual with exploration.
 
         `noise` is standard normal, shaped like the residual; where it `lasts`, a number for each unit of the
-        last hidden layer, shape (n, units), or (units,) for a tuple. Source: generalised state-dependent
-        exploration, Raffin et al. 2022, CoRL.
+        last hidden layer and one for the bias, shape (n, units + 1), or (units + 1,) for a tuple. Source:
+        generalised state-dependent exploration, Raffin et al. 2022, CoRL, which leaves the bias out.
         """
         if self.lasts:
             shift = self.exploration_std * (self._units(observation) * noise).sum(-1)
@@ -94,10 +94,10 @@ class Network:
         return hidden
 
     def _units(self, observation: Any) -> Any:
-        """Return the last hidden layer, shape (n, units), or (units,) for a tuple."""
+        """Return the last hidden layer and a one, shape (n, units + 1), or (units + 1,) for a tuple."""
         if isinstance(observation, (tuple, np.ndarray)):
-            return self._folded_units(observation)[..., :-1]
-        return self._units_of_tensors(observation)
+            return self._folded_units(observation)
+        return with_one(self._units_of_tensors(observation))
 
     def _outputs(self, observation: Any, last: Floats) -> Any:
         """Return what the weights `last` make of the last hidden layer."""
@@ -122,7 +122,12 @@ class Network:
     @property
     def noise_numbers(self) -> int:
         """How many numbers it explores with that stay as they are; 0: a new one each time."""
-        return self.layers[-1][0].shape[0] if self.lasts else 0
+        return self.layers[-1][0].shape[0] + 1 if self.lasts else 0
+
+
+def with_one(units: Array) -> Array:
+    """Return a layer of tensors with one unit more, which is always 1."""
+    return namespace(units).cat([units, units.new_ones((len(units), 1))], -1)
 
 
 def _fold_biases(layers: tuple[tuple[Floats, Floats], ...]) -> tuple[Floats, ...]:

@@ -6,13 +6,14 @@ from typing import Any, cast
 import sb3_contrib
 import stable_baselines3
 import torch
+from stable_baselines3.common.distributions import Distribution
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import create_mlp
 from torch import Tensor, nn
 from torch.distributions import Normal
 
 from unjam.adam import Adam
-from unjam.drivers.network import Network
+from unjam.drivers.network import Network, with_one
 from unjam.learners.experience import Experience, discounted_returns, fill_rollout_buffer, join
 from unjam.learners.learner import AgentSpec, Learner, Update, network_layers
 from unjam.learners.settings import PolicySettings, PPOSettings, TRPOSettings
@@ -109,9 +110,22 @@ class ResidualPolicy(ActorCriticPolicy):
         nn.init.zeros_(self.value_net.linear.bias)
         if self.settings.lasts or not self.settings.learn_exploration:
             log_std = self.log_std.detach()
+            if self.settings.lasts:
+                log_std = torch.cat([log_std, log_std[:1]])  # the bias
             del self.log_std
             self.register_buffer("log_std", log_std)
         self.optimizer = self.optimizer_class(self.parameters(), lr=lr_schedule(1), **self.optimizer_kwargs)  # pyright: ignore[reportCallIssue]
+
+    def _get_action_dist_from_latent(self, latent_pi: Tensor) -> Distribution:
+        """Return what SB3 does; noise that lasts is that of the bias, too.
+
+        Without it, next to nothing is tried where all units are at rest, and to move there is so improbable
+        that no step of TRPO's line search passes.
+        """
+        if not self.settings.lasts:
+            return super()._get_action_dist_from_latent(latent_pi)
+        mean = self.action_net(latent_pi)
+        return self.action_dist.proba_distribution(mean, self.log_std, with_one(latent_pi))  # pyright: ignore[reportCallIssue]
 
     def set_rates(self, actor: float, critic: float) -> None:
         """Give actor and critic learning rates of their own, in a new optimiser."""
