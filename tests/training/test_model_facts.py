@@ -14,9 +14,9 @@ from unjam.files import to_json
 from unjam.reports.model import wave_rows, waves
 from unjam.reports.results import MODEL_FILE, read_progress
 from unjam.training import model_facts
-from unjam.training.config import RunConfig, load_config
+from unjam.training.config import RunConfig
 from unjam.training.folder import read_config
-from unjam.training.model_facts import decisions_ahead, measure_model, newest_model_facts, why_no_facts
+from unjam.training.model_facts import decisions_ahead, measure_model, newest_model_facts
 from unjam.worlds.workers import Workers
 
 CONFIG = small_config(virtual__virtual_ratio=1.0, virtual__epochs=4, virtual__members=3, steps=2 * STEPS)
@@ -122,13 +122,6 @@ def test_a_run_without_a_virtual_environment_says_so(run: Path) -> None:
         newest_model_facts(run, without_virtual())
 
 
-def test_of_on_ramps_rows_are_measured_and_whole_roads_are_not() -> None:
-    rows = {"scenario": "on-ramp", "expert": "jam-ahead", "policy.observe": ["local"]}
-    whole = {"virtual.model": "road", "virtual.begin": "first", "world": "batch"}
-    assert why_no_facts(load_config(changes=rows)) == ""
-    assert why_no_facts(load_config(changes=rows | whole)).startswith("imagines an on-ramp as a whole")
-
-
 def test_a_run_that_has_only_begun_says_so(run: Path, tmp_path: Path) -> None:
     shutil.copy(run / "config.toml", tmp_path)
     with pytest.raises(InputError, match="has no checkpoint yet"):
@@ -151,7 +144,7 @@ def test_a_run_that_imagines_whole_roads_shows_waves(tmp_path: Path) -> None:
     shapes = [np.shape(found["waves"]["recorded"][name]) for name in ("speeds", "positions")]
     assert shapes == [(10, 8)] * 2  # a moment a second, for ten seconds
     assert found["step"] == pytest.approx(1.0)
-    assert len(found["cavs"]) == 1
+    assert len(found["waves"]["recorded"]["cavs"]) == 1
     titles = [axes.get_title(loc="left") or axes.get_title() for axes in waves(found).axes[:3]]
     assert titles == ["recorded", "imagined", "nothing changes"]
     assert newest_model_facts(tmp_path / "run", config) == found
@@ -174,6 +167,25 @@ RAMP: dict[str, Any] = {
     "virtual__begin": "first",
     "evaluation__baselines": [],
 }
+
+
+def test_a_run_that_imagines_an_on_ramp_shows_its_waves_lane_by_lane(tmp_path: Path) -> None:
+    changes = {"virtual__virtual_ratio": 1.0, "virtual__model": "road", "virtual__members": 2, **RAMP}
+    config = small_config(**changes, steps=STEPS)
+    with Workers(1) as workers:
+        learn_with(workers, tmp_path / "run", config)
+    found = json.loads(to_json(measure_model(tmp_path / "run", config)))
+    assert found["step"] == pytest.approx(10.0)
+    roads = {label: np.array(road["speeds"], float) for label, road in found["waves"].items()}
+    assert list(roads) == ["recorded", "imagined", "base"]
+    came = {label: (~np.isnan(speeds)).sum() for label, speeds in roads.items()}
+    assert came["recorded"] == came["imagined"] == came["base"] > 0  # the same people at the same times
+    assert not np.array_equal(roads["recorded"], roads["base"], equal_nan=True)  # who misjudge anew
+    drawn = waves(found)
+    titles = [axes.get_title(loc="left") or axes.get_title() for axes in drawn.axes]
+    assert [title for title in titles if title] == ["recorded", "imagined", "IDM alone"]
+    assert {axes.get_ylabel() for axes in drawn.axes} >= {f"{name}\n[m]" for name in found["lane_names"]}
+    assert all("nan" not in cell for _, row in wave_rows(found) for cell in row)
 
 
 @pytest.mark.parametrize("road", [{}, RAMP])

@@ -100,7 +100,8 @@ def begin_training(
     imaginations = []
     if virtual.virtual_ratio > 0:
         imaginations = [
-            _kind_of(virtual, task)(virtual, task, policy, seed, index) for index, task in enumerate(tasks)
+            kind_of_imagination(virtual, task)(virtual, task, policy, seed, index)
+            for index, task in enumerate(tasks)
         ]
     inputs = observation_size(policy.observe, tasks[0].expert)
     drawn = np.zeros((1, len(tasks[0].scenario.drawn_ranges)))
@@ -110,7 +111,8 @@ def begin_training(
     return Training(tasks, policy, seed, make_learner(learner, spec), imaginations)
 
 
-def _kind_of(virtual: VirtualSettings, task: Task) -> type[Imagination[Any]]:
+def kind_of_imagination(virtual: VirtualSettings, task: Task) -> type[Imagination[Any]]:
+    """Return what kind of virtual environment a task has with such settings."""
     if virtual.model == "row":
         return RowImagination
     return MotorwayImagination if isinstance(task.scenario, OnRamp) else RoadImagination

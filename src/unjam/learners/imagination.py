@@ -19,7 +19,7 @@ from unjam.learners.settings import PolicySettings
 from unjam.physics.idm import IDMParameters
 from unjam.tree import pack, unpack
 from unjam.virtual.comparison import return_gap
-from unjam.virtual.data import ActualData, pack_data, unpack_data
+from unjam.virtual.data import ActualData, is_held_out, pack_data, unpack_data
 from unjam.virtual.ensemble import Ensemble, torch_generator
 from unjam.virtual.fitting import Fit, fit
 from unjam.virtual.model import EnvironmentModel
@@ -181,6 +181,40 @@ class Imagination(Generic[Model]):
         self.model.load_state_dict({n: t for n, t in tensors.items() if not n.startswith(DATA)})
 
 
+class Everybody(NamedTuple):
+    """Everybody on a road, at some moments; M moments, N columns, of which each vehicle has one."""
+
+    speeds: Floats
+    """[m/s], shape (M, N), NaN where nobody is"""
+    positions: Floats
+    """front bumpers [m], likewise"""
+    lanes: Floats
+    """in which lane each is, likewise, or (0, 0)"""
+    cavs: list[int]
+    """columns of CAVs"""
+
+
+class Waves(NamedTuple):
+    """The same road as it was and as it is imagined: do the same waves come?"""
+
+    step: float
+    """from one moment to the next [s]"""
+    loop_length: float
+    """of a closed road [m], or NaN"""
+    lane_names: tuple[str, ...]
+    """of a road with lanes"""
+    roads: dict[str, Everybody]
+    """`recorded`, `imagined` with what was learned, and by the `base` alone"""
+
+
+def everybody(episode: Episode, every: int) -> Everybody:
+    """Return everybody at every so many-th moment of an episode."""
+    speeds, positions, lanes = (
+        values[::every] for values in (episode.speeds, episode.positions, episode.lanes)
+    )
+    return Everybody(speeds, positions, lanes, episode.cavs)
+
+
 class OfAnEpisode(Protocol):
     """What is kept of an actual episode."""
 
@@ -215,6 +249,16 @@ class WholeRoads(Imagination[RoadModel], Generic[Kept]):
     def _fit_moments(self, seed: Sequence[int]) -> Fit:
         """Fit the model to what is kept of D_a as it is now."""
         raise NotImplementedError
+
+    def waves(self) -> Waves:
+        """Return a road as it was and as it is imagined."""
+        raise NotImplementedError
+
+    @property
+    def _unseen(self) -> Kept:
+        """The newest episode that no network learned from, if there is one."""
+        share = self.settings.holdout
+        return ([each for each in self.moments if is_held_out(each.episode, share)] or self.moments)[-1]
 
     def learn(self, episodes: Sequence[Episode], iteration: int) -> None:
         """Add actual episodes to D_a, fit the model to it, and find the rollout length of Eq. 15."""

@@ -1,6 +1,7 @@
 """Imagining on-ramps: the same people come once more, and misjudge and change lanes anew."""
 
 from collections.abc import Sequence
+from math import nan
 from typing import Any, cast
 
 import numpy as np
@@ -13,7 +14,10 @@ from unjam.learners.imagination import (
     NOISE,
     STARTS,
     AsExperience,
+    Everybody,
+    Waves,
     WholeRoads,
+    everybody,
     full_policy,
 )
 from unjam.scenarios.on_ramp import OnRamp
@@ -32,6 +36,9 @@ from unjam.worlds.drive import Drive, driven_to_the_end
 from unjam.worlds.episode import rewarded
 from unjam.worlds.record import Episode
 from unjam.worlds.reward import make_reward
+
+MOMENT = 10.0
+"""from one moment of a road that is shown to the next [s]"""
 
 
 class MotorwayImagination(WholeRoads[MotorwayMoments]):
@@ -88,6 +95,23 @@ class MotorwayImagination(WholeRoads[MotorwayMoments]):
             self._note(kept, earned, decisions)
             self.facts["crash_share"] = float(np.mean(crashed))
         return join(found)
+
+    def waves(self) -> Waves:
+        """Return an actual road that no network learned from, and those where its people come once more.
+
+        On all of them the expert alone drives CAVs.
+        """
+        road, expert, seed = cast(OnRamp, self.scenario), self._task.expert, self._unseen.seed
+        learned = residual_of(self.model, torch_generator((0,), "cpu"))
+        again = Again([((1,), (2,))], road.horizon, self.settings.noise, learned)
+        kinds = {"recorded": None, "imagined": again, "base": again._replace(learned=None)}
+        roads, every, names = dict[str, Everybody](), max(1, round(MOMENT / road.decision_step)), ()
+        for label, otherwise in kinds.items():
+            world = MotorwayBatch(road, [seed], again=otherwise)
+            world.asked = expert.asks
+            (episode,) = driven_to_the_end(Drive(world, expert))
+            roads[label], names = everybody(episode, every), episode.lane_names
+        return Waves(every * road.decision_step, nan, names, roads)
 
     def driven(
         self,

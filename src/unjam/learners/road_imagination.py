@@ -17,13 +17,16 @@ from unjam.learners.imagination import (
     NOISE,
     STARTS,
     AsExperience,
+    Everybody,
+    Waves,
     WholeRoads,
+    everybody,
     full_policy,
 )
 from unjam.scenarios.ring import Loop
 from unjam.tree import mapped
 from unjam.virtual.comparison import Replayed
-from unjam.virtual.data import is_held_out, remembered
+from unjam.virtual.data import remembered
 from unjam.virtual.ensemble import torch_generator
 from unjam.virtual.fitting import Fit
 from unjam.virtual.roads import (
@@ -136,14 +139,12 @@ class RoadImagination(WholeRoads[Moments]):
         earned = make_reward(self._task.reward or road.reward)
         return [rewarded(episode, earned) for episode in found.episodes]
 
-    def waves(self) -> tuple[Moments, dict[str, Episode]]:
-        """Return an actual episode that no network learned from, and what is imagined from its start on.
+    def waves(self) -> Waves:
+        """Return an actual road that no network learned from, and those imagined from its start on.
 
-        There CAVs do what they did, and noise is drawn anew: with what was learned, and by the base alone.
+        There CAVs do what they did, and noise is drawn anew.
         """
-        share = self.settings.holdout
-        kept = [each for each in self.moments if is_held_out(each.episode, share)] or self.moments
-        moments, recordings = kept[-1], self.data.recordings
+        moments, recordings = self._unseen, self.data.recordings
         rows = [place for place, each in enumerate(recordings) if each.episode == moments.episode]
         did = Replayed(np.stack([recordings[row].applied for row in rows], 1))
         begun = np.array([[rows[0], 0]])
@@ -151,12 +152,12 @@ class RoadImagination(WholeRoads[Moments]):
             "imagined": people_of(self.model, self.scenario, torch_generator((0,), "cpu")),
             "base": known_speed(self.settings.base, self.scenario),
         }
-        return moments, {
-            label: self.driven(
-                did, did.initial_memory(len(rows)), begun, len(did.accelerations), people, (1,)
-            )[0]
-            for label, people in kinds.items()
-        }
+        cavs, memory = np.flatnonzero(moments.people == 0.0).tolist(), did.initial_memory(len(rows))
+        roads = {"recorded": Everybody(moments.speeds, moments.positions, np.zeros((0, 0)), cavs)}
+        for label, people in kinds.items():
+            (episode,) = self.driven(did, memory, begun, len(did.accelerations), people, (1,))
+            roads[label] = everybody(episode, moments.every)
+        return Waves(moments.every * self.scenario.decision_step, moments.length, (), roads)
 
     def _memory(self, choices: NDArray[np.int64], cavs: int) -> Memory:
         """Return what the expert remembered at `choices`: all rows of the first CAV, then of the second."""

@@ -1,6 +1,7 @@
 """What the report says and draws of a run's virtual environment."""
 
 from collections.abc import Sequence
+from math import nan
 from typing import Any
 
 import numpy as np
@@ -8,7 +9,8 @@ from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from unjam.reports.figures import INK, LINES, MUTED, STYLE, new_figure, space_time
+from unjam.reports.figures import INK, LINES, MUTED, STYLE, new_figure
+from unjam.reports.lanes import space_time_of
 from unjam.reports.results import Results, Shown
 
 NUMBERS = {
@@ -78,7 +80,7 @@ def wave_rows(facts: dict[str, Any]) -> list[tuple[str, list[str]]]:
     for label, road in facts["waves"].items():
         speeds = np.array(road["speeds"], np.float64)
         later = speeds[len(speeds) // 2 :]
-        numbers = (later.mean(), later.std(1).mean(), later.min(1).mean())
+        numbers = (np.nanmean(later), np.nanstd(later, 1).mean(), np.nanmin(later, 1).mean())
         found.append((BASES[facts["base"]][0] if label == "base" else label, [f"{n:.2f}" for n in numbers]))
     return found
 
@@ -166,7 +168,7 @@ def model_section(result: Results) -> dict[str, Any] | None:
             "about": (
                 "Between actual episodes the agent also learns on imagined roads, on which everybody drives: "
                 f"people by what is known ({known}), plus an ensemble of {facts['members']} networks for "
-                "what that leaves."
+                f"what that leaves. {_compared(facts)}"
             )
         }
     return {
@@ -186,24 +188,45 @@ def model_section(result: Results) -> dict[str, Any] | None:
     }
 
 
+def _compared(facts: dict[str, Any]) -> str:
+    """Return what is on the pictures of waves."""
+    begun = "Left an actual episode that no network learned from; then what is imagined"
+    kinds = "with what was learned and by what was known alone"
+    again = "waves come as often and travel as fast, not at the same moment"
+    if facts.get("lane_names"):
+        return (
+            f"{begun} where the same people come at the same times, {kinds}. The expert alone drives CAVs, "
+            f"and what people misjudge is drawn anew: {again}."
+        )
+    return f"{begun} from its start on, {kinds}. CAVs do what they did, and noise is drawn anew: {again}."
+
+
 def waves(facts: dict[str, Any]) -> Figure:
-    """Draw an actual road beside what is imagined from its start on: waves are dark bands."""
-    found, vehicles = facts["waves"], range(len(facts["waves"]["recorded"]["speeds"][0]))
-    return space_time(
-        [
+    """Draw an actual road beside those imagined from its start on: waves are dark bands."""
+    outline = np.zeros((0 if facts.get("lane_names") else 1, 3))
+    shown = list[Shown]()
+    for label, road in facts["waves"].items():
+        speeds, positions, lanes = (
+            np.array(road.get(name, np.zeros((0, 0))), np.float64)
+            for name in ("speeds", "positions", "lanes")
+        )
+        columns = [str(column) for column in range(speeds.shape[1])]
+        cavs = road.get("cavs", facts.get("cavs", []))  # earlier versions wrote them once
+        shown.append(
             Shown(
                 driver=BASES[facts["base"]][0] if label == "base" else label,
                 step=facts["step"],
-                loop_length=facts["loop_length"],
-                outline=np.zeros((1, 3)),
-                vehicle_ids=tuple(str(vehicle) for vehicle in vehicles),
-                cav_ids=tuple(str(vehicle) for vehicle in facts["cavs"]),
-                speeds=np.array(road["speeds"], np.float64),
-                positions=np.array(road["positions"], np.float64),
+                loop_length=nan if facts["loop_length"] is None else facts["loop_length"],
+                lane_names=tuple(facts.get("lane_names", ())),
+                outline=outline,
+                vehicle_ids=tuple(columns),
+                cav_ids=tuple(columns[cav] for cav in cavs),
+                speeds=speeds,
+                positions=positions,
+                lanes=lanes,
             )
-            for label, road in found.items()
-        ]
-    )
+        )
+    return space_time_of(shown)
 
 
 @rc_context(STYLE)

@@ -6,18 +6,17 @@ All of it is measured on episodes that no network learned from, and kept in the 
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
 
 from unjam.errors import InputError
 from unjam.files import to_json, write_whole
-from unjam.learners.imagination import RowImagination
+from unjam.learners.algorithm_1 import kind_of_imagination
+from unjam.learners.imagination import RowImagination, WholeRoads
 from unjam.learners.learner import under
-from unjam.learners.road_imagination import RoadImagination
 from unjam.reports.results import MODEL_FILE, read_model, read_progress
-from unjam.scenarios.on_ramp import OnRamp
 from unjam.scenarios.scenario import Scenario
 from unjam.training.config import RunConfig
 from unjam.training.folder import load_checkpoint
@@ -68,8 +67,6 @@ def why_no_facts(config: RunConfig) -> str:
         return "is of several roads; allowed: a run of one"
     if config.virtual.virtual_ratio == 0:
         return "has no virtual environment: its virtual.virtual_ratio is 0; allowed: > 0"
-    if config.virtual.model == "road" and isinstance(config.make_scenario(), OnRamp):
-        return "imagines an on-ramp as a whole; allowed: other roads, or rows"
     return ""
 
 
@@ -94,49 +91,35 @@ def measure_model(folder: Path, config: RunConfig) -> dict[str, Any]:
     state, tensors = checkpoint
     settings = replace(config.virtual, device="cpu")
     (task,) = config.make_tasks()
-    if settings.model == "road":
-        roads = RoadImagination(settings, task, config.policy, config.seed)
-        roads.restore(state[roads.name], under(f"{roads.name}/", tensors))
-        return _rounded({"iteration": state["iteration"], **_waves(roads)})
-    imagination = RowImagination(settings, task, config.policy, config.seed)
+    imagination = kind_of_imagination(settings, task)(settings, task, config.policy, config.seed)
     imagination.restore(state[imagination.name], under(f"{imagination.name}/", tensors))
-    scenario = imagination.scenario
-    generator = np.random.default_rng(config.seed)
-    newest = progress[-1]
-    actual = imagination.data.transitions(settings.holdout)
+    about = {"iteration": state["iteration"], "base": settings.base, "members": settings.members}
+    if settings.model == "road":
+        return _rounded(about | _waves(cast(WholeRoads[Any], imagination)))
+    return _rounded(about | _of_rows(cast(RowImagination, imagination), config, progress[-1]))
+
+
+def _waves(roads: WholeRoads[Any]) -> dict[str, Any]:
+    """Return what a road was like and what is imagined of it."""
+    step, length, lane_names, seen = roads.waves()
+    drawn = {label: each._asdict() for label, each in seen.items()}
+    return {"step": step, "loop_length": length, "lane_names": lane_names, "waves": drawn}
+
+
+def _of_rows(imagination: RowImagination, config: RunConfig, newest: dict[str, Any]) -> dict[str, Any]:
+    """Return how wrong imagined rows are, on episodes that no network learned from."""
+    scenario, generator = imagination.scenario, np.random.default_rng(config.seed)
+    actual = imagination.data.transitions(config.virtual.holdout)
     held_out = actual.chosen(generator.permutation(np.flatnonzero(actual.held_out))[:ROWS])
     errors = one_step_errors(imagination.model, held_out, scenario, config.reward)
-    return _rounded(
-        {
-            "iteration": state["iteration"],
-            "base": settings.base,
-            "members": settings.members,
-            "decision_step": scenario.decision_step,
-            "k_star": newest["k_star"],
-            "held_out": int(actual.held_out.sum()),
-            "one_step": {name: found._asdict() for name, found in errors.by_number().items()},
-            "where": {name: _by_bins(getattr(held_out.states, name), errors) for name in BINNED},
-            "replay": _replayed(imagination, scenario, generator),
-            "bound": _bounds(imagination, newest, config.learner.gamma),
-        }
-    )
-
-
-def _waves(roads: RoadImagination) -> dict[str, Any]:
-    """Return an actual road and imagined ones, at the moments that were kept of it: speeds and positions."""
-    kept, imagined = roads.waves()
-    recorded = {"speeds": kept.speeds, "positions": kept.positions}
-    drawn = {
-        label: {"speeds": episode.speeds[:: kept.every], "positions": episode.positions[:: kept.every]}
-        for label, episode in imagined.items()
-    }
     return {
-        "base": roads.settings.base,
-        "members": roads.settings.members,
-        "step": kept.every * roads.scenario.decision_step,
-        "loop_length": kept.length,
-        "cavs": np.flatnonzero(kept.people == 0.0),
-        "waves": {"recorded": recorded, **drawn},
+        "decision_step": scenario.decision_step,
+        "k_star": newest["k_star"],
+        "held_out": int(actual.held_out.sum()),
+        "one_step": {name: found._asdict() for name, found in errors.by_number().items()},
+        "where": {name: _by_bins(getattr(held_out.states, name), errors) for name in BINNED},
+        "replay": _replayed(imagination, scenario, generator),
+        "bound": _bounds(imagination, newest, config.learner.gamma),
     }
 
 
