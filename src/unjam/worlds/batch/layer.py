@@ -23,8 +23,6 @@ HALTING = 0.1
 """speed below which SUMO says that a vehicle stands [m/s]"""
 NO_ROOM = 0.01
 """way below which people's `stopSpeed` is zero [m]"""
-MANY_SECONDS = 1e6
-"""later than everything [s]"""
 
 
 @dataclass(frozen=True)
