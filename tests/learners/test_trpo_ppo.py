@@ -149,6 +149,16 @@ def test_noise_that_lasts_is_as_wide_in_the_network_as_the_policy_reckons() -> N
     assert "log_std" not in dict(policy.named_parameters())
 
 
+def test_noise_that_lasts_tries_something_where_all_units_are_at_rest() -> None:
+    policy = fresh(PolicySettings(exploration_std=0.1, exploration="lasting"), action_limit=2.0)
+    with torch.no_grad():
+        at_rest = cast(Normal, policy.get_distribution(torch.zeros(1, 5)).distribution)
+    assert float(at_rest.stddev) == pytest.approx(0.2, rel=1e-4)
+    network = policy.network()
+    bias_alone = np.eye(network.noise_numbers)[-1:]
+    assert network.explore(np.zeros((1, 5)), bias_alone)[0] == pytest.approx(0.2, rel=1e-6)
+
+
 @pytest.mark.parametrize("learned", [True, False])
 def test_exploration_is_among_the_parameters_only_where_it_is_learned(learned: bool) -> None:
     policy = fresh(PolicySettings(learn_exploration=learned))
