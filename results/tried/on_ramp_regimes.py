@@ -1,7 +1,7 @@
 """Whether a CAV had better be held back otherwise where the road ahead is jammed than where it is not.
 
-`python results/tried/on_ramp_regimes.py` writes on-ramp-regimes.json beside itself, in some half an hour: at
-5 % CAVs the law that was tuned longer, with shifts of its cap by stretch of the way and by whether somewhere
+`python results/tried/on_ramp_regimes.py` writes on-ramp-regimes.json beside itself, in a quarter of an hour:
+at 5 % CAVs the law that was tuned longer, with shifts of its cap by stretch of the way and by whether somewhere
 in the next 800 m of the own lane there is a jam. Pairs of roads of a batch with the same people and opposite
 shifts, and then one set of shifts in three strengths, read off these. Tuning seeds.
 """
@@ -36,7 +36,7 @@ JAMMED, SECTIONS = 0.6, 8
 """share of the allowed speed below which a section is, and how many sections of 100 m are looked at"""
 SPREAD = 1.5
 """standard deviation of the shifts [m/s]"""
-PAIRS, FIRST = 192, 9000
+PAIRS, FIRST = 96, 9000
 CHOSEN = (-1.0, 0.0, 0.0, 1.0, 0.5, 0.5, 1.0, 1.0)
 """from the ramp on upstream, where nothing is jammed ahead and then where something is [m/s]"""
 STRENGTHS, JUDGED, FIRST_JUDGED = (0.0, 0.6, 1.2, 2.0), 96, 9600
@@ -80,10 +80,13 @@ if __name__ == "__main__":
     times = times_of(np.stack([strengths] * JUDGED), tuning_seeds(JUDGED, FIRST_JUDGED))
     facts = {
         "manifest": manifest(),
-        "slopes": [{"slope": s, "half_width": 1.96 * e} for s, e in zip(slopes, errors, strict=True)],
+        "slopes": [
+            {"slope": float(slope), "half_width": 1.96 * float(error)}
+            for slope, error in zip(slopes, errors, strict=True)
+        ],
         "shifts": CHOSEN,
         "travel_times": {
-            f"{strength:g}": column for strength, column in zip(STRENGTHS, times.T, strict=True)
+            f"{strength:g}": column.tolist() for strength, column in zip(STRENGTHS, times.T, strict=True)
         },
         "beyond_none": {
             f"{strength:g}": asdict(estimate((column - times[:, 0]).tolist()))
