@@ -1,9 +1,9 @@
 """Whether a CAV had better be held back otherwise where the road ahead is jammed than where it is not.
 
 `python results/tried/on_ramp_regimes.py` writes on-ramp-regimes.json beside itself, in a quarter of an hour:
-at 5 % CAVs the law that was tuned longer, with shifts of its cap by stretch of the way and by whether somewhere
-in the next 800 m of the own lane there is a jam. Pairs of roads of a batch with the same people and opposite
-shifts, and then one set of shifts in three strengths, read off these. Tuning seeds.
+at 5 % CAVs the law that was tuned longer, with shifts of its cap by stretch of the way and by whether there
+is a jam somewhere in the next 800 m of the own lane. Pairs of roads of a batch with the same people and
+opposite shifts, and then one set of shifts in three strengths, read off these. Tuning seeds.
 """
 
 from dataclasses import asdict, replace
