@@ -16,6 +16,7 @@ from unjam.following.calibration import calibrated_people
 from unjam.learners.experience import Experience
 from unjam.learners.learner import under
 from unjam.learners.settings import PolicySettings
+from unjam.learners.waves import Waves
 from unjam.physics.idm import IDMParameters
 from unjam.tree import pack, unpack
 from unjam.virtual.comparison import return_gap
@@ -179,40 +180,6 @@ class Imagination(Generic[Model]):
         self.steps = facts["steps"]
         self.scenario = replace(self.scenario, humans=IDMParameters(**facts["people"]))
         self.model.load_state_dict({n: t for n, t in tensors.items() if not n.startswith(DATA)})
-
-
-class Everybody(NamedTuple):
-    """Everybody on a road, at some moments; M moments, N columns, of which each vehicle has one."""
-
-    speeds: Floats
-    """[m/s], shape (M, N), NaN where nobody is"""
-    positions: Floats
-    """front bumpers [m], likewise"""
-    lanes: Floats
-    """in which lane each is, likewise, or (0, 0)"""
-    cavs: list[int]
-    """columns of CAVs"""
-
-
-class Waves(NamedTuple):
-    """The same road as it was and as it is imagined: do the same waves come?"""
-
-    step: float
-    """from one moment to the next [s]"""
-    loop_length: float
-    """of a closed road [m], or NaN"""
-    lane_names: tuple[str, ...]
-    """of a road with lanes"""
-    roads: dict[str, Everybody]
-    """`recorded`, `imagined` with what was learned, and by the `base` alone"""
-
-
-def everybody(episode: Episode, every: int) -> Everybody:
-    """Return everybody at every so many-th moment of an episode."""
-    speeds, positions, lanes = (
-        values[::every] for values in (episode.speeds, episode.positions, episode.lanes)
-    )
-    return Everybody(speeds, positions, lanes, episode.cavs)
 
 
 class OfAnEpisode(Protocol):

@@ -14,12 +14,10 @@ from unjam.learners.imagination import (
     NOISE,
     STARTS,
     AsExperience,
-    Everybody,
-    Waves,
     WholeRoads,
-    everybody,
     full_policy,
 )
+from unjam.learners.waves import Everybody, Waves, everybody
 from unjam.scenarios.on_ramp import OnRamp
 from unjam.virtual.ensemble import torch_generator
 from unjam.virtual.fitting import Fit

@@ -17,12 +17,10 @@ from unjam.learners.imagination import (
     NOISE,
     STARTS,
     AsExperience,
-    Everybody,
-    Waves,
     WholeRoads,
-    everybody,
     full_policy,
 )
+from unjam.learners.waves import Everybody, Waves, everybody
 from unjam.scenarios.ring import Loop
 from unjam.tree import mapped
 from unjam.virtual.comparison import Replayed

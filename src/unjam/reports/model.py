@@ -190,36 +190,33 @@ def model_section(result: Results) -> dict[str, Any] | None:
 
 def _compared(facts: dict[str, Any]) -> str:
     """Return what is on the pictures of waves."""
-    begun = "Left an actual episode that no network learned from; then what is imagined"
-    kinds = "with what was learned and by what was known alone"
-    again = "waves come as often and travel as fast, not at the same moment"
+    where, who = "from its start on", "CAVs do what they did, and noise"
     if facts.get("lane_names"):
-        return (
-            f"{begun} where the same people come at the same times, {kinds}. The expert alone drives CAVs, "
-            f"and what people misjudge is drawn anew: {again}."
-        )
-    return f"{begun} from its start on, {kinds}. CAVs do what they did, and noise is drawn anew: {again}."
+        where = "where the same people come at the same times"
+        who = "The expert alone drives CAVs, and what people misjudge"
+    return (
+        f"Left an actual episode that no network learned from; then what is imagined {where}, with what was "
+        f"learned and by what was known alone. {who} is drawn anew: waves come as often and travel as fast, "
+        "not at the same moment."
+    )
 
 
 def waves(facts: dict[str, Any]) -> Figure:
     """Draw an actual road beside those imagined from its start on: waves are dark bands."""
-    outline = np.zeros((0 if facts.get("lane_names") else 1, 3))
-    shown = list[Shown]()
+    shown, lane_names = list[Shown](), tuple(facts.get("lane_names", ()))
     for label, road in facts["waves"].items():
-        speeds, positions, lanes = (
-            np.array(road.get(name, np.zeros((0, 0))), np.float64)
-            for name in ("speeds", "positions", "lanes")
-        )
-        columns = [str(column) for column in range(speeds.shape[1])]
+        names, none = ("speeds", "positions", "lanes"), np.zeros((0, 0))
+        speeds, positions, lanes = (np.array(road.get(name, none), np.float64) for name in names)
+        columns = tuple(str(column) for column in range(speeds.shape[1]))
         cavs = road.get("cavs", facts.get("cavs", []))  # earlier versions wrote them once
         shown.append(
             Shown(
                 driver=BASES[facts["base"]][0] if label == "base" else label,
                 step=facts["step"],
                 loop_length=nan if facts["loop_length"] is None else facts["loop_length"],
-                lane_names=tuple(facts.get("lane_names", ())),
-                outline=outline,
-                vehicle_ids=tuple(columns),
+                lane_names=lane_names,
+                outline=np.zeros((0 if lane_names else 1, 3)),
+                vehicle_ids=columns,
                 cav_ids=tuple(columns[cav] for cav in cavs),
                 speeds=speeds,
                 positions=positions,
