@@ -190,14 +190,14 @@ def model_section(result: Results) -> dict[str, Any] | None:
 
 def _compared(facts: dict[str, Any]) -> str:
     """Return what is on the pictures of waves."""
-    where, who = "from its start on", "CAVs do what they did, and noise"
+    left, where = "an actual episode that no network learned from", "from its start on"
+    who = "CAVs do what they did, and noise"
     if facts.get("lane_names"):
-        where = "where the same people come at the same times"
-        who = "The expert alone drives CAVs, and what people misjudge"
+        left = "the actual road with the people of an episode that no network learned from"
+        where, who = "where they come once more", "The expert alone drives CAVs, and what people misjudge"
     return (
-        f"Left an actual episode that no network learned from; then what is imagined {where}, with what was "
-        f"learned and by what was known alone. {who} is drawn anew: waves come as often and travel as fast, "
-        "not at the same moment."
+        f"Left {left}; then what is imagined {where}, with what was learned and by what was known alone. "
+        f"{who} is drawn anew: waves come as often and travel as fast, not at the same moment."
     )
 
 
