@@ -15,7 +15,9 @@ from unjam.learners.settings import PolicySettings
 from unjam.physics.arrays import Floats
 from unjam.scenarios.on_ramp import ON_RAMP
 from unjam.virtual import motorways
-from unjam.virtual.motorways import moments_of_motorway
+from unjam.virtual.ensemble import torch_generator
+from unjam.virtual.motorways import beside_known, moments_of_motorway
+from unjam.virtual.roads import RoadModel
 from unjam.virtual.settings import VirtualSettings
 from unjam.worlds.batch.motorway_world import Again, MotorwayBatch
 from unjam.worlds.batch.run import run_batch
@@ -121,12 +123,38 @@ def test_it_imagines_as_many_episodes_as_are_asked_for_in_mirrored_pairs(actual:
     assert first.residual[0] + second.residual[0] == pytest.approx(2.0 * calm[0])
 
 
+def test_who_knows_nothing_of_following_takes_people_to_go_on_as_fast_as_they_are() -> None:
+    model = RoadModel(replace(VIRTUAL, base="none"), (0,))
+    model.noise.fill_(0.3)
+    speed, known = np.linspace(5.0, 25.0, 4000), np.linspace(25.0, 5.0, 4000)
+    calm, noisy = (
+        beside_known(model, torch_generator((0,), "cpu"), ROAD.steps_per_decision, noise)
+        for noise in (False, True)
+    )
+    assert calm is not None
+    assert noisy is not None
+    np.testing.assert_allclose(known + calm(speed, speed, speed, known), speed, atol=1e-12)
+    per_step = (known + noisy(speed, speed, speed, known) - speed) / ROAD.steps_per_decision
+    assert per_step.std() * ROAD.steps_per_decision**0.5 == pytest.approx(0.3, rel=0.05)
+
+
+@pytest.mark.usefixtures("often")
+def test_networks_alone_learn_how_people_follow(actual: list[Episode]) -> None:
+    settings = replace(VIRTUAL, base="none", epochs=60)
+    imagination = MotorwayImagination(settings, Task(ROAD, EXPERT), POLICY, 0)
+    imagination.learn(actual, 1)
+    step = imagination.facts["one_step"]["speed"]
+    assert imagination.facts["learned"] == ["speed"]
+    assert step["base"] == pytest.approx(step["change"], rel=0.05)  # the base: nothing changes
+    assert step["model"] < 0.9 * step["base"]
+
+
 @pytest.mark.parametrize(
     ("settings", "words"),
     [
         (replace(VIRTUAL, begin="newest"), "virtual.begin: newest is not allowed"),
-        (replace(VIRTUAL, base="none"), "virtual.base"),
-        (replace(VIRTUAL, calibrate=True), "not calibrated"),
+        (replace(VIRTUAL, base="acc"), "virtual.base: acc is not allowed; allowed: idm"),
+        (replace(VIRTUAL, calibrate=True), "calibrate is not allowed"),
     ],
 )
 def test_what_cannot_be_imagined_is_refused(settings: VirtualSettings, words: str) -> None:

@@ -23,11 +23,13 @@ from unjam.virtual.ensemble import torch_generator
 from unjam.virtual.fitting import Fit
 from unjam.virtual.motorways import (
     MotorwayMoments,
+    beside_known,
     check_motorways,
     fit_motorways,
     moments_of_motorway,
 )
-from unjam.virtual.roads import residual_of
+from unjam.virtual.roads import RoadModel
+from unjam.worlds.batch.motorway import Learned
 from unjam.worlds.batch.motorway_world import Again, MotorwayBatch
 from unjam.worlds.batch.run import MOST_MOTORWAYS
 from unjam.worlds.drive import Drive, driven_to_the_end
@@ -54,7 +56,7 @@ class MotorwayImagination(WholeRoads[MotorwayMoments]):
         check_motorways(cast(OnRamp, self.scenario), self.settings)
 
     def _kept_of(self, episode: Episode, number: int) -> MotorwayMoments:
-        return moments_of_motorway(episode, number, cast(OnRamp, self.scenario))
+        return moments_of_motorway(episode, number, cast(OnRamp, self.scenario), self.model.base)
 
     def _fit_moments(self, seed: Sequence[int]) -> Fit:
         return fit_motorways(self.model, self.moments, self.settings, seed)
@@ -100,9 +102,9 @@ class MotorwayImagination(WholeRoads[MotorwayMoments]):
         On all of them the expert alone drives CAVs.
         """
         road, expert, seed = cast(OnRamp, self.scenario), self._task.expert, self._unseen.seed
-        learned = residual_of(self.model, torch_generator((0,), "cpu"))
+        learned, base = (self._beside_known(model, (0,)) for model in (self.model, self._new_model()))
         again = Again([((1,), (2,))], road.horizon, self.settings.noise, learned)
-        kinds = {"recorded": None, "imagined": again, "base": again._replace(learned=None)}
+        kinds = {"recorded": None, "imagined": again, "base": again._replace(learned=base)}
         roads, every, names = dict[str, Everybody](), max(1, round(MOMENT / road.decision_step)), ()
         for label, otherwise in kinds.items():
             world = MotorwayBatch(road, [seed], again=otherwise)
@@ -130,13 +132,17 @@ class MotorwayImagination(WholeRoads[MotorwayMoments]):
         """
         road = cast(OnRamp, self.scenario)
         noise, *_ = seeds[0]
-        learned = residual_of(self.model, torch_generator(noise, "cpu"))
-        again = Again(seeds, decisions, self.settings.noise, learned)
+        again = Again(seeds, decisions, self.settings.noise, self._beside_known(self.model, noise))
         world = MotorwayBatch(road, [each.seed for each in kept], explore=explore, again=again)
         world.asked = driver.asks
         found = driven_to_the_end(Drive(world, driver, 1.0))
         earned = make_reward(self._task.reward or road.reward)
         return [rewarded(episode, earned) for episode in found]
+
+    def _beside_known(self, model: RoadModel, seed: Sequence[int]) -> Learned | None:
+        """Return what people do beside what the batch has them do, as a model has it."""
+        generator, steps = torch_generator(seed, "cpu"), self.scenario.steps_per_decision
+        return beside_known(model, generator, steps, self.settings.noise)
 
     @property
     def _newest(self) -> list[MotorwayMoments]:

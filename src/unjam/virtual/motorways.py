@@ -7,9 +7,11 @@ of each such moment makes a decision's steps as the base has it, and what is lef
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from math import sqrt
 from typing import NamedTuple, cast
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from unjam.errors import InputError
@@ -17,9 +19,9 @@ from unjam.physics.arrays import Floats
 from unjam.scenarios.on_ramp import RAMP_SPEED, OnRamp
 from unjam.scenarios.road import MotorwayRoad
 from unjam.virtual.fitting import Fit
-from unjam.virtual.roads import PeopleRows, RoadModel, fit_people
+from unjam.virtual.roads import PeopleRows, RoadModel, fit_people, residual_of
 from unjam.virtual.settings import VirtualSettings
-from unjam.worlds.batch.motorway import Motorways, begun, driven_by, let_acc_drive
+from unjam.worlds.batch.motorway import Learned, Motorways, begun, driven_by, let_acc_drive
 from unjam.worlds.batch.vehicles import Vehicles, around, chosen, number_of, rows_of
 from unjam.worlds.record import Episode
 
@@ -52,10 +54,10 @@ def check_motorways(scenario: OnRamp, settings: VirtualSettings) -> None:
     """Raise `InputError` where an on-ramp cannot be imagined with these settings."""
     if settings.begin != "first":
         raise InputError(f"virtual.begin: {settings.begin} is not allowed; allowed: first, on the on-ramp")
-    if settings.base != "idm" or settings.calibrate:
-        raise InputError(
-            "virtual.base: on the on-ramp it is idm, as each drives; allowed: idm, not calibrated"
-        )
+    if settings.base not in ("idm", "none") or settings.calibrate:
+        given = "calibrate" if settings.calibrate else settings.base
+        words = "idm, as each drives, or none, on the on-ramp; neither is calibrated"
+        raise InputError(f"virtual.base: {given} is not allowed; allowed: {words}")
 
 
 class _Chosen(NamedTuple):
@@ -69,7 +71,9 @@ class _Chosen(NamedTuple):
     """number among the record's vehicles"""
 
 
-def moments_of_motorway(episode: Episode, number: int, scenario: OnRamp) -> MotorwayMoments:
+def moments_of_motorway(
+    episode: Episode, number: int, scenario: OnRamp, base: str = "idm"
+) -> MotorwayMoments:
     """Return what is kept of an actual episode, the so many-th, on a scenario."""
     road = cast(MotorwayRoad, scenario.of_seed(episode.seed)[0])
     every = max(1, min(EVERY, episode.steps // 4))
@@ -90,9 +94,10 @@ def moments_of_motorway(episode: Episode, number: int, scenario: OnRamp) -> Moto
     keeps = episode.lanes[later] == episode.lanes[now]
     counts = (row >= 0) & before.extended & keeps & ~np.isnan(known + noisy + after)
     gap = before.place[row] - road.vehicle_length - before.place
-    columns = before.speed, before.speed[row], gap, known, after, after, np.full(len(row), float(number))
-    people = PeopleRows(*(each[counts] for each in columns))
     noise = float(np.square(noisy - known)[counts].mean()) if counts.any() else 0.0
+    based = before.speed if base == "none" else known
+    columns = before.speed, before.speed[row], gap, based, after, after, np.full(len(row), float(number))
+    people = PeopleRows(*(each[counts] for each in columns))
     return MotorwayMoments(number, tuple(episode.seed), float(episode.reward.sum()), people, noise)
 
 
@@ -146,6 +151,27 @@ def _stepped(
     row = rows_of(number_of(vehicles), after)
     keeps = (row >= 0) & (after.way[row] == vehicles.way)
     return np.where(keeps, after.speed[row], np.nan)
+
+
+def beside_known(
+    model: RoadModel, generator: torch.Generator, steps: int, noise: bool = True
+) -> Learned | None:
+    """Return what people do in a decision of so many steps beside what the batch has them do.
+
+    With the base `none` that takes back what the batch knows of following, and what people misjudge, of which
+    `noise` of as much strength is left.
+    """
+    residual = residual_of(model, generator)
+    if model.base != "none":
+        return residual
+    sigma = float(model.noise) * sqrt(steps) if noise else 0.0
+
+    def driven(speed: Floats, leader_speed: Floats, gap: Floats, known: Floats) -> Floats:
+        drawn = torch.randn(speed.size, generator=generator, dtype=torch.float64).numpy()
+        learned = residual(speed, leader_speed, gap, speed) if residual else 0.0
+        return speed - known + learned + sigma * drawn
+
+    return driven
 
 
 def fit_motorways(
