@@ -59,7 +59,6 @@ COLUMNS = {
     "of the limit, steady": ("speed_limit_ratio_steady", 3),
     "std across vehicles [m/s]": ("speed_std_fleet", 2),
     "smallest headway [s]": ("min_headway", 2),
-    "wave dissolved after [s]": ("time_to_dissolve", 0),
     "leave [veh/h]": ("throughput_veh_per_h", 0),
     "wait [veh]": ("backlog_veh", 0),
     "collisions": ("collisions", 2),
@@ -67,7 +66,6 @@ COLUMNS = {
 """what the honest tables show: a metric and its digits"""
 OF_THE_RING = ("return", "mean speed [m/s]", "of the limit, steady", "std across vehicles [m/s]")
 OF_THE_RING += ("smallest headway [s]", "collisions")
-OF_THE_JAMMED = (*OF_THE_RING[:3], "wave dissolved after [s]", *OF_THE_RING[3:])
 OF_THE_EIGHT = ("return", "return, Eq. 16", "mean speed [m/s]", "steady [m/s]", "std across vehicles [m/s]")
 OF_THE_EIGHT += ("collisions",)
 OF_THE_MERGE = ("return", "mean speed [m/s]", "steady [m/s]", "leave [veh/h]", "wait [veh]", "collisions")
@@ -92,18 +90,6 @@ def honest(
         cells["beyond"] = "" if beyond is None else interval(beyond, 0, "+")
         cells["better"] = "" if better is None else interval({"low": None, "high": None, **better}, 2)
         table.append(cells)
-    return pd.DataFrame(table)
-
-
-def by_draw(study: str, road: str, names: tuple[str, ...]) -> pd.DataFrame:
-    """Return the steady speed of some drivers by what episodes draw."""
-    table = []
-    for row in rows_of(study, road):
-        if row["name"] in names:
-            (drawn,) = row["steady_by_draw"].values()
-            table.append(
-                {"": row["name"], **{f"{value} m": number(mean, 2) for value, mean in drawn.items()}}
-            )
     return pd.DataFrame(table)
 
 

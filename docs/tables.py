@@ -103,18 +103,37 @@ def roads_known(road: str) -> pd.DataFrame:
     actual ones, where PI drives and where a CAV follows as people do; in brackets the range of the seeds.
     """
     rows = json.loads((RESULTS / "model/whole_roads.json").read_text())["rows"]
-    (actual,) = (row for row in rows if row["road"] == road and not row["known"])
-    found = pd.DataFrame([row for row in rows if row["road"] == road and row["known"]])
-    table, drivers = [], {"PI": "PI", "a CAV that follows as people do": "as people"}
+    drivers = {"PI": "PI", "a CAV that follows as people do": "as people"}
+    metrics = {"speed": ("speed", "m/s", 2), "wave": ("spread", "m/s", 2)}
+    return _known([row for row in rows if row["road"] == road], drivers, metrics)
+
+
+def on_ramps_known() -> pd.DataFrame:
+    """Return how wrong imagined on-ramps are, as `roads_known`: travel time and flow beyond the actual."""
+    rows = json.loads((RESULTS / "model/on_ramps.json").read_text())["rows"]
+    drivers = {"the expert of the data": "the expert", "people alone": "people alone"}
+    metrics = {"travel_time": ("travel time", "s", 1), "throughput_veh_per_h": ("flow", "veh/h", 0)}
+    return _known(rows, drivers, metrics)
+
+
+Metrics = dict[str, tuple[str, str, int]]
+"""label, unit and digits of metrics"""
+
+
+def _known(rows: list[dict], drivers: dict[str, str], metrics: Metrics) -> pd.DataFrame:
+    """Return a table of `rows`, one of which is what was, by `drivers` with their labels."""
+    (actual,) = (row for row in rows if not row["known"])
+    found, table = pd.DataFrame([row for row in rows if row["known"]]), []
     for (known, steps), of in found.groupby(["known", "steps"], sort=False):
         cells = {"what is known": known, "actual steps": f"{steps:,}" if steps else "none"}
         cells["a step is wrong by [m/s]"] = f"{of['ignorance'].mean():.4f}"
         for who, words in drivers.items():
-            for name, heading in (("speed", "speed"), ("wave", "spread")):
+            for name, (heading, unit, digits) in metrics.items():
                 beyond = [np.mean(each[name]) - np.mean(actual[who][name]) for each in of[who]]
-                cells[f"{heading}, {words} [m/s]"] = _in_range(beyond)
+                cells[f"{heading}, {words} [{unit}]"] = _in_range(beyond, digits)
         crashed = sum(each["collisions"] for who in drivers for each in of[who])
-        cells["collide"] = f"{crashed} of {2 * len(of) * len(actual['PI']['speed'])}"
+        whole = sum(len(each[name]) for who in drivers for each in of[who])
+        cells["collide"] = f"{crashed} of {whole}"
         table.append(cells)
     return pd.DataFrame(table)
 
@@ -140,8 +159,10 @@ def levels(name: str, columns: dict[str, str], chosen: dict[str, tuple]) -> pd.D
     )
 
 
-def _in_range(values: Sequence[float]) -> str:
-    mean, low, high = (f"{round(each, 2) + 0.0:+.2f}" for each in (np.mean(values), min(values), max(values)))
+def _in_range(values: Sequence[float], digits: int = 2) -> str:
+    mean, low, high = (
+        f"{round(each, digits) + 0.0:+.{digits}f}" for each in (np.mean(values), min(values), max(values))
+    )
     return mean if low == high else f"{mean} [{low}, {high}]"
 
 

@@ -51,7 +51,7 @@ def test_a_training_that_two_studies_want_is_planned_once(tmp_path: Path) -> Non
 
 
 def test_the_paper_settings_cost_what_their_budget_says() -> None:
-    short, long = (estimated_seconds(PlannedRun("ring", name, 0)) for name in ("proposed", "proposed-long"))
+    short, long = (estimated_seconds(PlannedRun("ring", name, 0)) for name in ("trpo", "trpo-exact"))
     assert long == pytest.approx(short * 4_000_000 / 300_000)
 
 

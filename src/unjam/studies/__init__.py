@@ -49,20 +49,6 @@ STUDIES: dict[str, Study] = {
     ),
     "figure-10": FIGURE_10,
     "theory": THEORY,
-    "long": comparison_of(
-        "the paper's four million steps, and ours trained on, on the ring",
-        ("trpo-long", "proposed-long", "best"),
-    ),
-    "on-experts": comparison_of(
-        "ours on the figure eight: on the best expert and on PI, with model and without",
-        ("ours", "ours-with-model", "ours-on-pi"),
-        "figure-eight",
-    ),
-    "jammed": comparison_of(
-        "ours on a ring whose wave has grown before the CAV takes over",
-        ("best", "ours-with-model"),
-        "ring-jammed",
-    ),
     "imagined": imagined("ring", "best"),
     "imagined-jammed": imagined("ring-jammed", "jammed"),
     "imagined-eight": imagined("figure-eight", "eight"),
