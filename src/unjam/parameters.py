@@ -84,6 +84,8 @@ def one_line(error: ValidationError, field: str, kind: Any) -> str:
     if problem["type"] == "value_error" and names_itself:  # a check across fields
         return f"{name}.{problem['msg'].removeprefix('Value error, ')}".removeprefix(".")
     allowed = problem["msg"].removeprefix("Input should be ").removeprefix("Value error, ")
+    if problem["type"] == "tuple_type":
+        allowed = 'a list: [1, 2], ["local"]'
     return f"{name}: {problem['input']!r} is not allowed; allowed: {allowed}"
 
 

@@ -88,6 +88,7 @@ def test_merging_changes_neither_side() -> None:
         ({"evaluation.episodes": 0}, "evaluation.episodes: 0 is not allowed"),
         ({"evaluation.every": -1}, "evaluation.every: -1 is not allowed"),
         ({"evaluation.baselines": "pi"}, "evaluation.baselines: 'pi' is not allowed"),
+        ({"policy.hidden": 16}, "policy.hidden: 16 is not allowed; allowed: a list: [1, 2]"),
         ({"policy.observe": ["stars"]}, "policy.observe.0: 'stars' is not allowed"),
         ({"scenario": "rong"}, "scenario: 'rong' is not allowed; allowed: ring, ring-warm, ring-jammed"),
         ({"road": {"lenght": [220, 230]}}, "scenario ring.lenght: unknown name"),
