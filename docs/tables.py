@@ -129,11 +129,12 @@ def _known(rows: list[dict], drivers: dict[str, str], metrics: Metrics) -> pd.Da
         cells["a step is wrong by [m/s]"] = f"{of['ignorance'].mean():.4f}"
         for who, words in drivers.items():
             for name, (heading, unit, digits) in metrics.items():
-                beyond = [np.mean(each[name]) - np.mean(actual[who][name]) for each in of[who]]
-                cells[f"{heading}, {words} [{unit}]"] = _in_range(beyond, digits)
+                whole = [each for each in of[who] if each["collisions"] < len(each[name])]
+                beyond = [np.mean(each[name]) - np.mean(actual[who][name]) for each in whole]
+                cells[f"{heading}, {words} [{unit}]"] = _in_range(beyond, digits) if whole else "–"
         crashed = sum(each["collisions"] for who in drivers for each in of[who])
-        whole = sum(len(each[name]) for who in drivers for each in of[who])
-        cells["collide"] = f"{crashed} of {whole}"
+        episodes = len(drivers) * len(of) * len(actual[who][name])
+        cells["collide"] = f"{crashed} of {episodes}"
         table.append(cells)
     return pd.DataFrame(table)
 
