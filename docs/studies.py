@@ -64,6 +64,8 @@ COLUMNS = {
     "collisions": ("collisions", 2),
 }
 """what the honest tables show: a metric and its digits"""
+FILTERED = "2026-11-22T13:41"
+"""since when there is a safety filter"""
 OF_THE_RING = ("return", "mean speed [m/s]", "of the limit, steady", "std across vehicles [m/s]")
 OF_THE_RING += ("smallest headway [s]", "collisions")
 OF_THE_EIGHT = ("return", "return, Eq. 16", "mean speed [m/s]", "steady [m/s]", "std across vehicles [m/s]")
@@ -91,6 +93,15 @@ def honest(
         cells["better"] = "" if better is None else interval({"low": None, "high": None, **better}, 2)
         table.append(cells)
     return pd.DataFrame(table)
+
+
+def made_before_the_filter() -> str:
+    """Return which of the studies that have a manifest were made before CAVs had a safety filter."""
+    started = {
+        path.parent.name: json.loads(path.read_text())["started"] for path in RESULTS.glob("*/manifest.json")
+    }
+    before = sorted(name for name, when in started.items() if when < FILTERED)
+    return f"Made before CAVs had [the safety filter](safety.md): {', '.join(before)}." if before else ""
 
 
 def merge_capacity() -> pd.DataFrame:
