@@ -30,7 +30,8 @@ EVERY = 60
 LEAST = 0.3
 """share of the base's mean square error that networks must save: a record does not tell what people remember
 of lane changes, and who imagines them knows it; its mean effect would be added twice. Networks that saved a
-fifth made imagined episodes 10 s too long, others that saved three fifths 20 s instead of 180 (docs/virtual.md)"""
+fifth made imagined episodes 10 s too long; others, that saved three fifths, 20 s instead of 180
+(docs/virtual.md)"""
 JUDGED = 0.5
 """standard deviation of what people misjudge once they have driven for a while; of how they drive it is 1"""
 
