@@ -17,6 +17,7 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 import torch
 from knowledge import PASSES, settings_for, untrained
+from whole_roads import ELSEWHERE, wrong_beyond
 
 from unjam.controller import make_driver
 from unjam.drivers.driver import Driver
@@ -28,7 +29,7 @@ from unjam.measures.metrics import measure
 from unjam.scenarios.on_ramp import ON_RAMP, OnRamp
 from unjam.training.config import load_config
 from unjam.virtual.motorways import MotorwayMoments, fit_motorways, moments_of_motorway
-from unjam.virtual.roads import RoadModel
+from unjam.virtual.roads import PeopleRows, RoadModel
 from unjam.virtual.settings import BaseName, VirtualSettings
 from unjam.worlds.batch.run import run_batches
 from unjam.worlds.episode import Task
@@ -43,12 +44,11 @@ AT_ONCE = 8
 """episodes, of 40 MB each"""
 METRICS = ("travel_time", "throughput_veh_per_h", "speed_std_fleet")
 ALL_ALIKE = {
-    "time_headways": (1.6, 1.6),
-    "accelerations": (0.73, 0.73),
-    "decelerations": (1.67, 1.67),
-    "gaps": (2.0, 2.0),
+    "time_headways": (ELSEWHERE.time_headway,) * 2,
+    "accelerations": (ELSEWHERE.max_acceleration,) * 2,
+    "decelerations": (ELSEWHERE.comfortable_deceleration,) * 2,
+    "gaps": (ELSEWHERE.minimum_gap,) * 2,
 }
-"""Treiber, Hennecke, Helbing 2000, table I, for a motorway in Germany; but they wish to be as fast as here"""
 JUDGES = {"the expert of the data": ROAD, "people alone": replace(ROAD, cav_share=0.0)}
 
 
@@ -79,17 +79,6 @@ def moments(episodes: Sequence[Episode], known: str, first: int = 0) -> list[Mot
     return [moments_of_motorway(each, first + number, road, base) for number, each in enumerate(episodes)]
 
 
-def ignorance(model: RoadModel, kept: Sequence[MotorwayMoments], noise: float) -> float:
-    """Return how far a step is wrong, what people misjudge left out, root mean square [m/s]."""
-    wrong = [
-        each.people.moved
-        - each.people.base
-        - model.answers(each.people.inputs)[..., 0] * float(model.learned)
-        for each in kept
-    ]
-    return float(np.sqrt(max(0.0, np.square(np.concatenate(wrong, -1)).mean() - noise)))
-
-
 def numbers_of(episodes: Sequence[Episode]) -> dict[str, list[float]]:
     """Return some metrics of each episode."""
     found = [measure(episode) for episode in episodes]
@@ -99,7 +88,8 @@ def numbers_of(episodes: Sequence[Episode]) -> dict[str, list[float]]:
 def judged(model: RoadModel, known: str, test: list[Episode], noise: float, expert: Driver) -> dict[str, Any]:
     """Return what is wrong with a model on the test episodes, and what happens where it is imagined."""
     kept = moments(test, known)
-    found: dict[str, Any] = {"ignorance": ignorance(model, kept, noise)}
+    rows = PeopleRows(*map(np.concatenate, zip(*(one.people for one in kept), strict=True)))
+    found: dict[str, Any] = {"ignorance": wrong_beyond(noise, model, rows)}
     for who, road in JUDGES.items():
         taken = replace(road, **KNOWN[known].people)
         imagination = MotorwayImagination(settings_of(known), Task(taken, expert), PolicySettings(), 0)

@@ -27,7 +27,7 @@ from unjam.physics.idm import PAPER_IDM, IDMParameters
 from unjam.scenarios.ring import Loop
 from unjam.training.config import load_config
 from unjam.virtual.ensemble import torch_generator
-from unjam.virtual.roads import RoadModel, moments_of, people_in, people_of
+from unjam.virtual.roads import PeopleRows, RoadModel, moments_of, people_in, people_of
 from unjam.virtual.settings import BaseName
 from unjam.worlds.batch.run import run_batch
 from unjam.worlds.episode import Task
@@ -70,12 +70,15 @@ def driven(road: Loop, driver: Driver, count: int, seed: tuple[int, ...]) -> lis
 def ignorance(model: RoadModel, episodes: list[Episode], road: Loop) -> float:
     """Return how far a step is wrong, people's noise left out, root mean square [m/s]."""
     kept = [moments_of(episode, number, road) for number, episode in enumerate(episodes)]
-    rows = people_in(kept, model.base, road)
+    commanded = road.human_control == "commanded"
+    noise = (road.noise_per_step * road.simulation_step) ** 2 if commanded else 0.0
+    return wrong_beyond(noise, model, people_in(kept, model.base, road))
+
+
+def wrong_beyond(noise: float, model: RoadModel, rows: PeopleRows) -> float:
+    """Return how far steps are wrong beyond noise of a mean square [m2/s2], root mean square [m/s]."""
     wrong = (rows.moved - rows.base) - model.answers(rows.inputs)[..., 0] * float(model.learned)
-    square = float(np.square(wrong).mean())
-    if road.human_control == "commanded":
-        square -= (road.noise_per_step * road.simulation_step) ** 2
-    return float(np.sqrt(max(0.0, square)))
+    return float(np.sqrt(max(0.0, float(np.square(wrong).mean()) - noise)))
 
 
 def numbers_of(episodes: list[Episode]) -> dict[str, list[float]]:

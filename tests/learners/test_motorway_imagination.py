@@ -139,6 +139,16 @@ def test_who_knows_nothing_of_following_takes_people_to_go_on_as_fast_as_they_ar
 
 
 @pytest.mark.usefixtures("often")
+def test_networks_count_beside_wrong_people_and_not_beside_those_who_are_known(actual: list[Episode]) -> None:
+    others = {"time_headways": (1.6, 1.6), "accelerations": (0.73, 0.73), "decelerations": (1.67, 1.67)}
+    for people, learned in (({}, []), (others, ["speed"])):
+        imagination = MotorwayImagination(replace(VIRTUAL, epochs=60), Task(ROAD, EXPERT), POLICY, 0)
+        imagination.scenario = replace(ROAD, **people)
+        imagination.learn(actual, 1)
+        assert imagination.facts["learned"] == learned
+
+
+@pytest.mark.usefixtures("often")
 def test_networks_alone_learn_how_people_follow(actual: list[Episode]) -> None:
     settings = replace(VIRTUAL, base="none", epochs=60)
     imagination = MotorwayImagination(settings, Task(ROAD, EXPERT), POLICY, 0)
@@ -154,7 +164,7 @@ def test_networks_alone_learn_how_people_follow(actual: list[Episode]) -> None:
     [
         (replace(VIRTUAL, begin="newest"), "virtual.begin: newest is not allowed"),
         (replace(VIRTUAL, base="acc"), "virtual.base: acc is not allowed; allowed: idm"),
-        (replace(VIRTUAL, calibrate=True), "calibrate is not allowed"),
+        (replace(VIRTUAL, calibrate=True), "virtual.calibrate: true is not allowed"),
     ],
 )
 def test_what_cannot_be_imagined_is_refused(settings: VirtualSettings, words: str) -> None:

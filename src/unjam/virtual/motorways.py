@@ -30,8 +30,8 @@ EVERY = 60
 LEAST = 0.3
 """share of the base's mean square error that networks must save: a record does not tell what people remember
 of lane changes, and who imagines them knows it; its mean effect would be added twice. Networks that saved a
-fifth made imagined episodes 10 s too long; others, that saved three fifths, 20 s instead of 180
-(docs/virtual.md)"""
+fifth made imagined episodes 10 s too long; others, that saved more than half, 20 s instead of
+180 (docs/virtual.md)"""
 JUDGED = 0.5
 """standard deviation of what people misjudge once they have driven for a while; of how they drive it is 1"""
 
@@ -56,10 +56,11 @@ def check_motorways(scenario: OnRamp, settings: VirtualSettings) -> None:
     """Raise `InputError` where an on-ramp cannot be imagined with these settings."""
     if settings.begin != "first":
         raise InputError(f"virtual.begin: {settings.begin} is not allowed; allowed: first, on the on-ramp")
-    if settings.base not in ("idm", "none") or settings.calibrate:
-        given = "calibrate" if settings.calibrate else settings.base
-        words = "idm, as each drives, or none, on the on-ramp; neither is calibrated"
-        raise InputError(f"virtual.base: {given} is not allowed; allowed: {words}")
+    if settings.base not in ("idm", "none"):
+        words = "idm, as each drives, or none, on the on-ramp"
+        raise InputError(f"virtual.base: {settings.base} is not allowed; allowed: {words}")
+    if settings.calibrate:
+        raise InputError("virtual.calibrate: true is not allowed; allowed: false, on the on-ramp")
 
 
 class _Chosen(NamedTuple):
