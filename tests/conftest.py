@@ -3,6 +3,7 @@
 import itertools
 import os
 import shutil
+import signal
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -20,6 +21,9 @@ if "UNJAM_STATE" not in os.environ:  # which code the tests ran is not what the 
     os.environ["UNJAM_STATE"] = STATE = tempfile.mkdtemp(prefix="state-of-tests-")
 else:
     STATE = ""
+
+# What a shell starts in the background ignores interrupts, and so would all that a test starts to interrupt
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # No timed tests, and the same each time. `make test-all` takes the thorough one.
 settings.register_profile("unjam", deadline=None, derandomize=True, max_examples=20)
