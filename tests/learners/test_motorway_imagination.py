@@ -22,7 +22,7 @@ from unjam.virtual.settings import VirtualSettings
 from unjam.worlds.batch.motorway_world import Again, MotorwayBatch
 from unjam.worlds.batch.run import run_batch
 from unjam.worlds.drive import Drive, driven_to_the_end
-from unjam.worlds.episode import Task
+from unjam.worlds.episode import Task, run_episode
 from unjam.worlds.record import Episode
 from unjam.worlds.workers import EpisodeTask
 
@@ -41,6 +41,11 @@ HOW = AsExperience(
 @pytest.fixture(scope="module")
 def actual() -> list[Episode]:
     return run_batch([EpisodeTask(ROAD, EXPERT, (seed,)) for seed in range(4)], statistical=True)
+
+
+@pytest.fixture(scope="module")
+def in_sumo() -> list[Episode]:
+    return [run_episode(ROAD, EXPERT, (seed,)) for seed in range(4)]
 
 
 @pytest.fixture
@@ -170,3 +175,23 @@ def test_networks_alone_learn_how_people_follow(actual: list[Episode]) -> None:
 def test_what_cannot_be_imagined_is_refused(settings: VirtualSettings, words: str) -> None:
     with pytest.raises(InputError, match=words):
         MotorwayImagination(settings, Task(ROAD, EXPERT), POLICY, 0)
+
+
+def test_the_base_expects_of_people_in_sumo_what_it_expects_of_those_in_the_batch(
+    actual: list[Episode], in_sumo: list[Episode], often: None
+) -> None:
+    squares, counts, noises = list[float](), list[int](), list[float]()
+    for episodes in (actual, in_sumo):
+        kept = [moments_of_motorway(episode, 0, ROAD) for episode in episodes]
+        wrong = np.concatenate([one.people.after - one.people.base for one in kept])
+        squares.append(float(np.square(wrong).mean()))
+        counts.append(len(wrong))
+        noises.append(float(np.mean([one.noise for one in kept])))
+    assert counts[1] == pytest.approx(counts[0], rel=0.2)
+    assert noises[1] == pytest.approx(noises[0], rel=0.2)
+    assert squares[1] < 1.3 * squares[0]
+
+
+def test_a_record_that_skips_moments_is_refused(in_sumo: list[Episode]) -> None:
+    with pytest.raises(InputError, match="skips moments"):
+        moments_of_motorway(replace(in_sumo[0], every=2), 0, ROAD)

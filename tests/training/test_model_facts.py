@@ -169,9 +169,10 @@ RAMP: dict[str, Any] = {
 }
 
 
-def test_a_run_that_imagines_an_on_ramp_shows_its_waves_lane_by_lane(tmp_path: Path) -> None:
+@pytest.mark.parametrize("world", ["batch", "sumo"])
+def test_a_run_that_imagines_an_on_ramp_shows_its_waves_lane_by_lane(world: str, tmp_path: Path) -> None:
     changes = {"virtual__virtual_ratio": 1.0, "virtual__model": "road", "virtual__members": 2, **RAMP}
-    config = small_config(**changes, steps=STEPS)
+    config = small_config(**{**changes, "world": world}, steps=STEPS)
     with Workers(1) as workers:
         learn_with(workers, tmp_path / "run", config)
     found = json.loads(to_json(measure_model(tmp_path / "run", config)))

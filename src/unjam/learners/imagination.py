@@ -30,6 +30,7 @@ from unjam.virtual.settings import VirtualSettings
 from unjam.virtual.world import VirtualDynamics
 from unjam.worlds.episode import Task
 from unjam.worlds.record import Episode, Floats
+from unjam.worlds.workers import EpisodeTask
 
 FIT, STARTS, NOISE, EXPLORATION = 2, 3, 4, 5
 """what the random numbers of an iteration are for, in their seeds"""
@@ -217,8 +218,8 @@ class WholeRoads(Imagination[RoadModel], Generic[Kept]):
         """Fit the model to what is kept of D_a as it is now."""
         raise NotImplementedError
 
-    def waves(self) -> Waves:
-        """Return a road as it was and as it is imagined."""
+    def waves(self, drive: Callable[[EpisodeTask], Episode]) -> Waves:
+        """Return a road as it was and as it is imagined; `drive` runs an episode where actual ones run."""
         raise NotImplementedError
 
     @property

@@ -1,6 +1,6 @@
 """Imagining on-ramps: the same people come once more, and misjudge and change lanes anew."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from math import nan
 from typing import Any, cast
 
@@ -17,7 +17,7 @@ from unjam.learners.imagination import (
     WholeRoads,
     full_policy,
 )
-from unjam.learners.waves import Everybody, Waves, everybody
+from unjam.learners.waves import Waves, everybody
 from unjam.scenarios.on_ramp import OnRamp
 from unjam.virtual.ensemble import torch_generator
 from unjam.virtual.fitting import Fit
@@ -36,6 +36,7 @@ from unjam.worlds.drive import Drive, driven_to_the_end
 from unjam.worlds.episode import rewarded
 from unjam.worlds.record import Episode
 from unjam.worlds.reward import make_reward
+from unjam.worlds.workers import EpisodeTask
 
 MOMENT = 10.0
 """from one moment of a road that is shown to the next [s]"""
@@ -96,7 +97,7 @@ class MotorwayImagination(WholeRoads[MotorwayMoments]):
             self.facts["crash_share"] = float(np.mean(crashed))
         return join(found)
 
-    def waves(self) -> Waves:
+    def waves(self, drive: Callable[[EpisodeTask], Episode]) -> Waves:
         """Return an actual road that no network learned from, and those where its people come once more.
 
         On all of them the expert alone drives CAVs.
@@ -104,14 +105,14 @@ class MotorwayImagination(WholeRoads[MotorwayMoments]):
         road, expert, seed = cast(OnRamp, self.scenario), self._task.expert, self._unseen.seed
         learned, base = (self._beside_known(model, (0,)) for model in (self.model, self._new_model()))
         again = Again([((1,), (2,))], road.horizon, self.settings.noise, learned)
-        kinds = {"recorded": None, "imagined": again, "base": again._replace(learned=base)}
-        roads, every, names = dict[str, Everybody](), max(1, round(MOMENT / road.decision_step)), ()
-        for label, otherwise in kinds.items():
+        actual, every = drive(EpisodeTask(road, expert, seed)), max(1, round(MOMENT / road.decision_step))
+        roads = {"recorded": everybody(actual, every)}
+        for label, otherwise in {"imagined": again, "base": again._replace(learned=base)}.items():
             world = MotorwayBatch(road, [seed], again=otherwise)
             world.asked = expert.asks
             (episode,) = driven_to_the_end(Drive(world, expert))
-            roads[label], names = everybody(episode, every), episode.lane_names
-        return Waves(every * road.decision_step, nan, names, roads)
+            roads[label] = everybody(episode, every)
+        return Waves(every * road.decision_step, nan, actual.lane_names, roads)
 
     def driven(
         self,

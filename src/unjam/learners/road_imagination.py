@@ -1,6 +1,6 @@
 """Imagining whole roads: everybody drives on, from recorded moments, and waves come and go."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any, cast
 
@@ -44,6 +44,7 @@ from unjam.worlds.drive import driven_to_the_end
 from unjam.worlds.episode import rewarded
 from unjam.worlds.record import Episode
 from unjam.worlds.reward import make_reward
+from unjam.worlds.workers import EpisodeTask
 
 
 class RoadImagination(WholeRoads[Moments]):
@@ -137,10 +138,10 @@ class RoadImagination(WholeRoads[Moments]):
         earned = make_reward(self._task.reward or road.reward)
         return [rewarded(episode, earned) for episode in found.episodes]
 
-    def waves(self) -> Waves:
+    def waves(self, drive: Callable[[EpisodeTask], Episode]) -> Waves:
         """Return an actual road that no network learned from, and those imagined from its start on.
 
-        There CAVs do what they did, and noise is drawn anew.
+        It is one of the record's: nothing is driven anew. CAVs do what they did, and noise is drawn anew.
         """
         moments, recordings = self._unseen, self.data.recordings
         rows = [place for place, each in enumerate(recordings) if each.episode == moments.episode]

@@ -18,7 +18,6 @@ from unjam.errors import InputError
 from unjam.learners.settings import Agents, PolicySettings
 from unjam.parameters import STRICT, Count, CountOrNone, Positive, build, changed, nested, parse_toml
 from unjam.scenarios import make_scenario
-from unjam.scenarios.on_ramp import OnRamp
 from unjam.scenarios.scenario import Scenario
 from unjam.training.presets import preset_values
 from unjam.training.sampling import Sampling, episodes_of_iteration, shares_by_weight
@@ -122,9 +121,6 @@ class RunConfig(Agents):
         imagines = self.virtual.model if self.virtual.virtual_ratio > 0 else ""
         if self.policy.afterwards and imagines == "row":
             raise ValueError("policy.afterwards: true is not allowed; allowed: false where rows are imagined")
-        ramps = any(isinstance(scenario, OnRamp) for scenario in scenarios)
-        if imagines == "road" and ramps and self.world != "batch":
-            raise ValueError("world: sumo is not allowed; allowed: batch, where an on-ramp is imagined")
         if self.policy.lasts and self.agent not in ("trpo", "ppo"):
             kind = self.policy.exploration
             raise ValueError(f"policy.exploration: {kind} is not allowed; allowed: anew, for {self.agent}")

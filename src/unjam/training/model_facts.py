@@ -23,7 +23,10 @@ from unjam.training.folder import load_checkpoint
 from unjam.virtual.comparison import one_step_errors, open_loop, recorded, replay
 from unjam.virtual.fitting import OneStepErrors, root_mean_square
 from unjam.virtual.model import NUMBERS, TARGETS, EnvironmentModel
-from unjam.worlds.record import Floats
+from unjam.worlds.batch.run import run_batch
+from unjam.worlds.episode import run_episode
+from unjam.worlds.record import Episode, Floats
+from unjam.worlds.workers import EpisodeTask
 
 LONGEST = 500
 """decisions that virtual and actual are compared over, where the stays are long enough"""
@@ -95,15 +98,23 @@ def measure_model(folder: Path, config: RunConfig) -> dict[str, Any]:
     imagination.restore(state[imagination.name], under(f"{imagination.name}/", tensors))
     about = {"iteration": state["iteration"], "base": settings.base, "members": settings.members}
     if settings.model == "road":
-        return _rounded(about | _waves(cast(WholeRoads[Any], imagination)))
+        return _rounded(about | _waves(cast(WholeRoads[Any], imagination), config.world))
     return _rounded(about | _of_rows(cast(RowImagination, imagination), config, progress[-1]))
 
 
-def _waves(roads: WholeRoads[Any]) -> dict[str, Any]:
-    """Return what a road was like and what is imagined of it."""
-    step, length, lane_names, seen = roads.waves()
+def _waves(roads: WholeRoads[Any], world: str) -> dict[str, Any]:
+    """Return what a road was like and what is imagined of it; actual episodes run in a world."""
+    step, length, lane_names, seen = roads.waves(_in_batch if world == "batch" else _in_sumo)
     drawn = {label: each._asdict() for label, each in seen.items()}
     return {"step": step, "loop_length": length, "lane_names": lane_names, "waves": drawn}
+
+
+def _in_batch(task: EpisodeTask) -> Episode:
+    return run_batch([task], statistical=True)[0]
+
+
+def _in_sumo(task: EpisodeTask) -> Episode:
+    return run_episode(task.scenario, task.driver, task.seed)
 
 
 def _of_rows(imagination: RowImagination, config: RunConfig, newest: dict[str, Any]) -> dict[str, Any]:

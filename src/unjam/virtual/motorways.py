@@ -77,7 +77,13 @@ class _Chosen(NamedTuple):
 def moments_of_motorway(
     episode: Episode, number: int, scenario: OnRamp, base: str = "idm"
 ) -> MotorwayMoments:
-    """Return what is kept of an actual episode, the so many-th, on a scenario."""
+    """Return what is kept of an actual episode, the so many-th, on a scenario.
+
+    Raises:
+        InputError: so many drove for so long that the record skips moments.
+    """
+    if episode.every > 1:
+        raise InputError("road: its record skips moments; allowed: a shorter horizon, where it is imagined")
     road = cast(MotorwayRoad, scenario.of_seed(episode.seed)[0])
     every = max(1, min(EVERY, episode.steps // 4))
     at = np.arange(every, episode.steps, every)

@@ -1,8 +1,8 @@
 """What a road with ends keeps of who comes and goes: all speeds, and pictures as fine as anybody can see.
 
-A corridor of some hours has ten thousands of vehicles, each there for a few of all moments. A table with a
-column for each would be empty but for a hundredth: where it would be large, those who are never there
-together share a column.
+An on-ramp's hour has two thousand vehicles, a corridor ten thousands, each there for a few of all moments. A
+table with a column for each would be empty but for a hundredth: where it would be large, those who are never
+there together share a column.
 """
 
 from collections.abc import Hashable, Sequence
@@ -17,7 +17,7 @@ from unjam.worlds.record import FRAMES, shared_columns
 MOST_PICTURED = 600_000
 """vehicles at moments of which pictures are kept: of more, those of every second moment alone, then of every
 fourth, and so on"""
-MOST_CELLS = 20_000_000
+MOST_CELLS = 2_000_000
 """cells of a table with a column for each vehicle; of larger ones columns are shared"""
 
 

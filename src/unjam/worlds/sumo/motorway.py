@@ -143,7 +143,6 @@ class MotorwayTraffic(LaneTraffic[MotorwayRoad]):
         return [routes[name] for name in vehicles]
 
     def _pictured(self, columns: NDArray[np.intp]) -> dict[str, Any]:
-        facts = {**super()._pictured(columns), "peak": self.road.peak, "free_time": self.road.free_time}
-        if not self.full:
-            return facts
-        return {**facts, "lanes": self._log.pictures("lanes", columns), "lane_names": self.road.ways[::-1]}
+        lanes = {"lanes": self._log.pictures("lanes", columns), "lane_names": self.road.ways[::-1]}
+        road = {"peak": self.road.peak, "free_time": self.road.free_time}
+        return {**super()._pictured(columns), **road, **lanes}
