@@ -325,6 +325,7 @@ def measure(episode: Episode) -> dict[str, Any]:
         **episode.drawn,
         "floor": episode.audit.floor,
         "lanes": episode.audit.lanes,
+        "teleports": episode.teleports,
         **{name: metric.function(episode) if episode.ok else np.nan for name, metric in METRICS.items()},
     }
     return {**row, "drivable": drivable(row)}

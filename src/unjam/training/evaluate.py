@@ -37,6 +37,7 @@ from unjam.worlds.sumo.apart import simulation_for
 from unjam.worlds.workers import EpisodeTask, Workers
 
 WANTS_ACC = "holds back a car's own ACC, which none has: --set actuation=cruise --set safety.active=false"
+LIFTED = "vehicles that had stood for long and put them back further on: see its time-to-teleport"
 TRAINED = "trained"
 """label of the trained controller in tables and pictures"""
 Progress = Callable[[tuple[str, int], int], None]
@@ -236,6 +237,12 @@ def gain_of(config: RunConfig, rows: Rows) -> Estimate | None:
     return paired_difference(rows[TRAINED], rows[config.make_expert().describe()], "return")
 
 
+def _notes_on_teleports(rows: Rows) -> list[str]:
+    """Return by drivers how often SUMO moved somebody on who stood: no road does that."""
+    counts = {name: sum(row["teleports"] for row in found) for name, found in rows.items()}
+    return [f"{name}: SUMO lifted {count} {LIFTED}" for name, count in counts.items() if count]
+
+
 def _lacks_acc(driver: Driver, scenario: Scenario) -> bool:
     """Whether a driver is told of the road ahead to hold back an ACC which CAVs have not got."""
     told = "lane_speeds" in driver.perceives and "lane_speeds" in scenario.tells
@@ -304,6 +311,7 @@ def drive(
         found = evaluate(made, drivers, seeds, pool, reward, progress)
         report, notes = None, notes_on_controllers(scenario_recipe(made), drivers, found.shown)
         notes += [f"{name} {WANTS_ACC}" for name, one in drivers.items() if _lacks_acc(one, made)]
+        notes += _notes_on_teleports(found.rows)
         ran = any(row["status"] != "failed" for rows in found.rows.values() for row in rows)
         if folder is not None and ran:
             about = {"scenario": Path(scenario).name, "reward": reward or made.reward, "manifest": manifest()}

@@ -165,6 +165,8 @@ class Episode:
     """where the vehicles of each column came from, on a road with several ways in"""
     arrived: int = 0
     """vehicles that left at the end of their route"""
+    teleports: int = 0
+    """times that SUMO lifted a vehicle that had stood for long off the road; until it is put back it waits"""
     peak: tuple[float, float] = (0.0, 0.0)
     """from when to when the most vehicles want to enter [s]; (0, 0) where there is no peak"""
     free_time: float = float("nan")

@@ -121,7 +121,7 @@ def test_it_is_told_how_many_of_all_that_have_entered_are_cavs(simulation: Simul
     traffic = motorway(simulation, replace(BUSY, cav_share=0.3))
     for _ in range(100):
         traffic.advance(Command(np.full(traffic.rows, 1.0)))
-    came = {*libsumo.vehicle.getIDList(), *simulation.left()}
+    came = {*libsumo.vehicle.getIDList(), *simulation.arrived()}
     share = np.unique(traffic.perceive().cav_share)
     assert share == pytest.approx([sum(name in traffic.road.cav_ids for name in came) / len(came)], abs=0.02)
 

@@ -92,6 +92,11 @@ class OpenTraffic(Traffic[OpenKind]):
         """Run the warm-up, then hand the CAVs over; drivers remember nothing of it."""
         self._on_road: dict[str, bool] = {}
         """who is there, in order of entry; true: to be driven by the driver"""
+        self._lifted: dict[str, bool] = {}
+        """whom SUMO has lifted off the road, likewise"""
+        self._teleports = 0
+        self._taken = set[str]()
+        """CAVs that were taken control of"""
         self.cavs, self._arrived = [], 0
         self._alive = on_progress or (lambda steps: None)
         self._now: tuple[Sequence[str], Floats] | None = None
@@ -103,7 +108,7 @@ class OpenTraffic(Traffic[OpenKind]):
         self._stays = StayLog()
         self._log_waiting: list[int] = []
         self._log_fuel: list[float] = []
-        self._arrived = 0
+        self._arrived = self._teleports = 0
         self._forget()
         self._look()
 
@@ -181,13 +186,20 @@ class OpenTraffic(Traffic[OpenKind]):
     def _follow(self) -> None:
         """Keep up with who is on the road."""
         self._now = None
-        entered, left = self._simulation.departed(), self._simulation.left()
-        self._arrived += len(self._simulation.arrived())
-        for name in left:
+        simulation = self._simulation
+        entered, arrived, lifted = simulation.departed(), simulation.arrived(), simulation.lifted()
+        self._arrived += len(arrived)
+        self._teleports += len(lifted)
+        self._lifted |= {name: self._on_road[name] for name in lifted if name in self._on_road}
+        for name in (*arrived, *lifted):
             self._on_road.pop(name, None)
-        self._moved(left, entered)
+        for name in arrived:  # also from where it was lifted
+            self._lifted.pop(name, None)
+        self._moved([*arrived, *lifted], entered)
         for name in entered:
             self._on_road[name] = self._is_cav(name)
+        for name in filter(self._lifted.__contains__, simulation.put_back()):
+            self._on_road[name] = self._lifted.pop(name)
 
     def _watch(self) -> None:
         """Note how everybody's speed has changed in this step: people's and CAVs' apart."""
@@ -216,6 +228,8 @@ class OpenTraffic(Traffic[OpenKind]):
             self.cavs = [*(self.cavs[row] for row in rows), *new]
         self.entered += len(new)
         if self._controlled:
+            taken, self._taken = self._taken, self._taken.union(new)
+            new = [name for name in new if name not in taken]
             simulation.take_control(new, scenario.actuation, scenario.right_of_way, self._cav_type)
         names, self.speeds = self._everybody()
         self._note_moment()
@@ -226,7 +240,7 @@ class OpenTraffic(Traffic[OpenKind]):
             self._log.picture({**pictured, **places})
         self._stays.cavs.append(self.cavs)
         self._stays.states.append(self._states(self.cavs))
-        self._log_waiting.append(len(simulation.waiting()))
+        self._log_waiting.append(len(simulation.waiting()) + len(self._lifted))
 
     def record(self, driven: Driven) -> Episode:
         """Return what happened since the start."""
@@ -248,6 +262,7 @@ class OpenTraffic(Traffic[OpenKind]):
             "every": log.every,
             "fuel": held if self.full else np.zeros((0, 0)),
             "arrived": self._arrived,
+            "teleports": self._teleports,
             "waiting": np.array(self._log_waiting, np.float64),
             "lines": self._lines() if self.full else np.zeros((0, 2)),
             "trajectories": trajectories,

@@ -117,6 +117,10 @@ class Simulation:
         """who entered the road in the last step"""
         self.arrived: Callable[[], Sequence[str]] = call("simulation", "getArrivedIDList")
         """who left the road at the end of its route in the last step"""
+        self.lifted: Callable[[], Sequence[str]] = call("simulation", "getStartingTeleportIDList")
+        """whom SUMO lifted off the road in the last step, for it had stood for long"""
+        self.put_back: Callable[[], Sequence[str]] = call("simulation", "getEndingTeleportIDList")
+        """whom SUMO put back, further on, in the last step"""
         self.colliding: Callable[[], Sequence[str]] = call("simulation", "getCollidingVehiclesIDList")
         """who touched another in the last step"""
         self.on_loop: Callable[[str], Sequence[Any]] = call("inductionloop", "getVehicleData")
@@ -206,10 +210,6 @@ class Simulation:
     def along_lanes(self, ids: Sequence[str]) -> list[float]:
         """Return how far each of `ids` is along its lane [m]."""
         return list(map(self._get_along, ids))
-
-    def left(self) -> list[str]:
-        """Return who left the road in the last step: at the end of its route, or moved away by SUMO."""
-        return [*self.arrived(), *self._sumo.simulation.getStartingTeleportIDList()]
 
     def places(self, ids: Sequence[str]) -> NDArray[np.float64]:
         """Return rows (x, y, heading) of front bumpers: [m], and [rad] against the x axis."""

@@ -1,6 +1,5 @@
 """What a road with ends keeps of its CAVs: each stay of one is a trajectory of its own."""
 
-from collections import defaultdict
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -36,14 +35,18 @@ class StayLog:
         `driven` is all that the driver decided, `crashed` whether a collision ended the episode; `on_stay` is
         called now and then.
         """
-        stays: defaultdict[str, list[tuple[int, int]]] = defaultdict(list)
-        """moment and row of each CAV"""
+        stays = list[tuple[str, list[tuple[int, int]]]]()
+        """of whom each is, and moment and row: one that SUMO lifts off the road and puts back has several"""
+        newest = dict[str, list[tuple[int, int]]]()
         for time, names in enumerate(self.cavs):
             for row, name in enumerate(names):
-                stays[name].append((time, row))
+                if name not in newest or newest[name][-1][0] < time - 1:
+                    newest[name] = list[tuple[int, int]]()
+                    stays.append((name, newest[name]))
+                newest[name].append((time, row))
         states = list(zip(*self.states, strict=True))
         found = []
-        for number, (name, places) in enumerate(stays.items()):
+        for number, (name, places) in enumerate(stays):
             if number % BETWEEN_SIGNS == 0:
                 on_stay()
             start, steps = places[0][0], len(places) - 1

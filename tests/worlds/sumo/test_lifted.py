@@ -1,0 +1,103 @@
+"""Vehicles that SUMO lifts off a road where they stand for long, and puts back further on."""
+
+import re
+import subprocess
+from collections import Counter
+from pathlib import Path
+
+import libsumo
+import numpy as np
+import pytest
+
+import unjam
+from unjam.drivers.command import Command
+from unjam.measures.metrics import measure
+from unjam.scenarios import make_scenario
+from unjam.worlds.record import Episode
+from unjam.worlds.sumo import make_traffic
+from unjam.worlds.sumo.networks import sumo_program
+from unjam.worlds.sumo.open import OpenTraffic
+from unjam.worlds.sumo.simulation import Simulation
+from unjam.worlds.world import Driven
+
+
+@pytest.fixture(scope="module")
+def blocked(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A van stops at the end of an edge, and others fill the next one; nobody waits for longer than 5 s."""
+    folder = tmp_path_factory.mktemp("blocked")
+    places = {"a": 0, "b": 200, "c": 240, "d": 540}
+    nodes = "".join(f'<node id="{name}" x="{x}" y="0"/>' for name, x in places.items())
+    edges = "".join(
+        f'<edge id="{begin}{end}" from="{begin}" to="{end}" numLanes="1" speed="15"/>'
+        for begin, end in ("ab", "bc", "cd")
+    )
+    standing = "".join(
+        f'<vehicle id="van_{place}" type="van" depart="0" departPos="{place}"><route edges="bc cd"/>'
+        f'<stop lane="bc_0" endPos="{place + 1}" duration="60"/></vehicle>'
+        for place in (37, 28, 19, 10)
+    )
+    (folder / "nodes.xml").write_text(f"<nodes>{nodes}</nodes>")
+    (folder / "edges.xml").write_text(f"<edges>{edges}</edges>")
+    (folder / "demand.rou.xml").write_text(
+        '<routes><vType id="car" speedDev="0"/><vType id="van" speedDev="0" length="6"/>'
+        f'<route id="along" edges="ab bc cd"/>{standing}'
+        '<vehicle id="first" type="van" route="along" depart="0">'
+        '<stop lane="ab_0" endPos="190" duration="60"/></vehicle>'
+        '<flow id="f" type="car" route="along" begin="2" end="42" period="4"/></routes>'
+    )
+    command = [sumo_program("netconvert"), "-n", "nodes.xml", "-e", "edges.xml", "-o", "road.net.xml"]
+    subprocess.run(command, check=True, capture_output=True, cwd=folder)
+    path = folder / "blocked.sumocfg"
+    path.write_text(
+        '<configuration><net-file value="road.net.xml"/><route-files value="demand.rou.xml"/>'
+        '<end value="200"/><step-length value="0.5"/><time-to-teleport value="5"/></configuration>'
+    )
+    return path
+
+
+def driven(simulation: Simulation, file: Path, share: float) -> tuple[Episode, int]:
+    """Drive CAVs with 0.3 m/s2 until all have left; the record, and how many SUMO had there in all steps."""
+    scenario = make_scenario(str(file), {"cav_share": share, "horizon": 400})
+    traffic = make_traffic(scenario, (0,), simulation)
+    assert isinstance(traffic, OpenTraffic)
+    traffic.start(controlled=True)
+    count = 0
+    while not traffic.over:
+        traffic.advance(Command(np.full(len(traffic.cavs), 0.3)))
+        count += libsumo.vehicle.getIDCount()
+    return traffic.record(Driven()), count
+
+
+@pytest.mark.parametrize("share", [1e-9, 1.0])
+def test_they_count_on_the_road_and_off_it_until_they_arrive(
+    share: float, blocked: Path, simulation: Simulation
+) -> None:
+    episode, count = driven(simulation, blocked, share)
+    assert episode.teleports >= 4
+    assert (~np.isnan(episode.speeds[1:])).sum() == count
+    assert episode.arrived == len(episode.vehicle_ids) == 15
+    assert episode.waiting.max() >= 2, "whom SUMO finds no room for waits"
+    assert episode.waiting[-1] == 0
+    assert measure(episode)["teleports"] == episode.teleports
+
+
+def test_a_cav_that_is_put_back_is_driven_again(blocked: Path, simulation: Simulation) -> None:
+    episode, _ = driven(simulation, blocked, 1.0)
+    stays = Counter(each.vehicle for each in episode.trajectories)
+    again = [name for name, count in stays.items() if count > 1]
+    assert again
+    starts = [each.start for each in episode.trajectories]
+    assert starts == sorted(starts), "in order of entry, as drivers' memories are"
+    told = list[bool]()
+    for name in again:
+        first, *_, last = (each for each in episode.trajectories if each.vehicle == name)
+        assert first.start + len(first.applied) < last.start
+        told += np.isclose(np.diff(last.states.speed), 0.15).tolist()
+    assert sum(told) > 100, "with 0.3 m/s2 for half a second, where nobody is in its way"
+
+
+def test_who_drives_is_told_of_them(blocked: Path, tmp_path: Path) -> None:
+    (note,) = unjam.drive(
+        str(blocked), ["human"], road={"horizon": 400, "cav_share": 0.5}, workers=1, out=tmp_path / "out"
+    ).notes
+    assert re.fullmatch(r"human: SUMO lifted \d+ vehicles that had stood for long .*", note)
