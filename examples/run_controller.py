@@ -16,7 +16,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-from plain_experts import EXPERTS, State, clip
+from plain_experts import EXPERTS, State, clip, remember
 from plain_safety import highest
 
 
@@ -28,9 +28,11 @@ class Driver:
         if recipe["kind"] == "named":
             self.p = SimpleNamespace(**recipe["parameters"])
             return
-        if recipe["kind"] == "filtered":
+        if recipe["kind"] in ("filtered", "remembering"):
             self.inner = Driver(recipe["driver"], weights, f"{prefix}inner.")
             return
+        if recipe["kind"] != "residual":
+            raise ValueError(f"a driver of the kind {recipe['kind']} is not read here; read it with unjam")
         self.expert = Driver(recipe["expert"], weights, f"{prefix}expert.")
         count = sum(f"{prefix}{index}.weight" in weights for index in range(len(weights)))
         self.layers = [[weights[f"{prefix}{i}.{part}"] for part in ("weight", "bias")] for i in range(count)]
@@ -42,6 +44,10 @@ class Driver:
         if self.r["kind"] == "filtered":
             wanted = clip(self.inner.act(s), -self.r["action_limit"], self.r["action_limit"])
             return min(wanted, highest(SimpleNamespace(**self.r["safety"]), s, self.r["time_step"]))
+        if self.r["kind"] == "remembering":
+            wanted, own = self.inner.act(s), remember(self.memory, s, self.r["time_step"])
+            self.memory.features = (*getattr(self.inner.memory, "features", ()), *own)
+            return wanted
         limit = self.r["action_limit"]
         expert = clip(self.expert.act(s), -limit, limit)
         self.memory = self.expert.memory
@@ -102,15 +108,15 @@ class Controller:
         self.limit = max(-action["low"], action["high"])
         self.driver = Driver(self.manifest["driver"], arrays(parts["weights.safetensors"]))
 
-    def act(self, *perceived: Any) -> float:
+    def act(self, *perceived: Any, **named: Any) -> float:
         """The acceleration to drive with [m/s2], for the fields of `State`."""
-        return clip(self.driver.act(State(*perceived)), -self.limit, self.limit)
+        return clip(self.driver.act(State(*perceived, **named)), -self.limit, self.limit)
 
 
 if __name__ == "__main__":
     controller = Controller(sys.argv[1])
     names = [name for name in State._fields if name in controller.sample]
     recorded = zip(*(controller.sample[name].tolist() for name in (*names, "acceleration")), strict=True)
-    off = [abs(controller.act(*perceived) - answer) for *perceived, answer in recorded]
+    off = [abs(controller.act(**dict(zip(names, seen, strict=True))) - told) for *seen, told in recorded]
     print(f"{len(off)} decisions, at most {max(off):.1e} m/s2 from what was recorded")
     sys.exit(int(max(off) > 1e-9))
