@@ -42,7 +42,8 @@ def test_a_verdict_names_the_first_reason(changes: dict[str, Any], verdict: str)
 
 def test_people_who_brake_hard_are_a_reason_only_where_they_do_so_more_than_alone() -> None:
     row = {**GOOD, "people_beyond_4_5": 15.0}
-    assert drivable(row) == "people brake beyond 4.5 m/s2 15 times in a million moments (0 without CAVs)"
+    words = "people brake beyond 4.5 m/s2 15 times in a million moments"
+    assert drivable(row) == f"{words} (without CAVs: not driven)"
     assert drivable_in_all([row, row], [HUMAN]) == DRIVABLE
     assert drivable_in_all([row, {**GOOD, "people_beyond_4_5": 40.0}], [HUMAN]).startswith("people brake")
 
@@ -52,6 +53,14 @@ def test_one_bad_episode_of_many_is_told_with_how_many_there_are() -> None:
         drivable_in_all([GOOD, {**GOOD, "min_headway": 0.3}, GOOD])
         == "follows at 0.30 s (floor 1 s) (1 of 3)"
     )
+
+
+def test_of_results_that_are_compared_each_has_its_own_people() -> None:
+    rows = {"many: human": [HUMAN], "few: human": [{**HUMAN, "people_beyond_4_5": 10.0}]}
+    driven = [{**GOOD, "people_beyond_4_5": 15.0}]
+    found = verdicts({**rows, "many: pi": driven, "few: pi": driven})
+    assert found["many: pi"] == DRIVABLE
+    assert found["few: pi"].endswith("(without CAVs: 10)")
 
 
 def test_each_driver_of_a_road_has_a_verdict_and_people_have_none() -> None:

@@ -31,7 +31,7 @@ DRIVABLE = "drivable"
 def min_headway(episode: Episode) -> float:
     """Smallest time headway of the CAV, gap over speed, while it drives faster than 1 m/s [s]; NaN if never.
 
-    In any simulation step, as all that follows.
+    In any simulation step, as all that follows; on the merge after every decision.
     """
     return _finite(episode.audit.following.headway)
 
@@ -127,14 +127,15 @@ def yielded(episode: Episode) -> float:
     return episode.audit.following.yielded
 
 
-def drivable(row: dict[str, Any], people_alone: float = 0.0) -> str:
+def drivable(row: dict[str, Any], people_alone: float | None = None) -> str:
     """Return the verdict on an episode: `drivable`, or the first reason why not.
 
     Empty where nobody automated drove, or the episode failed. `people_alone` is how often in a million
-    moments people brake beyond 4.5 m/s2 where there are no CAVs.
+    moments people brake beyond 4.5 m/s2 where there are no CAVs; None: nobody looked.
     """
     if row["status"] == "failed" or isnan(row["cav_max_braking"]):
         return ""
+    alone = "not driven" if people_alone is None else f"{people_alone:.0f}"
     floor, lanes = row.get("floor") or USUAL_FLOOR, row.get("lanes", False)
     smallest = SMALLEST_WITH_LANES if lanes else FLOOR_MET * floor
     checks = [
@@ -151,9 +152,9 @@ def drivable(row: dict[str, Any], people_alone: float = 0.0) -> str:
         ),
         (row["overridden"] > 0, f"SUMO overrides {100 * row['overridden']:.2g} % of its commands"),
         (
-            row["people_beyond_4_5"] > people_alone,
+            row["people_beyond_4_5"] > (people_alone or 0.0),
             f"people brake beyond 4.5 m/s2 {row['people_beyond_4_5']:.0f} times in a million moments "
-            f"({people_alone:.0f} without CAVs)",
+            f"(without CAVs: {alone})",
         ),
     ]
     return next((reason for fails, reason in checks if fails), DRIVABLE)
@@ -173,8 +174,16 @@ def _with_lanes(row: dict[str, Any], floor: float) -> tuple[tuple[bool, str], ..
 
 def verdicts(rows_by_driver: dict[str, list[dict[str, Any]]]) -> dict[str, str]:
     """Return the verdict on each driver of a road; people alone, where they are among them, are `human`."""
-    people = rows_by_driver.get("human", [])
-    return {label: drivable_in_all(rows, people) for label, rows in rows_by_driver.items()}
+    return {
+        label: drivable_in_all(rows, people_beside(label, rows_by_driver))
+        for label, rows in rows_by_driver.items()
+    }
+
+
+def people_beside(label: str, rows_by_driver: dict[str, list[dict[str, Any]]]) -> list[dict[str, Any]]:
+    """Return the rows of people alone on a driver's road: of results that are compared, those of its own."""
+    result, _, _ = label.rpartition(": ")
+    return rows_by_driver.get(f"{result}: human", rows_by_driver.get("human", []))
 
 
 def drivable_in_all(rows: Sequence[dict[str, Any]], people: Sequence[dict[str, Any]] = ()) -> str:
@@ -184,7 +193,7 @@ def drivable_in_all(rows: Sequence[dict[str, Any]], people: Sequence[dict[str, A
     driver's fault.
     """
     alone = [row["people_beyond_4_5"] for row in people if row["status"] != "failed"]
-    share = sum(alone) / len(alone) if alone else 0.0
+    share = sum(alone) / len(alone) if alone else None
     verdicts = [drivable({**row, "people_beyond_4_5": 0.0}) for row in rows]
     wrong = [verdict for verdict in verdicts if verdict not in ("", DRIVABLE)]
     if wrong:

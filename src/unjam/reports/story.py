@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from unjam.measures.drivable import DRIVABLE
+from unjam.measures.drivable import DRIVABLE, verdicts
 from unjam.measures.effect import Effect, beside_people
 from unjam.measures.metrics import METRICS
 from unjam.measures.statistics import digits_of, estimate_of, paired_difference, signed, verdict_on
@@ -100,8 +100,8 @@ def lead_of(result: Results) -> str:
         return _lead_of_drives(result)
     rows, effect = result.rows[result.trained], beside_people(result.rows).get(result.trained)
     if effect:
-        scenario = result.about["scenario"]
-        said = f"Beside people alone on {scenario}, {len(rows)} held-out seeds paired: {_words_of(effect)}."
+        scenario, words = result.about["scenario"], _words_of(effect, verdicts(result.rows)[result.trained])
+        said = f"Beside people alone on {scenario}, {len(rows)} held-out seeds paired: {words}."
     else:
         earned = estimate_of(rows, "return").mean
         said = f"On {len(rows)} held-out seeds the trained controller earns {earned:.0f} an episode."
@@ -118,9 +118,10 @@ def lead_of(result: Results) -> str:
     return said
 
 
-def _words_of(effect: Effect) -> str:
-    """Return what everybody on the road gains, and whether a car could drive so."""
-    safe = {"": "", DRIVABLE: "; a car could drive so"}
+def _words_of(effect: Effect, verdict: str) -> str:
+    """Return what everybody on the road gains, and whether a car could drive so; `verdict` is that beside people."""
+    able = "; a car could drive so" + ("" if verdict == DRIVABLE else f", but {verdict}")
+    safe = {"": "", DRIVABLE: able}
     return effect.words + safe.get(effect.drivable, f"; no car could drive so: {effect.drivable}")
 
 
@@ -128,8 +129,8 @@ def _lead_of_drives(result: Results) -> str:
     """Return how fast all vehicles drive with each driver."""
     scenario, effects = result.about["scenario"], beside_people(result.rows)
     if effects:
-        count = len(result.rows["human"])
-        said = "; ".join(f"{label}: {_words_of(effect)}" for label, effect in effects.items())
+        count, found = len(result.rows["human"]), verdicts(result.rows)
+        said = "; ".join(f"{label}: {_words_of(effect, found[label])}" for label, effect in effects.items())
         return f"Beside people alone on {scenario}, {count} episodes with the same seeds paired: {said}."
     ratios = {label: estimate_of(rows, "speed_limit_ratio_steady") for label, rows in result.rows.items()}
     if len(ratios) > 1:
