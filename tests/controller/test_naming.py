@@ -46,3 +46,10 @@ def test_several_joined_by_a_plus_share_the_cavs(tmp_path: Path) -> None:
     assert isinstance(made, Mixed)
     assert made.drivers[0] == PISaturation(window=10)
     np.testing.assert_array_equal(actions(made.drivers[1]), actions(residual(IDM())))
+
+
+def test_a_file_whose_folder_has_a_plus_in_its_name_is_one_driver(tmp_path: Path, my_drivers: Path) -> None:
+    path = tmp_path / "my+drivers" / "mine.py"
+    path.parent.mkdir()
+    path.write_text(my_drivers.read_text())
+    assert make_driver(f"{path}:gentle", 0.1) == FileDriver(path, "gentle")

@@ -14,7 +14,7 @@ from stable_baselines3.common.env_checker import check_env as check_env_of_sb3
 
 import unjam
 from tests.worlds.sumo.own_roads import straight
-from unjam.drivers import Constant
+from unjam.drivers import IDM, Constant
 from unjam.drivers.registry import named_driver
 from unjam.environments.single import RoadEnv
 from unjam.errors import InputError, MissingPartError, UnjamError
@@ -240,6 +240,7 @@ def test_renders_the_road_with_its_cav(scenario: str) -> None:
         ({"scenario": "moon"}, "ring, ring-warm"),
         ({"lenght": (230, 230)}, "lenght: unknown name"),
         ({"expert": "nobody"}, "nobody"),
+        ({"scenario": "merge", "expert": "pacer"}, "it needs a closed road"),
     ],
 )
 def test_wrong_arguments_get_one_clear_line(arguments: Any, words: str) -> None:
@@ -252,3 +253,13 @@ def test_gymnasium_knows_the_environments_after_importing_unjam() -> None:
     ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert ran.stdout.strip() == str(sorted([*NAMES, OWN]))
     assert unjam.__version__
+
+
+def test_rewards_are_for_what_happens_and_not_for_what_sensors_read() -> None:
+    changes: Any = {"horizon": 60, "sensors": {"gap_error": 3.0}, "safety": {"active": False}}
+    expected = run_episode(make_scenario("ring", changes), IDM(time_headway=0.4), (0,), "eq16")
+    environment = RoadEnv("ring", reward="eq16", expert="idm:time_headway=0.4", **changes)
+    environment.reset(seed=0)
+    earned = [environment.step(np.zeros(1))[1] for _ in range(60)]
+    environment.close()
+    np.testing.assert_allclose(earned, expected.reward, atol=1e-12)

@@ -97,6 +97,19 @@ def test_highd_is_read_on_both_carriageways(tmp_path: Path, sign: int) -> None:
     np.testing.assert_allclose(pair.gap, GAP + (LEADER - SPEED) * 0.04 * np.arange(MOMENTS), atol=1e-6)
 
 
+@pytest.mark.parametrize("sign", [1, -1])
+def test_who_stands_on_highd_stands_where_it_was(tmp_path: Path, sign: int) -> None:
+    path = highd(tmp_path / "01_tracks.csv", sign)
+    table = pd.read_csv(path)
+    leader, half = table["id"] == 1, MOMENTS // 2
+    stands = leader & (table["frame"] >= half)
+    table.loc[stands, "x"] = table.loc[leader & (table["frame"] == half), "x"].item()
+    table.loc[stands, "xVelocity"] = 0.0
+    table.to_csv(path, index=False)
+    (pair,) = read_pairs(path, reading=replace(SHORT, shortest=1.0)).pairs
+    assert np.abs(np.diff(pair.gap)).max() < 0.04 * max(SPEED, LEADER) + 1e-6
+
+
 def test_what_sumo_wrote_is_read_with_the_gaps_that_there_were(tmp_path: Path) -> None:
     flow = '<flow id="f" type="van" route="along" begin="0" end="20" period="4"/>'
     options = ["--fcd-output", "fcd.csv", "--fcd-output.max-leader-distance", "200"]

@@ -62,6 +62,9 @@ def test_words_say_what_everybody_gains() -> None:
     slower = replace(known, travel_time=between(2.0, 6.0))
     assert slower.words.startswith("travel time +4.0 [+2.0, +6.0] s (more delay)")
     assert "delay" not in replace(known, travel_time=between(-6.0, 1.0)).words  # it may be none
+    assert (
+        "delay" not in replace(known, people_delay=-40.0).words
+    )  # nobody has arrived yet: there is none to cut
     assert "flow -20 [-30, -10] veh/h: a loss" in replace(GOOD, flow=between(-30.0, -10.0)).words
     nowhere = Estimate(nan, nan, nan, 0)
     closed = replace(GOOD, travel_time=nowhere, speed=between(0.1, 0.3))

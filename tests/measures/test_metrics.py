@@ -340,7 +340,18 @@ def test_a_failed_episode_has_its_reason_and_no_metrics() -> None:
 
 def test_a_row_has_the_episode_what_was_drawn_and_every_metric() -> None:
     row = measure(episode_of(steady(4.0), seed=(7, 1)))
-    about = {"seed", "status", "reason", "error", "steps", "length", "floor", "lanes", "teleports", "drivable"}
+    about = {
+        "seed",
+        "status",
+        "reason",
+        "error",
+        "steps",
+        "length",
+        "floor",
+        "lanes",
+        "teleports",
+        "drivable",
+    }
     assert set(row) == about | set(METRICS)
     assert row["seed"] == [7, 1]
     assert row["length"] == LENGTH

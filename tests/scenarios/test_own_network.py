@@ -53,6 +53,7 @@ TIMES = '<time><begin value="30"/><end value="90"/><step-length value="0.2"/></t
         ({"begin": 50.0}, 0.2, 200),
         ({"begin": 40.0, "end": 70.0}, 0.2, 150),
         ({"end": 70.0, "horizon": 9}, 0.2, 9),
+        ({"begin": 40.0, "end": 70.0, "warmup": 50}, 0.2, 100),
     ],
 )
 def test_step_and_horizon_are_its_own_unless_said_otherwise(
@@ -87,6 +88,12 @@ def test_a_begin_after_the_end_that_the_configuration_names_needs_another_end(
 def test_an_end_before_the_begin_is_refused(times: dict[str, Any], tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"end: .* is not allowed; allowed: after begin"):
         own(tmp_path, TIMES, cav_share=0.1, **times)
+
+
+def test_sumo_is_told_the_begin_to_the_last_digit(tmp_path: Path) -> None:
+    road = own(tmp_path, cav_share=0.1, begin=1234567.5, end=1234667.5).draw(np.random.default_rng(0))
+    assert isinstance(road, OwnRoad)
+    assert float(road.files.options["begin"]) == 1234567.5
 
 
 def test_without_an_end_an_episode_is_an_hour(tmp_path: Path) -> None:

@@ -1,4 +1,5 @@
 import os
+import re
 from pathlib import Path
 from typing import Any
 
@@ -105,6 +106,10 @@ def test_merging_changes_neither_side() -> None:
         (
             {"policy.afterwards": True},
             "policy.afterwards: true is not allowed; allowed: false where rows are imagined",
+        ),
+        (
+            {"road.simulation_step": 0.0333},
+            "scenario ring.simulation_step: 0.0333 is not allowed; allowed: a whole number of milliseconds",
         ),
         ({"scenario": "merge", "world": "batch"}, "world: batch is not allowed; allowed: sumo, for merge"),
         (
@@ -221,3 +226,19 @@ def test_the_expert_is_made_as_named() -> None:
     assert load_config(changes={"expert": "pi:window=30"}).make_expert() == PISaturation(window=30)
     slow = load_config(changes={"road.steps_per_decision": 5}).make_expert()
     assert slow == PISaturation(time_step=0.5)
+
+
+@pytest.mark.parametrize(
+    ("changes", "name"),
+    [
+        ({"scenario": "figure-eight"}, "scenario: 'figure-eight'"),
+        ({"reward": "eq16"}, "reward: 'eq16'"),
+        ({"road.length": [230, 230]}, "road.length: [230, 230]"),
+    ],
+)
+def test_what_each_road_of_a_preset_says_otherwise_is_refused(changes: dict[str, Any], name: str) -> None:
+    with pytest.raises(
+        InputError, match=re.escape(f"{name} is not allowed; allowed: none with the preset rings")
+    ):
+        load_config(None, "rings", changes)
+    assert load_config(None, "rings", {"road.horizon": 200}).make_tasks()[0].scenario.horizon == 200

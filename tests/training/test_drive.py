@@ -245,6 +245,7 @@ def started(monkeypatch: pytest.MonkeyPatch) -> Callable[[], bool]:
         {"reward": "nowhere.py:gold"},
         {"episodes": 0},
         {"seed": -1},
+        {"seed": 999_999, "episodes": 2},
         {"seed": 3, "held_out": True},
         {"workers": -1},
     ],

@@ -26,8 +26,9 @@ def test_an_empty_folder_may_be_there(tmp_path: Path) -> None:
         {"evaluation__baselines": ["human", "nobody"]},
         {"expert": "none", "policy__observe": ["expert_memory"]},
         {"scenario": "merge", "road": {}, "policy__observe": ["local", "place"]},
+        {"scenario": "merge", "road": {}, "expert": "pacer"},
     ],
-    ids=["expert", "file of the expert", "reward", "baseline", "nothing to observe", "place where none is"],
+    ids=["expert", "file of it", "reward", "baseline", "nothing to observe", "no place", "expert of loops"],
 )
 def test_what_cannot_work_is_told_before_anything_is_written(tmp_path: Path, changes: dict[str, Any]) -> None:
     with pytest.raises(InputError) as caught:

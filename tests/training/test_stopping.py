@@ -30,7 +30,10 @@ from unjam.worlds.workers import Workers
 def test_patience_counts_validations_since_the_best(
     validations: list[float | None], patience: int, over: bool
 ) -> None:
-    rows = [{"return_validation": value, "return_expert": 11.0} for value in validations]
+    rows = [
+        {"iteration": number, "return_validation": value, "return_expert": 11.0}
+        for number, value in enumerate(validations, 1)
+    ]
     assert gave_up(small_config(evaluation__patience=patience), rows) is over
 
 
@@ -109,3 +112,27 @@ def test_without_tensorboard_a_line_says_so_before_anything_is_trained(
     with pytest.raises(MissingPartError, match=r"pip install 'unjam\[train\]'"):
         tensorboard_into(tmp_path)
     assert not list(tmp_path.iterdir())
+
+
+def test_who_has_converged_or_given_up_stays_so_when_it_is_resumed(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    returns = iter([5.0, 6.0, 5.5, 5.8, 9.0, 9.5])
+    monkeypatch.setattr(Trainer, "returns_of", lambda *given: [next(returns)])
+    for name, settings in (
+        ("gave up", {"evaluation__patience": 2}),
+        ("converged", {"evaluation__every": 0, "evaluation__converged": 1}),
+    ):
+        config, folder = small_config(steps=20 * STEPS, **settings), tmp_path / name
+        with Workers(1) as workers:
+            learn_with(workers, folder, config)
+            before = outcome(folder), len(read_progress(folder))
+            learn_with(workers, folder, config, resume=True)
+        assert (outcome(folder), len(read_progress(folder))) == before
+
+
+def test_a_validation_at_an_end_that_a_longer_run_would_not_make_counts_for_no_patience() -> None:
+    rows = [{"iteration": number, "return_expert": 10.0} for number in range(1, 5)]
+    for row, found in zip(rows, (None, 12.0, 11.0, 11.5), strict=True):
+        row["return_validation"] = found  # pyright: ignore[reportArgumentType]
+    assert not gave_up(small_config(evaluation__every=2, evaluation__patience=2), rows)

@@ -28,6 +28,7 @@ from unjam.worlds.episode import run_episode
 from unjam.worlds.sumo.simulation import Simulation
 
 RING = Ring(horizon=300)
+SHORT_RING = replace(RING, horizon=20)
 UNFILTERED = replace(RING, safety=SafetyFilter(active=False))
 RESIDUAL = ResidualDriver(PISaturation(), random_network(), 1.0)
 
@@ -395,3 +396,12 @@ def test_a_driver_cannot_change_how_it_is_measured(road: str, simulation: Simula
     driven = [run_episode(scenario, driver, (0,), simulation=simulation) for driver in (honest, insists)]
     assert driven[0].trajectories
     assert fingerprint(driven[0]) == fingerprint(driven[1])
+
+
+def test_a_seed_may_be_any_whole_number_from_zero_on(simulation: Simulation) -> None:
+    first, *others = (
+        run_episode(SHORT_RING, PISaturation(), seed, simulation=simulation) for seed in (3, np.int64(3), [3])
+    )
+    assert all(np.array_equal(first.speeds, other.speeds) for other in others)
+    with pytest.raises(InputError, match="seed: -1 is not allowed; allowed: >= 0"):
+        run_episode(SHORT_RING, PISaturation(), -1, simulation=simulation)

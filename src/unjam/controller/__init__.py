@@ -49,7 +49,8 @@ def make_driver(text: str, time_step: float) -> Driver:
     Raises:
         InputError: there is no such driver, or a parameter is wrong.
     """
-    parts = [] if os.path.exists(text) else _SEVERAL.split(text)
+    is_one = os.path.exists(text) or os.path.exists(text.rpartition(":")[0])
+    parts = [] if is_one else _SEVERAL.split(text)
     if len(parts) > 1:
         return Mixed(tuple(make_driver(part, time_step) for part in parts))
     if text.startswith(SHIPPED):

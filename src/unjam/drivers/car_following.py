@@ -4,6 +4,7 @@ from math import pi
 from typing import ClassVar
 
 import numpy as np
+from pydantic import model_validator
 from pydantic.dataclasses import dataclass
 
 from unjam.drivers.driver import Formula, Memory
@@ -65,6 +66,13 @@ class OVM(Formula):
     """h_go: gap from which on it is the largest [m]"""
     largest_speed: Positive = 30.0
     """v_max [m/s]"""
+
+    @model_validator(mode="after")
+    def _in_order(self) -> "OVM":
+        if self.go_gap <= self.stop_gap:
+            allowed = f"> stop_gap, {self.stop_gap:g}"
+            raise ValueError(f"go_gap: {self.go_gap:g} is not allowed; allowed: {allowed}")
+        return self
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
         """Return the acceleration towards the optimal speed; nothing is remembered."""

@@ -2,6 +2,7 @@
 
 from typing import ClassVar
 
+from pydantic import model_validator
 from pydantic.dataclasses import dataclass
 
 from unjam.drivers.driver import Formula, Memory
@@ -35,6 +36,13 @@ class FollowerStopper(Formula):
     """time over which the wanted speed is reached [s]; 0: one time step"""
     time_step: Positive = 0.1
     """time between two decisions [s]; set by the road"""
+
+    @model_validator(mode="after")
+    def _in_order(self) -> "FollowerStopper":
+        stop, follow, free = self.gaps
+        if not stop < follow < free:
+            raise ValueError(f"gaps: {list(self.gaps)} is not allowed; allowed: each larger than the last")
+        return self
 
     def initial_memory(self, n: int) -> Memory:
         """Return an empty window."""

@@ -3,6 +3,7 @@
 from typing import ClassVar, Literal
 
 import numpy as np
+from pydantic import model_validator
 from pydantic.dataclasses import dataclass
 
 from unjam.drivers.driver import Formula, Memory
@@ -47,6 +48,14 @@ class PISaturation(Formula):
     """commanded speed before the first step; Flow starts from zero"""
     time_step: Positive = 0.1
     """time between two decisions [s]; set by the road"""
+
+    @model_validator(mode="after")
+    def _in_order(self) -> "PISaturation":
+        if self.gap_upper <= self.gap_lower:
+            raise ValueError(
+                f"gap_upper: {self.gap_upper:g} is not allowed; allowed: > gap_lower, {self.gap_lower:g}"
+            )
+        return self
 
     def initial_memory(self, n: int) -> Memory:
         """Return an empty window and no command (NaN), or the command zero."""

@@ -107,7 +107,8 @@ def _highd(frame: pd.DataFrame, path: Path, reading: Reading) -> Recorded:
     On one of the two carriageways all drive towards smaller x: there places count the other way.
     """
     vehicles = _columns(frame, HIGHD, path)
-    onwards = vehicles["speed"] >= 0
+    # Of a whole lane: who stands has no direction.
+    onwards = vehicles.groupby("lane")["speed"].transform("sum").to_numpy() >= 0
     front = (vehicles["front"] + vehicles["length"]).where(onwards, -vehicles["front"])
     moving = {"front": front, "speed": vehicles["speed"].abs(), "time": vehicles["time"] / HIGHD_RATE}
     return _behind_leaders(vehicles.assign(place=path.stem, **moving), path, reading)

@@ -16,7 +16,7 @@ import torch
 
 from unjam.drivers.network import Network
 from unjam.drivers.observation import observation_size
-from unjam.errors import UnjamError
+from unjam.errors import InputError, UnjamError
 from unjam.learners.experience import Experience, experience_of, join
 from unjam.learners.imagination import AsExperience, Imagination, RowImagination
 from unjam.learners.learner import AgentSpec, Learner, Tensors, Update, make_learner, policy_distance, under
@@ -222,6 +222,8 @@ def experience_on(training: Training, index: int, episodes: Sequence[Episode]) -
     """Return the experience of episodes of task `index`."""
     policy, scenario = training.policy, training.tasks[index].scenario
     pairs = [(episode, trajectory) for episode in episodes for trajectory in episode.trajectories]
+    if not pairs:
+        raise InputError(f"no CAV was on the road in {len(episodes)} episodes: let more vehicles be CAVs")
     drawn = np.array([scenario.drawn_scaled(episode.drawn) for episode, _ in pairs])
     extra, later = seen_by_critic(training.tasks, policy, index, drawn), None
     if policy.afterwards:

@@ -6,6 +6,7 @@ able to drive so; and people must not brake hard more often than where they are 
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from math import nan
 from typing import Any
 
 from unjam.measures.drivable import DRIVABLE, drivable_in_all
@@ -50,8 +51,8 @@ class Effect:
 
     @property
     def delay_cut(self) -> Estimate:
-        """Share of people's delay that is saved; NaN where that is not known."""
-        time, whole = self.travel_time, -self.people_delay
+        """Share of people's delay that is saved; NaN where that is not known, or where they have none."""
+        time, whole = self.travel_time, -self.people_delay if self.people_delay > 0 else nan
         return Estimate(time.mean / whole, time.high / whole, time.low / whole, time.count)
 
     @property

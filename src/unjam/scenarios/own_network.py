@@ -90,7 +90,7 @@ class OwnNetwork(Scenario):
         if self.begin is not None:
             # The horizon ends an episode; SUMO would refuse an end of the configuration that is earlier.
             options = {name: value for name, value in files.options.items() if name != "end"}
-            files = files._replace(begin=self.begin, options={**options, "begin": f"{self.begin:g}"})
+            files = files._replace(begin=self.begin, options={**options, "begin": str(self.begin)})
         cav_seed = int(generator.integers(2**31))
         drivers = self.calibrated.draw(DRAWN, generator) if self.calibrated else ()
         return OwnRoad(
@@ -149,9 +149,10 @@ def own_network(file: str, changes: dict[str, Any]) -> OwnNetwork:
         return made
     begin = files.begin if made.begin is None else made.begin
     end = made.end or (begin + LONGEST if files.end is None else files.end)
-    if end <= begin:
-        raise wrong("end", end, f"after begin, {begin:g} s")
-    return replace(made, horizon=max(1, int((end - begin) / made.decision_step + 1e-9)))
+    driven = end - begin - made.warmup * made.simulation_step
+    if driven <= 0:
+        raise wrong("end", end, f"after begin, {begin:g} s" + (" and the warm-up" if made.warmup else ""))
+    return replace(made, horizon=max(1, int(driven / made.decision_step + 1e-9)))
 
 
 @cache

@@ -7,7 +7,7 @@ from math import inf
 from typing import Annotated, ClassVar, Literal, Self
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 from pydantic.dataclasses import dataclass
 
 from unjam.drivers.command import Limits
@@ -86,6 +86,13 @@ class CruiseControl:
         return xp.where(held, found, 0.0 * found + inf)
 
 
+def in_milliseconds(step: float) -> float:
+    """Return a step [s]; raise `ValueError` where it is none of SUMO's, which counts milliseconds."""
+    if abs(1000.0 * step - round(1000.0 * step)) > 1e-9:
+        raise ValueError("a whole number of milliseconds, as SUMO counts")
+    return step
+
+
 @dataclass(frozen=True, config=STRICT)
 class Scenario:
     """What all scenarios share; each kind of road adds its own."""
@@ -102,7 +109,7 @@ class Scenario:
     people_gap: ClassVar[float] = 0.0
     """gap that SUMO keeps for commanded people [m]"""
 
-    simulation_step: Positive = 0.1
+    simulation_step: Annotated[Positive, AfterValidator(in_milliseconds)] = 0.1
     """time step of SUMO [s]"""
     steps_per_decision: Count = 1
     """simulation steps for which one command holds"""

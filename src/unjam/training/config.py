@@ -1,6 +1,7 @@
 """Everything that decides what a training run does: one validated configuration, as TOML and flags."""
 
 import os
+from collections.abc import Sequence
 from dataclasses import asdict, field, replace
 from math import ceil
 from pathlib import Path
@@ -14,9 +15,9 @@ from unjam.drivers.car_following import Constant
 from unjam.drivers.driver import Driver
 from unjam.drivers.observation import observed
 from unjam.drivers.wrappers import Remembering
-from unjam.errors import InputError
+from unjam.errors import InputError, wrong
 from unjam.learners.settings import Agents, PolicySettings
-from unjam.parameters import STRICT, Count, CountOrNone, Positive, build, changed, nested, parse_toml
+from unjam.parameters import STRICT, Count, CountOrNone, Positive, build, changed, flat, nested, parse_toml
 from unjam.scenarios import make_scenario
 from unjam.scenarios.scenario import Scenario
 from unjam.training.presets import preset_values
@@ -217,8 +218,19 @@ def load_config(
     values: dict[str, Any] = {}
     if preset:
         started = preset_values(preset, str(given.get("scenario", RunConfig.scenario)))
+        if "tasks" in started and "tasks" not in given:
+            _check_heeded(preset, started["tasks"], given)
         values = {**started, "preset": preset}
     return build(RunConfig, changed(values, given), "")
+
+
+def _check_heeded(preset: str, tasks: Sequence[dict[str, Any]], given: dict[str, Any]) -> None:
+    """Raise `InputError` where the user says what every task of a preset says otherwise."""
+    said = {name: value for name, value in given.items() if name in ("scenario", "reward")}
+    said |= {f"road.{name}": value for name, value in given.get("road", {}).items()}
+    for name, value in said.items():
+        if all(flat(task).get(name, "") not in ("", value) for task in tasks):
+            raise wrong(name, value, f"none with the preset {preset}, whose roads have their own")
 
 
 def read_toml(path: Path) -> dict[str, Any]:

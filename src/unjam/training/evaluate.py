@@ -29,7 +29,7 @@ from unjam.scenarios.scenario import Scenario
 from unjam.training.config import RunConfig
 from unjam.training.drive_result import DriveResult, Rows, frame_of_rows
 from unjam.training.folder import new_and_owned
-from unjam.training.seeds import held_out_seeds
+from unjam.training.seeds import TRAINING_BELOW, held_out_seeds
 from unjam.worlds.episode import can_drive, run_episode
 from unjam.worlds.record import Episode
 from unjam.worlds.reward import make_reward
@@ -289,6 +289,8 @@ def drive(
     for name, number, least in (("episodes", episodes, 1), ("seed", seed, 0), ("workers", workers, 1)):
         if number is not None and number < least:
             raise wrong(name, number, f">= {least}")
+    if seed + episodes > TRAINING_BELOW:
+        raise wrong("seed", seed, f"<= {TRAINING_BELOW - episodes}: those above choose or judge")
     if held_out and seed:
         raise wrong("seed", seed, "none with held-out seeds")
     made = make_scenario(scenario, road)

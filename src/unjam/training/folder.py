@@ -40,7 +40,7 @@ from unjam.kernels import kernels
 from unjam.parameters import build, flat
 from unjam.scenarios.own_network import OwnNetwork
 from unjam.sumo_files import read_sumo_files
-from unjam.worlds.episode import Task
+from unjam.worlds.episode import Task, check_driver
 
 FORMAT = 4
 """of what a checkpoint holds; one of another unjam is refused"""
@@ -62,7 +62,9 @@ def check_possible(config: RunConfig) -> None:
                 raise InputError(f"policy.observe: {name!r} is not allowed on {scenario.title}")
             if needs == "coordinate" and not scenario.has_coordinate:
                 raise InputError(f"policy.observe: {name!r} is not allowed on a network of one's own")
-        observation_size(road.policy.observe, road.make_expert())
+        expert = road.make_expert()
+        check_driver(expert, scenario)
+        observation_size(road.policy.observe, expert)
         make_reward(road.reward or scenario.reward)
         for name in road.evaluation.baselines:
             make_driver(name, scenario.decision_step)
@@ -204,12 +206,19 @@ def has_converged(config: RunConfig, progress: Sequence[dict[str, Any]]) -> bool
 
 def gave_up(config: RunConfig, progress: Sequence[dict[str, Any]]) -> bool:
     """Return whether so many validations in a row found nothing better that `evaluation.patience` is over."""
-    found = [value for row in progress if (value := row.get("return_validation")) is not None]
+    every = config.evaluation.every
+    scheduled = [row for row in progress if every and row["iteration"] % every == 0]  # and none at an end
+    found = [value for row in scheduled if (value := row.get("return_validation")) is not None]
     if not config.evaluation.patience or not found:
         return False
     best = max(range(len(found)), key=found.__getitem__)
     since = len(found) - 1 - best if found[best] > progress[0]["return_expert"] else len(found)
     return since >= config.evaluation.patience
+
+
+def ends_early(config: RunConfig, progress: Sequence[dict[str, Any]]) -> bool:
+    """Return whether a training ends before its steps are made, as its settings say."""
+    return gave_up(config, progress) or has_converged(config, progress)
 
 
 def last_state(

@@ -14,7 +14,7 @@ from unjam.parameters import flat
 from unjam.processes import is_owned, owned
 from unjam.reports.results import EVALUATION_FILE, damaged, read_about, read_progress
 from unjam.training.config import RunConfig
-from unjam.training.folder import MANIFEST, gave_up, read_config
+from unjam.training.folder import MANIFEST, ends_early, read_config
 
 State = Literal["running", "finished", "stopped"]
 
@@ -84,7 +84,7 @@ def read_run(folder: Path, name: str = "") -> Run:
     except DAMAGED as error:
         raise damaged(folder, error) from None
     judged = all((folder / road / EVALUATION_FILE).is_file() for road in gains)
-    over = steps >= config.steps or gave_up(config, progress)
+    over = steps >= config.steps or ends_early(config, progress)
     done: State = "finished" if judged and over else "stopped"
     return Run(name or str(folder), folder, config, "running" if is_owned(folder) else done, steps, gains)
 

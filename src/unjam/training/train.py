@@ -33,8 +33,7 @@ from unjam.training.folder import (
     belonging,
     check_possible,
     continue_folder,
-    gave_up,
-    has_converged,
+    ends_early,
     last_state,
     make_new_folder,
     note_lineage,
@@ -189,10 +188,11 @@ class Trainer:
         self._validation_best, self._expert_returns = -np.inf, [float("nan")] * len(self.tasks)
         self._sampler = Sampler(self.tasks, config.sampling, self._expert_returns)
         self._controllers = KeptControllers(self.folders)
-        self._belongs = belonging(config)
+        self._belongs, self._ended_early = belonging(config), False
         if checkpoint := last_state(folder, {folder, *self.folders}, self._belongs):
             state, tensors = checkpoint
-            self._controllers.restore(tensors, state["actual_steps"] >= config.steps)
+            self._ended_early = ends_early(config, read_progress(folder))
+            self._controllers.restore(tensors, self._ended_early or state["actual_steps"] >= config.steps)
             self.training.restore(state, tensors)
             self._validation_best = state["validation_best"]
             self._expert_returns = state["expert_returns"]
@@ -210,7 +210,8 @@ class Trainer:
             self._sampler.reached = self._expert_returns
             self._keep_controllers(self.training.learner.network(), best=True)
             self._validation_best = self._sampler.mean(self._expert_returns)
-        algorithm_1(self.training, self.config.steps, self.collect, self.validate, self.write)
+        if not self._ended_early:
+            algorithm_1(self.training, self.config.steps, self.collect, self.validate, self.write)
 
     def drivers(self, network: Network) -> list[Driver]:
         """Return the full policy on each road: its expert plus this residual."""
@@ -266,6 +267,9 @@ class Trainer:
                 },
             }
         append_line(self.folder / PROGRESS, to_json(whole))
+        early = ends_early(self.config, read_progress(self.folder))
+        if early and validated is None:
+            self.validate(iteration, ended=True)
         counters, tensors = self.training.state()
         state = {
             **counters,
@@ -275,11 +279,10 @@ class Trainer:
             "sampler": self._sampler.state(),
         }
         save_checkpoint(self.folder / "checkpoint", state, {**tensors, **self._controllers.tensors()})
-        stopped, progress = self._on_iteration(whole) is False, read_progress(self.folder)
-        stopped = stopped or gave_up(self.config, progress) or has_converged(self.config, progress)
-        if stopped and validated is None:
+        stopped = self._on_iteration(whole) is False
+        if stopped and validated is None and not early:
             self.validate(iteration, ended=True)
-        return stopped
+        return stopped or early
 
     def returns_of(self, drivers: Sequence[Driver]) -> list[float]:
         """Return the mean return on the validation seeds, by road, each driven by its own of `drivers`."""

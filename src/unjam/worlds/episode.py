@@ -2,10 +2,14 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from operator import index
+from typing import SupportsIndex
+
+import numpy as np
 
 from unjam.drivers.driver import Driver
 from unjam.drivers.from_file import DriverLike, as_driver
-from unjam.errors import InputError
+from unjam.errors import InputError, wrong
 from unjam.scenarios.scenario import Scenario
 from unjam.worlds.drive import drive
 from unjam.worlds.earned import earned
@@ -35,7 +39,7 @@ class Task:
 def run_episode(
     scenario: Scenario,
     driver: DriverLike,
-    seed: int | Sequence[int],
+    seed: SupportsIndex | Sequence[int],
     reward: str = "",
     explore: float = 0.0,
     full: bool = False,
@@ -63,9 +67,8 @@ def run_episode(
         InputError: driver or reward answer something that is not finite, or of a wrong shape.
         EpisodeError: SUMO cannot run the scenario.
     """
-    driver, seed = as_driver(driver), (seed,) if isinstance(seed, int) else seed
-    if not can_drive(driver, scenario):
-        raise InputError(f"driver: it is not allowed on {scenario.title}: it needs a closed road")
+    driver, seed = as_driver(driver), as_seed(seed)
+    check_driver(driver, scenario)
     paid = make_reward(reward or scenario.reward)
     if simulation is None:
         with simulation_for(scenario) as simulation:
@@ -75,6 +78,20 @@ def run_episode(
     if traffic.entered == 0 and not driver.native:
         raise InputError(f"no CAV was on the road in {episode.steps} decisions: let more vehicles be CAVs")
     return rewarded(episode, paid)
+
+
+def as_seed(seed: SupportsIndex | Sequence[int]) -> tuple[int, ...]:
+    """Return a seed's integers; raise `InputError` where one is negative."""
+    found = tuple(map(int, seed)) if isinstance(seed, Sequence | np.ndarray) else (index(seed),)
+    if min(found, default=0) < 0:
+        raise wrong("seed", seed, ">= 0")
+    return found
+
+
+def check_driver(driver: Driver, scenario: Scenario) -> None:
+    """Raise `InputError` where a driver cannot drive on a scenario's road."""
+    if not can_drive(driver, scenario):
+        raise InputError(f"driver: it is not allowed on {scenario.title}: it needs a closed road")
 
 
 def can_drive(driver: Driver, scenario: Scenario) -> bool:

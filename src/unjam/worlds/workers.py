@@ -18,6 +18,7 @@ from unjam.processes import PrivateFolder, bound, sweep_private_folders
 from unjam.scenarios import scenario_recipe
 from unjam.scenarios.own_network import OwnNetwork
 from unjam.scenarios.scenario import Scenario
+from unjam.sumo_files import LONGEST_TIME
 from unjam.tree import Arrays, unpack
 from unjam.worlds.messages import read_message, write_message
 from unjam.worlds.record import Episode, failed_episode
@@ -176,10 +177,13 @@ class _Worker:
             if self._stopped:
                 raise _WorkerLost("stopped")
             process = self._process = self._process or self._start()
+        # A network of the user's own is read, and loaded, before there is anything to tell.
+        patience = self._silence + (LONGEST_TIME if self._confined else 0.0)
         try:
             self._send(process, task)
             while True:
-                message = self._messages.get(timeout=self._silence)
+                message = self._messages.get(timeout=patience)
+                patience = self._silence
                 if message is None:
                     raise _WorkerLost(self._why(process))
                 facts, arrays = message
@@ -188,7 +192,7 @@ class _Worker:
                 progress(facts["progress"])
         except queue.Empty:
             self._kill()
-            raise _WorkerLost(f"no sign of life for {self._silence:g} s") from None
+            raise _WorkerLost(f"no sign of life for {patience:g} s") from None
         except BrokenPipeError:
             raise _WorkerLost(self._why(process)) from None
 

@@ -355,6 +355,7 @@ def test_nobody_enters_before_the_time_or_without_room() -> None:
 REFUSED: dict[str, dict[str, Any]] = {
     "actuation": {"actuation": "shielded"},
     "simulation_step": {"simulation_step": 0.25, "steps_per_decision": 4},
+    "warmup": {"warmup": 100},
     "roadside.loss": {"roadside": replace(SHORT.roadside, loss=0.1)},
     "sensors": {"actuator": replace(SHORT.actuator, lag=0.3)},
 }

@@ -266,3 +266,10 @@ def test_a_network_that_a_full_disk_cut_short_is_not_kept(
             network_file(road_of(230))
     assert files_in(cache) == {cache / "networks"}
     assert len(edges_of(network_file(road_of(230)))) == 4
+
+
+def test_what_another_process_removes_meanwhile_disturbs_nobody(cache: Path) -> None:
+    networks = cache / "networks"
+    networks.mkdir(parents=True, exist_ok=True)
+    (networks / "tmpgone").symlink_to("nowhere")  # it is listed, and is not there
+    assert network_file(road_of(230)).is_file()

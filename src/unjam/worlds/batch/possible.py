@@ -58,6 +58,8 @@ def _why_not_on_ramp(scenario: OnRamp) -> str:
         return f"simulation_step: {scenario.simulation_step:g} s; allowed: {MOTORWAY_STEP:g} s"
     if not scenario.sensors.exact or not scenario.actuator.instant:
         return "sensors and actuator: CAVs misread, or obey late; allowed: exact ones that obey at once"
+    if scenario.warmup > 0:
+        return f"warmup: {scenario.warmup}; allowed: 0"
     if scenario.roadside.loss > 0:
         return f"roadside.loss: {scenario.roadside.loss:g}; allowed: 0"
     return ""

@@ -102,7 +102,7 @@ class ClosedTraffic(Traffic[ClosedRoad]):
         """Return where the front bumpers of all vehicles are now along the road, not wrapped [m]."""
         return self.road.start_positions + np.array(self._simulation.distances(self.road.vehicle_ids))
 
-    def _state(self) -> LocalState:
+    def exact_state(self) -> LocalState:
         """Return what exact sensors of the CAVs would read now."""
         near = self._near_positions
         if self.single:

@@ -144,5 +144,7 @@ class MotorwayTraffic(LaneTraffic[MotorwayRoad]):
 
     def _pictured(self, columns: NDArray[np.intp]) -> dict[str, Any]:
         lanes = {"lanes": self._log.pictures("lanes", columns), "lane_names": self.road.ways[::-1]}
-        road = {"peak": self.road.peak, "free_time": self.road.free_time}
+        before = self.scenario.warmup * self.scenario.simulation_step
+        begin, end = (max(0.0, moment - before) for moment in self.road.peak)
+        road = {"peak": (begin, end), "free_time": self.road.free_time}
         return {**super()._pictured(columns), **road, **lanes}

@@ -89,8 +89,9 @@ def network_file(network: RoadNetwork) -> Path:
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         for left in target.parent.glob("tmp*"):  # by processes that were killed meanwhile
-            if time.time() - left.stat().st_mtime > LONG_AGO:
-                shutil.rmtree(left, ignore_errors=True)
+            with suppress(FileNotFoundError):  # another process has just removed it
+                if time.time() - left.stat().st_mtime > LONG_AGO:
+                    shutil.rmtree(left, ignore_errors=True)
         with tempfile.TemporaryDirectory(dir=target.parent) as folder:
             made = _netconvert(files, options, Path(folder))
             with made.open("ab") as file:

@@ -125,7 +125,7 @@ class OpenTraffic(Traffic[OpenKind]):
         """How many want to enter now and cannot."""
         return self._log_waiting[-1]
 
-    def _state(self) -> LocalState:
+    def exact_state(self) -> LocalState:
         """Return what exact sensors of the CAVs would read now."""
         return self._stays.states[-1].read_only()
 

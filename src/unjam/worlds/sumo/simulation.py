@@ -14,7 +14,7 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from unjam.errors import EpisodeError, UnjamError
+from unjam.errors import EpisodeError, UnjamError, wrong
 from unjam.processes import PrivateFolder
 from unjam.sandbox import keep_disk
 from unjam.scenarios.scenario import Actuation
@@ -78,6 +78,8 @@ class Simulation:
         self._gui_options = gui_options
         self._sumo: Any = library(backend)
         self._folder = PrivateFolder()
+        if "," in self._folder.name:  # between the names of files that SUMO is given
+            raise wrong("TMPDIR", self._folder.name, "a folder without , in its name")
         self._error_log = Path(self._folder.name) / "error.log"
         self._copies: dict[Path, tuple[tuple[int, int] | None, Path]] = {}
         """of users' own files, with the stamps of those"""

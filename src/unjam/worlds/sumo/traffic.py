@@ -129,12 +129,12 @@ class Traffic(World[Episode], Generic[RoadKind]):
     def perceive(self) -> LocalState:
         """Return what the CAVs perceive now: arrays of shape (CAVs,), or plain numbers of a single one."""
         if self._readings is None:
-            return self._state()
+            return self.exact_state()
         if self._perceived is None or self._perceived[0] != self.decisions:
-            self._perceived = self.decisions, self._readings.of_driver(self.cavs, self._state())
+            self._perceived = self.decisions, self._readings.of_driver(self.cavs, self.exact_state())
         return self._perceived[1]
 
-    def _state(self) -> LocalState:
+    def exact_state(self) -> LocalState:
         """Return what exact sensors of the CAVs would read now."""
         raise NotImplementedError
 
