@@ -51,8 +51,11 @@ def test_builds_nested_parameters() -> None:
     ("values", "line"),
     [
         ({}, "here.needed: missing"),
-        ({"needed": 1, "other": 2}, "here.other: unknown name"),
-        ({"needed": 1, "inner": {"other": 2}}, "here.inner.other: unknown name"),
+        (
+            {"needed": 1, "other": 2},
+            "here.other: unknown name; allowed: extra, inner, names, needed, positive, share",
+        ),
+        ({"needed": 1, "inner": {"other": 2}}, "here.inner.other: unknown name; allowed: size"),
         (
             {"needed": "x"},
             "here.needed: 'x' is not allowed; allowed: a valid number, unable to parse string as a number",

@@ -77,7 +77,9 @@ def one_line(error: ValidationError, field: str, kind: Any) -> str:
     name = ".".join([field, *(str(part) for part in problem["loc"])]).strip(".")
     if problem["type"] in ("unexpected_keyword_argument", "extra_forbidden"):
         *path, last = problem["loc"]
-        return f"{name}: unknown name{did_you_mean(last, _names_at(kind, path))}"
+        names = _names_at(kind, path)
+        allowed = f"; allowed: {', '.join(sorted(names))}" if names else ""
+        return f"{name}: unknown name{did_you_mean(last, names) or allowed}"
     if problem["type"] == "missing":
         return f"{name}: missing"
     names_itself = not problem["loc"] or " is not allowed; allowed: " in problem["msg"]

@@ -16,7 +16,7 @@ from unjam.measures.effect import Judged, headline, recommended
 from unjam.measures.metrics import METRICS
 from unjam.measures.statistics import Estimate
 from unjam.reports.assessment import ASSESSMENT_FILE, effects, render_assessment, write_assessment
-from unjam.scenarios import Ring, scenario_recipe
+from unjam.scenarios import OnRamp, Ring, scenario_recipe
 from unjam.training.evaluate import Evaluation, save_evaluation
 from unjam.worlds.record import Episode
 
@@ -85,6 +85,19 @@ def test_the_page_leads_with_the_words_of_the_rule(page: str) -> None:
     assert HELPS.words in page
     assert "max_acceleration=2.5,b=&lt;2&gt;: not recommended, for travel time is longer" in page
     assert "The CAVs are those recommended." in page
+
+
+def test_the_page_says_that_cavs_have_accs_of_their_own_where_they_have(tmp_path: Path, page: str) -> None:
+    assert "an ACC of its own" not in page
+    folder = folder_of(tmp_path, [HELPS])
+    found = json.loads((folder / ASSESSMENT_FILE).read_text())
+    found["road"] = scenario_recipe(OnRamp())
+    (folder / ASSESSMENT_FILE).write_text(json.dumps(found, default=float).replace("NaN", "null"))
+    said = " ".join(render_assessment(folder).split())
+    assert (
+        "Each has an ACC of its own that follows, with a time headway of 1.1 s and at most 2.5 m/s²" in said
+    )
+    assert "There is no safety filter." in said
 
 
 def test_the_tables_have_people_as_they_are_and_cavs_beside_them(page: str) -> None:

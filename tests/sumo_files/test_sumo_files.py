@@ -47,6 +47,14 @@ def test_files_times_and_types_are_what_the_configuration_says(tmp_path: Path) -
     assert found.used_types == {"car"}
 
 
+def test_names_of_files_may_have_spaces(tmp_path: Path) -> None:
+    path = configuration(tmp_path)
+    (tmp_path / "road.rou.xml").rename(tmp_path / "my road.rou.xml")
+    (tmp_path / "other.rou.xml").write_text("<routes/>")
+    path.write_text(path.read_text().replace("road.rou.xml", "my road.rou.xml, other.rou.xml"))
+    assert read_sumo_files(path).route_files == (tmp_path / "my road.rou.xml", tmp_path / "other.rou.xml")
+
+
 def test_what_a_configuration_does_not_say_is_as_sumo_has_it(tmp_path: Path) -> None:
     found = read_sumo_files(configuration(tmp_path))
     assert (found.begin, found.end, found.step, found.additional_files) == (0.0, None, 1.0, ())

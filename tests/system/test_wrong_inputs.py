@@ -86,6 +86,7 @@ WRONG: dict[str, tuple[str, list[str]]] = {
     "evaluating what is no run": ("not a run folder", ["evaluate full"]),
     "virtual environment of what is no run": ("not a run folder", ["model full"]),
     "virtual environment of a run without one": ("has no virtual environment", ["model model-free"]),
+    "report of no folder": ("report: 'nowhere' is not a folder", ["report nowhere"]),
     "report of nothing": ("has no evaluation.json", ["report full"]),
     "report of damaged results": ("damaged", ["report damaged"]),
     "share above one": ("cav_share: 2", ["drive merge --driver pi --set cav_share=2"]),

@@ -69,7 +69,13 @@ def test_merging_changes_neither_side() -> None:
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"sed": 1}, "sed: unknown name"),
+        ({"sed": 1}, "sed: unknown name; did you mean 'seed'?"),
+        ({"horizon": 100}, "horizon: unknown name; did you mean 'road.horizon'?"),
+        ({"length": 230}, "length: unknown name; did you mean 'road.length'?"),
+        (
+            {"evaluation.nope": 1},
+            "evaluation.nope: unknown name; allowed: baselines, converged, episodes, every",
+        ),
         ({"trpo.gama": 0.9}, "trpo.gama: unknown name"),
         ({"evaluation.evry": 1}, "evaluation.evry: unknown name"),
         ({"trpo.gamma": 1.5}, "trpo.gamma: 1.5 is not allowed; allowed: less than 1"),

@@ -231,6 +231,12 @@ def test_a_run_that_goes_on_with_a_larger_budget_ends_as_one_in_one_go(
     assert outcome(folder) == outcome(uninterrupted)
 
 
+def test_a_run_does_not_go_back_to_fewer_steps_than_are_made(tmp_path: Path, learn: Learn) -> None:
+    learn(tmp_path / "run", small_config(steps=2 * STEPS))
+    with pytest.raises(InputError, match=f"steps: {STEPS} is not allowed; allowed: >= {2 * STEPS}, which"):
+        continue_folder(tmp_path / "run", small_config(steps=STEPS))
+
+
 @pytest.mark.slow
 def test_validating_at_the_end_of_a_smaller_budget_does_not_change_what_is_learned(
     tmp_path: Path, learn: Learn

@@ -8,7 +8,7 @@ import pytest
 from tests.training.test_run import STEPS, controller_manifest, learn_with, outcome, small_config
 from unjam.errors import MissingPartError
 from unjam.reports.results import read_progress
-from unjam.training.folder import gave_up, has_converged
+from unjam.training.stopping import gave_up, has_converged
 from unjam.training.tensorboard import FOLDER, tensorboard_into
 from unjam.training.train import Trainer
 from unjam.worlds.workers import Workers
@@ -95,7 +95,7 @@ def test_what_a_callback_ended_goes_on_as_if_it_never_had(tmp_path: Path) -> Non
 
 def test_tensorboard_has_every_number_at_its_actual_step(tmp_path: Path) -> None:
     events = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
-    write = tensorboard_into(tmp_path)
+    write = tensorboard_into(str(tmp_path))
     for step in (300, 600):
         row: dict[str, Any] = {"iteration": step // 300, "actual_steps": step, "return_mean": step / 10}
         write({**row, "return_validation": None, "learner": {"kl": 0.5}, "seconds": {"actual": 1}})

@@ -82,7 +82,7 @@ def test_a_tuning_that_was_stopped_goes_on_where_it_was(
         assert (found.settings, found.best, found.default) == (whole.settings, whole.best, whole.default)
         assert driven == [EPISODES, EPISODES, (FINALISTS - 1 + 1) * 2 * EPISODES]  # the last two, finalists
         assert len(json.loads((folder / TUNED).read_text())["manifest"]["starts"]) == 2
-        with pytest.raises(InputError, match="is of another tuning"):
+        with pytest.raises(InputError, match="was made with other settings"):
             tune({"ring": SMALL}, "pi", SPACE, STEPS, folder, workers, seed=1)
     assert tune({"ring": SMALL}, "pi", SPACE, STEPS, folder, workers).best == whole.best  # nobody drives
 

@@ -194,7 +194,7 @@ def after_training(folder: Path, gain: "Estimate | None", steps: int, run: Path)
     if gain is not None and not gain.low > 0:
         say_next("no gain is shown; train longer", "train", "--resume", run, "--steps", 2 * steps)
     else:
-        say_next("ship it", "export", folder, "--to", f"{folder.name}.unjam")
+        say_next("export it" if gain is None else "ship it", "export", folder, "--to", f"{folder.name}.unjam")
 
 
 @contextmanager

@@ -127,7 +127,7 @@ def report(
     folders: Annotated[list[Path], typer.Argument(help="Folders of results: of training runs, or of drive.")],
     out: Annotated[
         Path | None,
-        typer.Option("--out", help="The page to write.", show_default="report.html in the folder"),
+        typer.Option("--out", help="The page.", show_default="report.html in it, or comparison.html here"),
     ] = None,
     json: JsonOption = False,
 ) -> None:
@@ -141,6 +141,9 @@ def report(
     """
     from matplotlib import get_cachedir
 
+    for folder in folders:
+        if not folder.is_dir():
+            raise InputError(f"report: {str(folder)!r} is not a folder; allowed: one with results")
     target = out or (folders[0] / "report.html" if len(folders) == 1 else Path("comparison.html"))
     go_on_limited(f"report: {', '.join(map(str, folders))}", target.absolute().parent, Path(get_cachedir()))
     from unjam.reports.html import write_report

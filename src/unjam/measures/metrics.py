@@ -1,9 +1,8 @@
 """What is measured of an episode. Each metric is defined here, once, with its unit and source."""
 
-import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from math import inf
+from math import inf, prod
 from typing import Any, Literal
 
 import numpy as np
@@ -56,7 +55,7 @@ def _over_cavs(values: Sequence[Any]) -> float:
 
 def _parts(speeds: Floats) -> Iterator[Floats]:
     """Return moments part by part: of hours of traffic there is no copy."""
-    rows = max(1, CELLS_AT_ONCE // max(1, math.prod(speeds.shape[1:])))
+    rows = max(1, CELLS_AT_ONCE // max(1, prod(speeds.shape[1:])))
     return (speeds[start : start + rows] for start in range(0, len(speeds), rows))
 
 

@@ -119,7 +119,7 @@ def lead_of(result: Results) -> str:
 
 
 def _words_of(effect: Effect, verdict: str) -> str:
-    """Return what everybody on the road gains, and whether a car could drive so; `verdict` is that beside people."""
+    """Return what everybody on the road gains, and whether a car could drive so, as `verdict` says, too."""
     able = "; a car could drive so" + ("" if verdict == DRIVABLE else f", but {verdict}")
     safe = {"": "", DRIVABLE: able}
     return effect.words + safe.get(effect.drivable, f"; no car could drive so: {effect.drivable}")

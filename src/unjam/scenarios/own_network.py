@@ -76,7 +76,9 @@ class OwnNetwork(Scenario):
                 raise ValueError(f"cav_types: no vehicle has the type {name!r}; allowed: {known}")
         if not self.cav_types:
             if self.cav_share == 0:
-                raise ValueError("cav_share: 0.0 is not allowed without cav_types; allowed: > 0, <= 1")
+                raise ValueError(
+                    "cav_share: 0.0 is not allowed without cav_types; allowed: > 0, <= 1, as --cav-share 0.1"
+                )
             if not any(is_car(files.types.get(name, {})) for name in files.used_types):
                 raise ValueError(f"cav_share: no vehicle is a car; its types are {known}; name cav_types")
         self.check_people_are_native("on your own network")

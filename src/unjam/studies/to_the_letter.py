@@ -19,7 +19,7 @@ from unjam.measures.table import cell_of
 from unjam.studies.comparison import comparison_of
 from unjam.studies.study import LAST_SHARE, VARIANTS, Study, StudyFolder, Table, TrainedRun, read_part
 from unjam.training.config import load_config
-from unjam.training.folder import has_converged
+from unjam.training.stopping import has_converged
 
 VARIANTS_OF = {
     "ring": ("trpo-exact", "proposed-exact"),

@@ -74,7 +74,7 @@ def _configuration(path: Path) -> dict[str, Any]:
         raise Broken(f"{path.name}: names no net-file")
     network = path.parent / options["net-file"]
     additional, routes = (
-        [path.parent / name for name in options.get(files, "").replace(",", " ").split()]
+        [path.parent / name.strip() for name in options.get(files, "").split(",") if name.strip()]
         for files in ("additional-files", "route-files")
     )
     files = [path, network, *additional, *routes]

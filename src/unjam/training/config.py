@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Sequence
-from dataclasses import asdict, field, replace
+from dataclasses import asdict, field, fields, replace
 from math import ceil
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -18,7 +18,7 @@ from unjam.drivers.wrappers import Remembering
 from unjam.errors import InputError, wrong
 from unjam.learners.settings import Agents, PolicySettings
 from unjam.parameters import STRICT, Count, CountOrNone, Positive, build, changed, flat, nested, parse_toml
-from unjam.scenarios import make_scenario
+from unjam.scenarios import SCENARIOS, make_scenario
 from unjam.scenarios.scenario import Scenario
 from unjam.training.presets import preset_values
 from unjam.training.sampling import Sampling, episodes_of_iteration, shares_by_weight
@@ -216,6 +216,10 @@ def load_config(
         check_values(f"config file {file}", read)
     given = changed(read, nested(changes or {}))
     values: dict[str, Any] = {}
+    road = SCENARIOS.get(str(given.get("scenario", RunConfig.scenario)), Scenario)
+    for name in given.keys() - {each.name for each in fields(RunConfig)}:
+        if hasattr(road, name):
+            raise InputError(f"{name}: unknown name; did you mean 'road.{name}'?")
     if preset:
         started = preset_values(preset, str(given.get("scenario", RunConfig.scenario)))
         if "tasks" in started and "tasks" not in given:

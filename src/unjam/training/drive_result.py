@@ -37,7 +37,8 @@ class DriveResult:
     """Episodes of one or several drivers on the same traffic."""
 
     scenario: str
-    rows: Rows
+    rows: Rows = field(repr=False)
+    """by driver: a row of metrics per episode"""
     folder: Path | None = None
     """where everything was written"""
     report: Path | None = None

@@ -32,6 +32,8 @@ if TYPE_CHECKING:
 Kind = Literal["best", "kept"]
 SAMPLED = 1000
 """most decisions of the recorded sample"""
+SAMPLED_SHARE = 0.1
+"""share of CAVs with which it is recorded on a network of the user's own"""
 
 
 class KeptControllers:
@@ -152,7 +154,8 @@ def _of_run(folder: Path, scenario: str) -> tuple[Scenario, Driver, dict[str, An
 
 def _of_driver(text: str, scenario: str) -> tuple[Scenario, Driver, dict[str, Any]]:
     """Return the road, driver and origin of a driver by itself."""
-    road = make_scenario(scenario or "ring")
+    own = scenario.endswith(".sumocfg")
+    road = make_scenario(scenario or "ring", {"cav_share": SAMPLED_SHARE} if own else None)
     driver = make_driver(text, road.decision_step)
     expert = driver.expert if isinstance(driver, ResidualDriver) else driver
     return road, driver, origin(road, expert)

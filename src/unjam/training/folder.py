@@ -6,7 +6,7 @@ are made at the end of iterations: written whole, checked by hash, two generatio
 
 import json
 import shutil
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
@@ -154,6 +154,9 @@ def continue_folder(folder: Path, config: RunConfig) -> None:
     before = read_config(folder)
     if replace(before, steps=config.steps, workers=config.workers) != config:
         raise InputError("resume: only steps and workers may change; all else is the run's")
+    made = max((row["actual_steps"] for row in read_progress(folder)), default=0)
+    if config.steps < before.steps and config.steps < made:
+        raise wrong("steps", config.steps, f">= {made}, which are made")
     if config != before:
         write_whole(folder / "config.toml", to_toml(config))
     if not (folder / MANIFEST).is_file():  # it was stopped before it had written that
@@ -193,32 +196,6 @@ def save_checkpoint(folder: Path, state: dict[str, Any], tensors: "Tensors") -> 
     said = json.dumps({**state, "sha256": _hash(state, data)}, indent=1)
     write_folder(folder / f"{state['iteration']:06d}", {TENSORS: data, STATE: said})
     _sweep(folder)
-
-
-def has_converged(config: RunConfig, progress: Sequence[dict[str, Any]]) -> bool:
-    """Return whether the newest `evaluation.converged` iterations were no better than those before them."""
-    span = config.evaluation.converged
-    if not span or len(progress) % span or len(progress) < 2 * span:
-        return False
-    returns = [row["return_mean"] for row in progress[-2 * span :]]
-    return sum(returns[span:]) <= sum(returns[:span])
-
-
-def gave_up(config: RunConfig, progress: Sequence[dict[str, Any]]) -> bool:
-    """Return whether so many validations in a row found nothing better that `evaluation.patience` is over."""
-    every = config.evaluation.every
-    scheduled = [row for row in progress if every and row["iteration"] % every == 0]  # and none at an end
-    found = [value for row in scheduled if (value := row.get("return_validation")) is not None]
-    if not config.evaluation.patience or not found:
-        return False
-    best = max(range(len(found)), key=found.__getitem__)
-    since = len(found) - 1 - best if found[best] > progress[0]["return_expert"] else len(found)
-    return since >= config.evaluation.patience
-
-
-def ends_early(config: RunConfig, progress: Sequence[dict[str, Any]]) -> bool:
-    """Return whether a training ends before its steps are made, as its settings say."""
-    return gave_up(config, progress) or has_converged(config, progress)
 
 
 def last_state(

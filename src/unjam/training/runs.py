@@ -14,7 +14,8 @@ from unjam.parameters import flat
 from unjam.processes import is_owned, owned
 from unjam.reports.results import EVALUATION_FILE, damaged, read_about, read_progress
 from unjam.training.config import RunConfig
-from unjam.training.folder import MANIFEST, ends_early, read_config
+from unjam.training.folder import MANIFEST, read_config
+from unjam.training.stopping import ends_early
 
 State = Literal["running", "finished", "stopped"]
 

@@ -12,7 +12,7 @@ FOLDER = "tensorboard"
 """of a run: what `tensorboard --logdir` is given"""
 
 
-def tensorboard_into(folder: Path) -> OnIteration:
+def tensorboard_into(folder: Path | str) -> OnIteration:
     """Return what writes each row of progress into a run's folder: for `on_iteration` of `unjam.train`.
 
     Every number of a row has its curve over actual steps; those of one kind have one group.
@@ -29,7 +29,7 @@ def tensorboard_into(folder: Path) -> OnIteration:
     def write(row: dict[str, Any]) -> None:
         nonlocal logger
         if logger is None:  # the run makes its folder first
-            logger = Logger(str(folder), [TensorBoardOutputFormat(str(folder / FOLDER))])
+            logger = Logger(str(folder), [TensorBoardOutputFormat(str(Path(folder, FOLDER)))])
         for name, value in flat(row).items():
             if isinstance(value, int | float) and name not in ("iteration", "actual_steps"):
                 logger.record(name.replace(".", "/", 1), value)

@@ -33,7 +33,6 @@ from unjam.training.folder import (
     belonging,
     check_possible,
     continue_folder,
-    ends_early,
     last_state,
     make_new_folder,
     note_lineage,
@@ -45,6 +44,7 @@ from unjam.training.folder import (
 from unjam.training.model_facts import why_no_facts, write_model_facts
 from unjam.training.sampling import Sampler, episodes_of, iterations_ahead
 from unjam.training.seeds import VALIDATE
+from unjam.training.stopping import ends_early
 from unjam.worlds.batch.run import run_where_possible
 from unjam.worlds.workers import Workers
 
@@ -271,13 +271,8 @@ class Trainer:
         if early and validated is None:
             self.validate(iteration, ended=True)
         counters, tensors = self.training.state()
-        state = {
-            **counters,
-            "belongs": self._belongs,
-            "validation_best": self._validation_best,
-            "expert_returns": self._expert_returns,
-            "sampler": self._sampler.state(),
-        }
+        state = {**counters, "belongs": self._belongs, "sampler": self._sampler.state()}
+        state |= {"validation_best": self._validation_best, "expert_returns": self._expert_returns}
         save_checkpoint(self.folder / "checkpoint", state, {**tensors, **self._controllers.tensors()})
         stopped = self._on_iteration(whole) is False
         if stopped and validated is None and not early:

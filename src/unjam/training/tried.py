@@ -31,7 +31,7 @@ class Tried:
             with suppress(ValueError, RecursionError, OSError):
                 before = json.loads(path.read_text(encoding="utf-8"))
             if not isinstance(before, dict) or before.get("asked") != asked:
-                raise InputError(f"out: {str(folder)!r} is of another tuning; allowed: a new folder")
+                raise InputError(f"out: {str(folder)!r} was made with other settings; allowed: a new folder")
             starts = before.get("starts", [])
         else:
             make_new_folder(folder, ", or that of this tuning")

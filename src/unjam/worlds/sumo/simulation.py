@@ -120,9 +120,8 @@ class Simulation:
         self.arrived: Callable[[], Sequence[str]] = call("simulation", "getArrivedIDList")
         """who left the road at the end of its route in the last step"""
         self.lifted: Callable[[], Sequence[str]] = call("simulation", "getStartingTeleportIDList")
-        """whom SUMO lifted off the road in the last step, for it had stood for long"""
+        """whom SUMO lifted off the road in the last step, for it had stood for long; and whom it put back"""
         self.put_back: Callable[[], Sequence[str]] = call("simulation", "getEndingTeleportIDList")
-        """whom SUMO put back, further on, in the last step"""
         self.colliding: Callable[[], Sequence[str]] = call("simulation", "getCollidingVehiclesIDList")
         """who touched another in the last step"""
         self.on_loop: Callable[[str], Sequence[Any]] = call("inductionloop", "getVehicleData")
