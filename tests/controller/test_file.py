@@ -162,7 +162,7 @@ def test_an_expert_of_the_users_own_that_has_changed_is_another(tmp_path: Path, 
     driver = residual(FileDriver(my_drivers, "gentle"))
     (tmp_path / "controller.unjam").write_bytes(controller_bytes(driver, ABOUT))
     my_drivers.write_text(my_drivers.read_text() + "# changed")
-    with pytest.raises(InputError, match=r"its expert '.*mine\.py' has changed since"):
+    with pytest.raises(InputError, match=r"its code '.*mine\.py' has changed since"):
         load_controller(tmp_path)
 
 

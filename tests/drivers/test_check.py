@@ -76,3 +76,12 @@ def test_accepts_good_drivers(driver: Any) -> None:
 def test_names_what_is_wrong_and_in_which_step(driver: Any, words: str) -> None:
     with pytest.raises(InputError, match=words):
         check_driver(driver)
+
+
+def test_what_motorways_tell_is_there_where_it_is_asked_for() -> None:
+    def as_allowed(state: Any) -> Any:
+        return 0.3 * (state.allowed_speed - state.speed)
+
+    check_driver(as_allowed, told=True)
+    with pytest.raises(InputError, match="driver: step 0: TypeError: "):
+        check_driver(as_allowed)

@@ -189,9 +189,10 @@ def _check_code(name: str, recipe: Any, in_folder: bool) -> None:
         code = Path(found["path"]).resolve()
         if not in_folder:
             alone = "a file by itself may not run; use the run folder"
-            raise InputError(f"controller {name}: its expert is Python code ({code.name}), which {alone}")
+            raise InputError(f"controller {name}: part of it is Python code ({code.name}), which {alone}")
         if code.is_file() and hash_of(code.read_bytes()) != found["sha256"]:
-            raise InputError(f"controller {name}: its expert {str(code)!r} has changed since")
+            once = "allowed: as it was when it was trained, or train anew"
+            raise InputError(f"controller {name}: its code {str(code)!r} has changed since; {once}")
         check_trusted(f"controller {name}", code)
 
 

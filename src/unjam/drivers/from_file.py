@@ -249,24 +249,32 @@ def acting(found: Any, where: str) -> Any:
     raise InputError(f"{where}: is neither a function nor a class with act(state, memory)")
 
 
-def check_driver(driver: DriverLike, rows: int = 8, steps: int = 50, seed: int = 0) -> None:
+def check_driver(
+    driver: DriverLike, rows: int = 8, steps: int = 50, seed: int = 0, told: bool = False
+) -> None:
     """Check that a driver keeps the contract of `unjam.drivers.Driver`; raise where it does not.
 
     It drives `rows` vehicles for `steps` random steps, drawn from `seed`, and checks that accelerations are
     finite and of shape (rows,), that n rows at once equal n single calls to 1e-12, that the same call gives
-    the same answer, and that neither the state nor the memory it was given is changed.
+    the same answer, and that neither the state nor the memory it was given is changed. With `told` it is told
+    all that a road may tell, as motorways do: what is allowed, the way to the ramp, who drives beside it.
 
     Raises:
         InputError: one line that names what is wrong, and in which step.
     """
     driver = as_driver(driver)
-    generator, told = np.random.default_rng(seed), bool(driver.told)
+    generator, told = np.random.default_rng(seed), told or bool(driver.told)
     memory = driver.initial_memory(rows)
     single = [driver.initial_memory(1) for _ in range(rows)]
     for step in range(steps):
         state = random_state(generator, rows, told)
         before = mapped(np.array, memory)  # a copy
-        acceleration, after = driver.act(state, memory)
+        try:
+            acceleration, after = driver.act(state, memory)
+        except InputError:
+            raise
+        except Exception as error:  # whatever the user's code raises is the user's to mend
+            raise InputError(f"driver: step {step}: {type(error).__name__}: {error}") from error
         acceleration = check_acceleration(acceleration, rows, f"step {step}")
         if not _equal(memory, before):
             raise InputError(f"driver: step {step}: act() changed the memory that it was given")

@@ -19,7 +19,7 @@ from unjam.errors import EpisodeError, InputError, MissingPartError, UnjamError,
 from unjam.processes import has_display
 from unjam.scenarios import make_scenario
 from unjam.worlds.drive import Drive
-from unjam.worlds.episode import check_driver
+from unjam.worlds.episode import check_can_drive
 from unjam.worlds.reward import Outcome, make_reward, time_headway
 from unjam.worlds.sumo import make_traffic
 from unjam.worlds.sumo.apart import simulation_for
@@ -105,7 +105,7 @@ class SteppedRoad:
         self.scenario = make_scenario(scenario, changes)
         self._reward = make_reward(reward or self.scenario.reward)
         driver = make_driver(expert, self.scenario.decision_step) if expert else Constant()
-        check_driver(driver, self.scenario)
+        check_can_drive(driver, self.scenario)
         self._driver = Outside(driver, observe_parts, self.scenario.limits)
         self._backend: Backend = backend
         self._simulation: Simulation | None = None

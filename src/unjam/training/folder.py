@@ -40,7 +40,7 @@ from unjam.kernels import kernels
 from unjam.parameters import build, flat
 from unjam.scenarios.own_network import OwnNetwork
 from unjam.sumo_files import read_sumo_files
-from unjam.worlds.episode import Task, check_driver
+from unjam.worlds.episode import Task, check_can_drive
 
 FORMAT = 4
 """of what a checkpoint holds; one of another unjam is refused"""
@@ -63,7 +63,7 @@ def check_possible(config: RunConfig) -> None:
             if needs == "coordinate" and not scenario.has_coordinate:
                 raise InputError(f"policy.observe: {name!r} is not allowed on a network of one's own")
         expert = road.make_expert()
-        check_driver(expert, scenario)
+        check_can_drive(expert, scenario)
         observation_size(road.policy.observe, expert)
         make_reward(road.reward or scenario.reward)
         for name in road.evaluation.baselines:

@@ -68,7 +68,7 @@ def run_episode(
         EpisodeError: SUMO cannot run the scenario.
     """
     driver, seed = as_driver(driver), as_seed(seed)
-    check_driver(driver, scenario)
+    check_can_drive(driver, scenario)
     paid = make_reward(reward or scenario.reward)
     if simulation is None:
         with simulation_for(scenario) as simulation:
@@ -88,7 +88,7 @@ def as_seed(seed: SupportsIndex | Sequence[int]) -> tuple[int, ...]:
     return found
 
 
-def check_driver(driver: Driver, scenario: Scenario) -> None:
+def check_can_drive(driver: Driver, scenario: Scenario) -> None:
     """Raise `InputError` where a driver cannot drive on a scenario's road."""
     if not can_drive(driver, scenario):
         raise InputError(f"driver: it is not allowed on {scenario.title}: it needs a closed road")

@@ -23,7 +23,7 @@ from unjam.worlds.batch.possible import alike, check_together, statistical_why_n
 from unjam.worlds.batch.record import Rings
 from unjam.worlds.batch.world import RingBatch
 from unjam.worlds.drive import Drive, driven_to_the_end
-from unjam.worlds.episode import check_driver, rewarded
+from unjam.worlds.episode import check_can_drive, rewarded
 from unjam.worlds.record import Episode
 from unjam.worlds.reward import make_reward
 from unjam.worlds.workers import EpisodeTask
@@ -91,7 +91,7 @@ def _driven_at_once(
     """Return the episodes of tasks, without what was earned; arguments as of `run_batch`."""
     first = tasks[0]
     for task in tasks:
-        check_driver(task.driver, task.scenario)
+        check_can_drive(task.driver, task.scenario)
     if isinstance(first.scenario, OnRamp):
         check_together([task.scenario for task in tasks], statistical)
         explore = [task.explore for task in tasks]
