@@ -4,13 +4,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from markupsafe import Markup
 from matplotlib import rc_context
 from matplotlib.figure import Figure
 
 from unjam.drivers.wrappers import Filtered
 from unjam.files import write_whole
 from unjam.reports.figures import CAV_COLOUR, LINES, MUTED, STYLE, data_uri, new_figure
-from unjam.reports.html import filled
+from unjam.reports.html import filled, page_part
 
 UNITS = (("own speed", "speed", "m/s"), ("leader's speed", "leader_speed", "m/s"), ("gap", "leader_gap", "m"))
 
@@ -36,6 +37,7 @@ def write_certificate(name: str, driver: Filtered, certificate: dict[str, Any], 
         strings=certificate["strings"],
         attack=data_uri(_attack(worst["attack"])),
         strings_picture=data_uri(_strings(certificate["strings"])),
+        downloads=Markup(page_part("downloads.js")),
         domain=[(label, certificate["domain"][key], unit) for label, key, unit in UNITS],
     )
     write_whole(target, text)

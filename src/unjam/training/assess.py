@@ -173,8 +173,8 @@ def assess(
     rows, judged, chose = {PEOPLE: choice.rows[PEOPLE]}, list[Judged](), budget.spent
     if choice.finalists:
         rows, judged = judge(choice.finalists, drive, budget, asked.precision, on_line)
-    on_line("pictures of people alone and with CAVs, same seed")
     beside = shown_beside(judged)
+    on_line("pictures of people alone" + ("" if beside is None else " and with CAVs, same seed"))
     pictured = [PEOPLE] if beside is None else [PEOPLE, Option(beside.share, beside.driver)]
     seeds = held_out_seeds(1) if judged else choosing_seeds(1)
     shown = driven(pictured, seeds, pictured=True).shown
