@@ -9,7 +9,7 @@ import pytest
 from tests.worlds.sumo.own_roads import straight
 from tests.worlds.test_record import fingerprint
 from unjam.drivers import IDM, PISaturation
-from unjam.errors import EpisodeError, UnjamError
+from unjam.errors import EpisodeError, InputError, UnjamError
 from unjam.scenarios import Ring, make_scenario
 from unjam.scenarios.road import Connection
 from unjam.worlds.episode import run_episode
@@ -218,3 +218,13 @@ def test_over_traci_sumo_is_reached_from_this_machine_alone_once_we_are_there(ro
         connections = sumo.net_connections("tcp")
     assert [each.raddr.ip for each in connections] == ["127.0.0.1"]
     assert all(each.status != psutil.CONN_LISTEN for each in connections)
+
+
+def test_a_temporary_folder_whose_name_sumo_would_take_apart_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "a,b"))
+    with pytest.raises(InputError, match="TMPDIR: .*a,b' is not allowed; allowed: a folder without ,"):
+        Simulation()
+    monkeypatch.undo()
+    Simulation().close()

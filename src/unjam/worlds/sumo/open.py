@@ -228,8 +228,8 @@ class OpenTraffic(Traffic[OpenKind]):
             self.cavs = [*(self.cavs[row] for row in rows), *new]
         self.entered += len(new)
         if self._controlled:
-            taken, self._taken = self._taken, self._taken.union(new)
-            new = [name for name in new if name not in taken]
+            new = [name for name in new if name not in self._taken]
+            self._taken.update(new)
             simulation.take_control(new, scenario.actuation, scenario.right_of_way, self._cav_type)
         names, self.speeds = self._everybody()
         self._note_moment()

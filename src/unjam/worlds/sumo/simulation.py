@@ -9,6 +9,7 @@ from contextlib import redirect_stdout
 from functools import partial
 from itertools import count, dropwhile, starmap
 from pathlib import Path
+from tempfile import gettempdir
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -68,18 +69,16 @@ class Simulation:
     def __init__(self, backend: Backend = "libsumo", gui_options: Sequence[str] = ()) -> None:
         """Open a simulation; nothing runs before `load`. `gui_options` go to SUMO's window."""
         global _open
+        if "," in (folder := gettempdir()):  # between the names of files that SUMO is given
+            raise wrong("TMPDIR", folder, "a folder without , in its name")
         if backend == "libsumo":
             if _open is not None:
-                raise UnjamError(
-                    "a simulation is already open in this process; close it, or use another process"
-                )
+                raise UnjamError("a simulation is already open in this process; close it, or use another")
             _open = self
         self.backend = backend
         self._gui_options = gui_options
         self._sumo: Any = library(backend)
         self._folder = PrivateFolder()
-        if "," in self._folder.name:  # between the names of files that SUMO is given
-            raise wrong("TMPDIR", self._folder.name, "a folder without , in its name")
         self._error_log = Path(self._folder.name) / "error.log"
         self._copies: dict[Path, tuple[tuple[int, int] | None, Path]] = {}
         """of users' own files, with the stamps of those"""
