@@ -224,7 +224,7 @@ def test_a_temporary_folder_whose_name_sumo_would_take_apart_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "a,b"))
-    with pytest.raises(InputError, match="TMPDIR: .*a,b' is not allowed; allowed: a folder without ,"):
+    with pytest.raises(InputError, match=r"TMPDIR: .*a,b' is not allowed; allowed: a folder without ,"):
         Simulation()
     monkeypatch.undo()
     Simulation().close()
