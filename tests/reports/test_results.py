@@ -157,6 +157,23 @@ def test_the_command_to_repeat_can_be_pasted_into_a_shell(command: tuple[str, ..
     assert told.stdout.splitlines() == list(command)
 
 
+def test_a_training_that_went_on_is_repeated_by_its_first_command_with_its_last_budget(
+    tmp_path: Path,
+) -> None:
+    first = ["unjam", "train", "ring", "--steps", "400", "--set", "trpo.gamma=0.99"]
+    longer, again = (
+        ["unjam", "train", "--resume", "it", "--steps", "800"],
+        ["unjam", "train", "--resume", "it"],
+    )
+    about = {"trained": "trained", "manifest": {"command": again}}
+    lineage = [{"command": longer}, {"command": again}]
+    (tmp_path / "manifest.json").write_text(json.dumps({"command": first, "lineage": lineage}))
+    found = command_to_repeat(Results(tmp_path, about, {}, {}))
+    assert found == " ".join([*first, "--steps", "800"])
+    (tmp_path / "manifest.json").write_text("{")
+    assert command_to_repeat(Results(tmp_path, about, {}, {})) == " ".join(again)
+
+
 def test_plain_words_of_the_command_are_left_as_they_are() -> None:
     command = ["unjam", "train", "ring", "--out", "runs/ring-001", "--set", "trpo.gamma=0.99"]
     assert command_to_repeat(results_made_by(*command)) == " ".join(command)

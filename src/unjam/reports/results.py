@@ -4,6 +4,7 @@ import json
 import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -200,9 +201,17 @@ def read_model(folder: Path) -> dict[str, Any] | None:
 
 
 def command_to_repeat(results: Results) -> str:
-    """Return the command line that made a folder."""
-    command = results.about.get("manifest", {}).get("command", [])
-    return shlex.join(str(word) for word in command)
+    """Return the command line that made a folder; of one that went on the first, with the last budget."""
+    command = [str(word) for word in results.about.get("manifest", {}).get("command", [])]
+    if results.trained is None or "--resume" not in command:
+        return shlex.join(command)
+    try:
+        made = json.loads(_text(results.folder / "manifest.json"))
+        first, *others = (each["command"] for each in (made, *made["lineage"]))
+    except DAMAGED:
+        return shlex.join(command)
+    budgets = [["--steps", after] for each in others for word, after in pairwise(each) if word == "--steps"]
+    return shlex.join([*first, *(budgets or [[]])[-1]])
 
 
 def _text(path: Path) -> str:
