@@ -133,7 +133,7 @@ def test_a_calibration_that_was_stopped_goes_on_where_it_was(
 
 
 def test_the_folder_of_another_calibration_is_refused(asked: Corridor, done: tuple[Path, Calibrated]) -> None:
-    with Counting(1) as counting, pytest.raises(InputError, match="is of another"):
+    with Counting(1) as counting, pytest.raises(InputError, match="was made with other settings"):
         calibrate(asked, done[0], counting, SPACE, TRIALS, seeds=2)
 
 

@@ -154,9 +154,10 @@ def continue_folder(folder: Path, config: RunConfig) -> None:
     before = read_config(folder)
     if replace(before, steps=config.steps, workers=config.workers) != config:
         raise InputError("resume: only steps and workers may change; all else is the run's")
-    made = max((row["actual_steps"] for row in read_progress(folder)), default=0)
-    if config.steps < before.steps and config.steps < made:
-        raise wrong("steps", config.steps, f">= {made}, which are made")
+    if config.steps < before.steps:
+        made = max((row.get("actual_steps", 0) for row in read_progress(folder)), default=0)
+        if config.steps < made:
+            raise wrong("steps", config.steps, f">= {made}, which are made")
     if config != before:
         write_whole(folder / "config.toml", to_toml(config))
     if not (folder / MANIFEST).is_file():  # it was stopped before it had written that
