@@ -98,7 +98,9 @@ def drive(
     elif any(row["status"] != "failed" for rows in result.rows.values() for row in rows):
         print_metrics(result.rows)
         for label, effect in beside_people(result.rows).items():
-            words = f"{label} beside people alone, seeds paired, {effect.flow.count}: {effect.words}"
+            count = effect.flow.count
+            seeds = f"{count} paired seed{'' if count == 1 else 's'}"
+            words = f"{label} beside people alone, {seeds}: {effect.words}"
             console.print(words, soft_wrap=True)
         for note in result.notes:
             aside.print(f"note: {note}", markup=False, soft_wrap=True)

@@ -15,8 +15,6 @@ from unjam.cli.options import JsonOption, SeedOption, assignments
 from unjam.cli.output import Counted, aside, console, new_table, print_json
 from unjam.errors import InputError
 
-SHOWN_SHARE = 0.1
-"""share of CAVs with which your own network is listed"""
 PICTURED_AFTER = 60.0
 """seconds after which a road with ends is drawn: at the start it is all but empty"""
 
@@ -38,7 +36,7 @@ def scenarios(
 
       unjam scenarios figure-eight --picture eight.png
     """
-    from unjam.scenarios import SCENARIOS, make_scenario, scenario_recipe
+    from unjam.scenarios import SCENARIOS, example_of, scenario_recipe
 
     if picture is not None and (name is None or picture.suffix.lower() != ".png"):
         raise InputError("picture: wants the name of a scenario, and a file that ends in .png")
@@ -54,8 +52,7 @@ def scenarios(
             table.add_row(key, *(facts[fact] for fact in shown), f"{scenario.horizon:,}", warmup)
         console.print(table)
         return
-    # Your own network has no default share of CAVs, and gets one here.
-    scenario = make_scenario(name, {"cav_share": SHOWN_SHARE} if name.endswith(".sumocfg") else None)
+    scenario = example_of(name)
     if picture is not None:
         _draw(scenario, name, picture)
     facts = [*scenario.facts(), *_common_facts(scenario)]

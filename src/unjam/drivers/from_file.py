@@ -269,26 +269,31 @@ def check_driver(
     for step in range(steps):
         state = random_state(generator, rows, told)
         before = mapped(np.array, memory)  # a copy
-        try:
-            acceleration, after = driver.act(state, memory)
-        except InputError:
-            raise
-        except Exception as error:  # whatever the user's code raises is the user's to mend
-            raise InputError(f"driver: step {step}: {type(error).__name__}: {error}") from error
+        acceleration, after = _asked(driver, state, memory, step)
         acceleration = check_acceleration(acceleration, rows, f"step {step}")
         if not _equal(memory, before):
             raise InputError(f"driver: step {step}: act() changed the memory that it was given")
-        again, _ = driver.act(state, before)
+        again, _ = _asked(driver, state, before, step)
         if not np.array_equal(acceleration, again):
             raise InputError(f"driver: step {step}: the same state and memory gave another acceleration")
         for row in range(rows):
             one = state.at(slice(row, row + 1))
-            answer, single[row] = driver.act(one, single[row])
+            answer, single[row] = _asked(driver, one, single[row], step)
             alone, among = float(np.asarray(answer)[0]), float(acceleration[row])
             if not abs(alone - among) <= TOLERANCE:
                 words = f"row {row} gave {alone!r} alone and {among!r} among {rows} rows"
                 raise InputError(f"driver: step {step}: {words}")
         memory = after
+
+
+def _asked(driver: Driver, state: LocalState, memory: Memory, step: int) -> tuple[Any, Memory]:
+    """Return what a driver answers; raise `InputError` with the step where it fails."""
+    try:
+        return driver.act(state, memory)
+    except InputError:
+        raise
+    except Exception as error:  # whatever the user's code raises is the user's to mend
+        raise InputError(f"driver: step {step}: {type(error).__name__}: {error}") from error
 
 
 def check_acceleration(acceleration: Any, rows: int, where: str) -> np.ndarray:

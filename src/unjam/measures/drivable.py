@@ -175,12 +175,12 @@ def _with_lanes(row: dict[str, Any], floor: float) -> tuple[tuple[bool, str], ..
 def verdicts(rows_by_driver: dict[str, list[dict[str, Any]]]) -> dict[str, str]:
     """Return the verdict on each driver of a road; people alone, where they are among them, are `human`."""
     return {
-        label: drivable_in_all(rows, people_beside(label, rows_by_driver))
+        label: drivable_in_all(rows, people_alone_of(label, rows_by_driver))
         for label, rows in rows_by_driver.items()
     }
 
 
-def people_beside(label: str, rows_by_driver: dict[str, list[dict[str, Any]]]) -> list[dict[str, Any]]:
+def people_alone_of(label: str, rows_by_driver: dict[str, list[dict[str, Any]]]) -> list[dict[str, Any]]:
     """Return the rows of people alone on a driver's road: of results that are compared, those of its own."""
     result, _, _ = label.rpartition(": ")
     return rows_by_driver.get(f"{result}: human", rows_by_driver.get("human", []))

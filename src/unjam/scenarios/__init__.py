@@ -26,6 +26,8 @@ SCENARIOS: dict[str, Scenario] = {
     **ON_RAMPS,
 }
 
+EXAMPLE_SHARE = 0.1
+"""share of CAVs where a network of the user's own stands as an example"""
 NAMED_BEFORE = {"people": "human_control", "penetration": "cav_share"}
 """what parameters are called now, by what they were called"""
 KINDS = {kind.title: kind for kind in (Ring, FigureEight, Merge, OnRamp, OwnNetwork)}
@@ -51,6 +53,11 @@ def make_scenario(name: str, changes: dict[str, Any] | None = None) -> Scenario:
     if changes.get("population"):
         changes = {**_of_population(str(changes["population"])), **changes}
     return build(type(scenario), changed(asdict(scenario), changes), f"scenario {name}")
+
+
+def example_of(name: str) -> Scenario:
+    """Return a scenario as it is listed and sampled: with some CAVs on a network of the user's own."""
+    return make_scenario(name, {"cav_share": EXAMPLE_SHARE} if name.endswith(".sumocfg") else None)
 
 
 def _named_as_now(values: dict[str, Any]) -> dict[str, Any]:

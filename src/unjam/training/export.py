@@ -19,7 +19,7 @@ from unjam.files import check_folder, make_folder, write_whole
 from unjam.measures.metrics import measure
 from unjam.measures.statistics import summarise
 from unjam.reports.results import EVALUATION_FILE, rows_by_driver
-from unjam.scenarios import make_scenario
+from unjam.scenarios import example_of
 from unjam.scenarios.scenario import Scenario
 from unjam.training.evaluate import TRAINED, raise_failure
 from unjam.training.folder import origin, read_config
@@ -32,8 +32,6 @@ if TYPE_CHECKING:
 Kind = Literal["best", "kept"]
 SAMPLED = 1000
 """most decisions of the recorded sample"""
-SAMPLED_SHARE = 0.1
-"""share of CAVs with which it is recorded on a network of the user's own"""
 
 
 class KeptControllers:
@@ -154,8 +152,7 @@ def _of_run(folder: Path, scenario: str) -> tuple[Scenario, Driver, dict[str, An
 
 def _of_driver(text: str, scenario: str) -> tuple[Scenario, Driver, dict[str, Any]]:
     """Return the road, driver and origin of a driver by itself."""
-    own = scenario.endswith(".sumocfg")
-    road = make_scenario(scenario or "ring", {"cav_share": SAMPLED_SHARE} if own else None)
+    road = example_of(scenario or "ring")
     driver = make_driver(text, road.decision_step)
     expert = driver.expert if isinstance(driver, ResidualDriver) else driver
     return road, driver, origin(road, expert)

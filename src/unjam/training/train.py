@@ -188,11 +188,11 @@ class Trainer:
         self._validation_best, self._expert_returns = -np.inf, [float("nan")] * len(self.tasks)
         self._sampler = Sampler(self.tasks, config.sampling, self._expert_returns)
         self._controllers = KeptControllers(self.folders)
-        self._belongs, self._ended_early = belonging(config), False
+        self._belongs = belonging(config)
         if checkpoint := last_state(folder, {folder, *self.folders}, self._belongs):
             state, tensors = checkpoint
-            self._ended_early = ends_early(config, read_progress(folder))
-            self._controllers.restore(tensors, self._ended_early or state["actual_steps"] >= config.steps)
+            ended = state["actual_steps"] >= config.steps or ends_early(config, read_progress(folder))
+            self._controllers.restore(tensors, ended)
             self.training.restore(state, tensors)
             self._validation_best = state["validation_best"]
             self._expert_returns = state["expert_returns"]
@@ -210,7 +210,7 @@ class Trainer:
             self._sampler.reached = self._expert_returns
             self._keep_controllers(self.training.learner.network(), best=True)
             self._validation_best = self._sampler.mean(self._expert_returns)
-        if not self._ended_early:
+        if not ends_early(self.config, read_progress(self.folder)):
             algorithm_1(self.training, self.config.steps, self.collect, self.validate, self.write)
 
     def drivers(self, network: Network) -> list[Driver]:
