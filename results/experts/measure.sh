@@ -9,6 +9,10 @@ for radius in 32 35; do
     unjam drive figure-eight --radius $radius --episodes 10 --out "$runs/figure-eight-$radius" \
         -d human -d pi:time_constant=0 >/dev/null
 done
+for setting in impatience=0 impatience=1 free_ahead=0 free_ahead=70; do
+    unjam drive figure-eight --radius 32 --set $setting --episodes 10 --out "$runs/figure-eight-32-$setting" \
+        -d human >/dev/null
+done
 for radius in 32 33 34 35; do
     unjam drive figure-eight --radius $radius --set horizon=3000 --episodes 10 \
         --out "$runs/figure-eight-steady-$radius" \
