@@ -15,6 +15,7 @@ for length in 220 230 240 250 260 270; do
 done
 measure ring ring --episodes 20 -d human -d pi:time_constant=0 -d pi -d follower-stopper -d idm
 measure ring-jammed ring-jammed --episodes 20 -d human -d idm -d pi:time_constant=0 -d pi -d follower-stopper
+measure ring-jammed-unfiltered ring-jammed --set safety.active=false --episodes 20 -d pi:time_constant=0 -d pi
 measure ring-5 ring-warm --vehicles 5 --length 55 --episodes 5 -d human -d pi
 measure ring-11 ring-warm --vehicles 11 --length 115 --episodes 5 -d human -d pi
 measure ring-44 ring-warm --vehicles 44 --length 520 --episodes 5 -d human -d pi
