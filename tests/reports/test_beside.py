@@ -7,19 +7,19 @@ from unjam.measures.metrics import METRICS
 from unjam.reports.story import BETTER, Column, against_people, episodes_as_csv
 
 
-def column(name: str, values: list[float], **more: Any) -> Column:
+def column(name: str, values: list[float], people: Column | None = None, **more: Any) -> Column:
     rows = [
         {"seed": seed, "status": "completed", **dict.fromkeys(METRICS, float("nan")), "fuel_ml_per_km": value}
         for seed, value in enumerate(values)
     ]
-    return Column(name, [{**row, **more} for row in rows], None)
+    return Column(name, [{**row, **more} for row in rows], None, people.rows if people else None)
 
 
 PEOPLE = column("human", [100.0, 200.0, 300.0], mean_speed=5.0)
 
 
 def test_less_fuel_is_better_and_less_speed_is_worse() -> None:
-    found = against_people([PEOPLE, column("pi", [90.0, 191.0, 289.0], mean_speed=4.0)])
+    found = against_people([PEOPLE, column("pi", [90.0, 191.0, 289.0], PEOPLE, mean_speed=4.0)])
     cells = {row["label"]: row["cells"][0] for row in found["rows"]}
     assert found["names"] == ["pi"]
     assert cells["fuel"] == {"text": "-10.0 [-12.5, -7.5]", "mark": "better"}
@@ -28,8 +28,18 @@ def test_less_fuel_is_better_and_less_speed_is_worse() -> None:
 
 
 def test_what_may_be_nothing_has_no_mark_and_what_is_unknown_no_row() -> None:
-    found = against_people([PEOPLE, column("pi", [90.0, 210.0, 301.0])])
+    found = against_people([PEOPLE, column("pi", [90.0, 210.0, 301.0], PEOPLE)])
     assert [(row["label"], row["cells"][0]["mark"]) for row in found["rows"]] == [("fuel", "")]
+
+
+def test_each_stands_beside_the_people_of_its_own_folder() -> None:
+    others = column("b: human", [1100.0, 1200.0, 1300.0])
+    pairs = (("a", PEOPLE, 0.0), ("b", others, 1000.0))
+    both = [column(f"{of}: pi", [far + 90.0, far + 191.0, far + 289.0], people) for of, people, far in pairs]
+    found = against_people([PEOPLE, both[0], others, both[1]])
+    [fuel] = found["rows"]
+    assert found["names"] == ["a: pi", "b: pi"]
+    assert [cell["text"] for cell in fuel["cells"]] == ["-10.0 [-12.5, -7.5]"] * 2
 
 
 def test_without_people_or_without_anybody_else_there_is_no_table() -> None:

@@ -10,7 +10,7 @@ import pandas as pd
 from unjam.measures.drivable import DRIVABLE, verdicts
 from unjam.measures.effect import Effect, beside_people
 from unjam.measures.metrics import METRICS
-from unjam.measures.statistics import digits_of, estimate_of, paired_difference, signed, verdict_on
+from unjam.measures.statistics import estimate_of, paired_difference, signed, verdict_on
 from unjam.measures.table import PEOPLE, baseline_of, cell_of
 from unjam.reports.results import Results, Shown
 
@@ -41,13 +41,14 @@ class Column:
     name: str
     rows: list[dict[str, Any]]
     shown: Shown | None
+    people: list[dict[str, Any]] | None = None
+    """those of people alone in the same folder; of themselves none"""
 
 
 def columns_of(results: Sequence[Results]) -> list[Column]:
     """Return the drivers to show: all of a single folder; of several, what each folder is about."""
     if len(results) == 1:
-        only = results[0]
-        return [Column(label, rows, only.shown.get(label)) for label, rows in only.rows.items()]
+        return [_column(results[0], label, label) for label in results[0].rows]
     columns: dict[str, Column] = {}
     for result, folder in zip(results, names_of(results), strict=True):
         for label, rows in result.rows.items():
@@ -55,8 +56,13 @@ def columns_of(results: Sequence[Results]) -> list[Column]:
             name = f"{folder}: {label}" if mine else label
             if name in columns and _episodes(columns[name].rows) != _episodes(rows):
                 name = f"{folder}: {label}"
-            columns.setdefault(name, Column(name, rows, result.shown.get(label)))
+            columns.setdefault(name, _column(result, label, name))
     return list(columns.values())
+
+
+def _column(result: Results, label: str, name: str) -> Column:
+    people = None if label == PEOPLE else result.rows.get(PEOPLE)
+    return Column(name, result.rows[label], result.shown.get(label), people)
 
 
 def baseline_of_columns(results: Sequence[Results]) -> str:
@@ -216,28 +222,27 @@ def cards_of(result: Results) -> list[dict[str, str]]:
 
 
 def against_people(columns: Sequence[Column]) -> dict[str, Any]:
-    """Return the table of differences to people alone, same seeds paired; empty where they are not there.
+    """Return the table of differences to people alone in the same folder, seeds paired; empty without them.
 
     A cell is marked better or worse where its interval lies on one side of zero: each for itself, so that of
     twenty cells one is marked by chance.
     """
-    people = next((column for column in columns if column.name == "human"), None)
-    others = [column for column in columns if column is not people]
-    if people is None or not others:
+    others = [(column, column.people) for column in columns if column.people is not None]
+    if not others:
         return {}
     rows = []
     for name, better in BETTER.items():
         metric = METRICS[name]
-        gains = [paired_difference(column.rows, people.rows, name) for column in others]
+        gains = [paired_difference(column.rows, people, name) for column, people in others]
         if not any(gain.count for gain in gains):
             continue
         cells = []
         for gain in gains:
             shown = gain.low > 0 or gain.high < 0
             mark = ("better" if (gain.mean > 0) == (better is MORE) else "worse") if shown else ""
-            cells.append({"text": signed(gain, digits_of(gain, metric.digits)), "mark": mark})
+            cells.append({"text": str(cell_of(gain, metric.digits, sign="+")), "mark": mark})
         rows.append({"label": metric.label, "unit": metric.unit, "cells": cells})
-    return {"names": [column.name for column in others], "rows": rows}
+    return {"names": [column.name for column, _ in others], "rows": rows}
 
 
 def episodes_as_csv(columns: Sequence[Column]) -> str:
