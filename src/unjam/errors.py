@@ -20,6 +20,10 @@ class InputError(UnjamError):
     exit_code = 2
 
 
+class NoCavError(InputError):
+    """A driver had nobody to drive: by chance, or because too few vehicles are CAVs."""
+
+
 class MissingPartError(UnjamError):
     """A program or package that is needed is not there: the message says how to get it."""
 
@@ -60,10 +64,10 @@ def disk_error(error: OSError, path: object) -> DiskError:
     return DiskError(f"cannot write {path}: {error.strerror or error}")
 
 
-def error_named(kind: str, words: str) -> UnjamError:
+def error_named(name: str, words: str) -> UnjamError:
     """Return the error that another process told of; of a kind that is not ours, it is an `UnjamError`."""
-    kinds = {each.__name__: each for each in UnjamError.__subclasses__()}
-    return kinds.get(kind, UnjamError)(words)
+    kinds = {each.__name__: each for kind in (UnjamError, InputError) for each in kind.__subclasses__()}
+    return kinds.get(name, UnjamError)(words)
 
 
 def in_own_words(error: Exception) -> UnjamError:

@@ -133,7 +133,7 @@ def calibrate(
         study.tell(trial, one.score, state=None if one.score is not None else optuna.trial.TrialState.FAIL)
         said = one.why if one.score is None else f"{one.score:.4g}"
         on_line(f"{number + 1} of {trials}: {_words(one.factors)}: {said}")
-    ranked = sorted(found, key=_rank)[:FINALISTS]
+    ranked = sorted((one for one in found if one.score is not None), key=_rank)[:FINALISTS]
     again = [score(one.factors, seeds, 2 * seeds) for one in (*ranked, as_it_is)]
     best = min(again, key=_rank).factors
     on_line(f"judged on {JUDGED} other seeds: {_words(best)}")

@@ -5,7 +5,7 @@ limits and filter. Settings that no car could drive do not count.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, fields
 from functools import cache, partial
 from itertools import chain
 from math import inf
@@ -17,7 +17,6 @@ import numpy as np
 from unjam.controller.file import SUFFIX, controller_bytes
 from unjam.drivers.driver import labelled
 from unjam.drivers.registry import DRIVERS, named_driver
-from unjam.drivers.wrappers import Mixed
 from unjam.errors import InputError, UnjamError, wrong_name
 from unjam.files import to_json, write_whole
 from unjam.manifest import manifest
@@ -209,7 +208,8 @@ def tune(
             settings.append(setting)
             said = setting.verdict if setting.score is None else f"{setting.score:.4g}"
             on_line(f"{len(settings)} of {trials}: {setting.driver}: {said}")
-    ranked = sorted(settings, key=lambda one: -inf if one.score is None else one.score, reverse=True)
+    able = [(one.score, one) for one in settings if one.score is not None]
+    ranked = [one for _, one in sorted(able, key=lambda pair: pair[0], reverse=True)]
     best_values = [one.values for one in ranked[:FINALISTS]]
     *again, default = judged([*best_values, {}], episodes, 2 * episodes, in_sumo)
     finalists = [one for one in (*again, default) if one.score is not None]
@@ -266,16 +266,13 @@ def _in_sumo(workers: Workers, tasks: list[list[EpisodeTask]]) -> list[Rows]:
 def _in_batch(tasks: list[list[EpisodeTask]]) -> list[Rows]:
     import torch
 
-    if isinstance(tasks[0][0].scenario, OnRamp):
-        driven = iter(run_batches([*chain(*tasks)], statistical=True))
-        return [[measure(next(driven)) for _ in each] for each in tasks]
-    # Rings go round the drivers as CAVs do in a mixture: a ring's CAVs all have the same one.
-    drivers = [each[0].driver for each in tasks]
-    together = drivers[0] if len(drivers) == 1 else Mixed(tuple(drivers))
-    mixed = [replace(task, driver=together) for part in zip(*tasks, strict=True) for task in part]
-    episodes = run_batch(mixed, torch.as_tensor if together.tensors else np.asarray, statistical=True)
-    rows = [measure(episode) for episode in episodes]
-    return [rows[number :: len(drivers)] for number in range(len(drivers))]
+    every = [*chain(*tasks)]
+    if isinstance(every[0].scenario, OnRamp):
+        driven = iter(run_batches(every, statistical=True))
+    else:
+        numbers = torch.as_tensor if all(task.driver.tensors for task in every) else np.asarray
+        driven = iter(run_batch(every, numbers, statistical=True))
+    return [[measure(next(driven)) for _ in each] for each in tasks]
 
 
 def _score(found: Mapping[str, Rows], people: Mapping[str, Rows]) -> tuple[float | None, str]:

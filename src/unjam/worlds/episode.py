@@ -9,7 +9,7 @@ import numpy as np
 
 from unjam.drivers.driver import Driver
 from unjam.drivers.from_file import DriverLike, as_driver
-from unjam.errors import InputError, wrong
+from unjam.errors import InputError, NoCavError, wrong
 from unjam.scenarios.scenario import Scenario
 from unjam.worlds.drive import drive
 from unjam.worlds.earned import earned
@@ -75,8 +75,7 @@ def run_episode(
             return run_episode(scenario, driver, seed, reward, explore, full, simulation, progress)
     traffic = make_traffic(scenario, seed, simulation, driver.plain_numbers, full, driver.asks)
     episode = drive(traffic, driver, explore, on_progress=progress)
-    if traffic.entered == 0 and not driver.native:
-        raise InputError(f"no CAV was on the road in {episode.steps} decisions: let more vehicles be CAVs")
+    check_cavs_drove(episode, driver)
     return rewarded(episode, paid)
 
 
@@ -92,6 +91,12 @@ def check_can_drive(driver: Driver, scenario: Scenario) -> None:
     """Raise `InputError` where a driver cannot drive on a scenario's road."""
     if not can_drive(driver, scenario):
         raise InputError(f"driver: it is not allowed on {scenario.title}: it needs a closed road")
+
+
+def check_cavs_drove(episode: Episode, driver: Driver) -> None:
+    """Raise `NoCavError` where a driver had nobody to drive."""
+    if not episode.cav_ids and not driver.native:
+        raise NoCavError(f"no CAV was on the road in {episode.steps} decisions: let more vehicles be CAVs")
 
 
 def can_drive(driver: Driver, scenario: Scenario) -> bool:

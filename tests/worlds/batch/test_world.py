@@ -10,6 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from unjam.controller import make_driver
 from unjam.drivers import Constant, Driver
 from unjam.drivers.command import Command
 from unjam.drivers.driver import Memory
@@ -319,8 +320,40 @@ def test_rings_differ_in_their_lengths_alone() -> None:
     parts = [EpisodeTask(SHORT.part(part, 2), driver, (1,)) for part in range(2)]
     assert len({episode.loop_length for episode in run_batch(parts)}) == 2
     other = [*tasks(SHORT, driver, (1,)), *tasks(SHORT, named_driver("idm", 0.1), (2,))]
+    together, alone = run_batch(other), [run_batch([each])[0] for each in other]
+    assert all(np.array_equal(one.speeds, two.speeds) for one, two in zip(together, alone, strict=True))
     with pytest.raises(InputError, match="differ in driver"):
-        run_batch(other)
+        run_batch([other[0], replace(other[1], reward="eq16")])
+
+
+def test_who_of_a_mixture_drives_does_not_depend_on_the_other_rings() -> None:
+    two = replace(SHORT, cavs=2)
+    for ring in (SHORT, two):
+        every = tasks(ring, make_driver("pi+idm", 0.1), (1, 2, 3))
+        together, alone = run_batch(every), [run_batch([each])[0] for each in every]
+        assert all(
+            np.array_equal(one.speeds, other.speeds) for one, other in zip(together, alone, strict=True)
+        )
+
+
+def test_what_a_driver_sees_is_not_the_worlds_own() -> None:
+    world = RingBatch([SHORT], [(1,)])
+    with pytest.raises(ValueError, match="read-only"):
+        world.perceive().speed[0] = 1.0
+
+
+def test_rings_on_which_somebody_touched_within_a_decision_have_collided() -> None:
+    raw = replace(
+        SHORT, actuation="raw", safety=NO_FILTER, steps_per_decision=10, action_limit=3.0, horizon=40
+    )
+    every = tasks(raw, Constant(3.0), range(24))
+    scenarios, seeds = [each.scenario for each in every], [each.seed for each in every]
+    world = RingBatch(scenarios, seeds)  # pyright: ignore[reportArgumentType]
+    rings = driven_to_the_end(begin(world, Constant(3.0)))
+    crashed = [episode.status == "collision" for episode in rings.episodes]
+    assert crashed == [bool(each) for each in rings.crashed]
+    assert all(episode.collisions >= 2 for episode in rings.episodes if episode.status == "collision")
+    assert any(crashed)
 
 
 def test_rings_of_many_kinds_come_back_in_their_order() -> None:

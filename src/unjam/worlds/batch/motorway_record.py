@@ -28,6 +28,9 @@ from unjam.worlds.batch.vehicles import Vehicles
 from unjam.worlds.record import FRAMES, Episode, Trajectory, shared_columns, trajectory
 from unjam.worlds.world import Driven
 
+NEVER = int(np.iinfo(np.intp).max)
+"""the decision after which a road ends on which nobody has touched"""
+
 
 class _Where(NamedTuple):
     """Where vehicles are; arrays of shape (n,)."""
@@ -61,13 +64,15 @@ class MotorwayLog:
     """of the simulation [s]"""
     decision_step: float
     """[s]"""
+    planned: float
+    """how long they are driven [s]"""
     ends: NDArray[np.intp] = field(init=False)
-    """decision after which vehicles touched on each; none: far beyond the horizon"""
+    """decision after which vehicles touched on each, or NEVER"""
 
     def __post_init__(self) -> None:
         """Begin with nothing."""
         roads, kinds = len(self.roads), 1 + max(PEOPLE, CAV, CAV_CUT_IN)
-        self.ends = np.full(roads, np.iinfo(np.intp).max)
+        self.ends = np.full(roads, NEVER)
         self._wheres = list[_Where]()
         self._waiting = list[NDArray[np.intp]]()
         self._cavs = list[NDArray[np.intp]]()
@@ -89,7 +94,8 @@ class MotorwayLog:
     ) -> None:
         """Note how all braked in a step, and how CAVs, the rows `cavs`, follow those `ahead` of each."""
         self._steps += 1
-        self._arrived += np.bincount(left.road, minlength=len(self.roads))
+        goes_on = self.ends == NEVER
+        self._arrived += np.bincount(left.road, minlength=len(self.roads)) * goes_on
         road, entry = vehicles.road, vehicles.entry
         kind = np.full(len(road), PEOPLE)
         if controlled:
@@ -102,12 +108,12 @@ class MotorwayLog:
             self._since[own] = np.where(changed, self._steps, self._since[own])
             lasts = (self._steps - self._since[own]) * self.step
             kind[rows[lasts < CUT_IN]] = CAV_CUT_IN
-            follows = (leader >= 0) & (lasts > SETTLED)
+            follows = (leader >= 0) & (lasts > SETTLED) & goes_on[road[rows]]
             gap = vehicles.place[leader] - self.roads[0].vehicle_length - vehicles.place[rows]
             seen = road[rows], vehicles.speed[rows], vehicles.speed[leader], gap
             self._settled.append(np.stack([each[follows].astype(np.float64) for each in seen]))
-        np.add.at(self._braked, (road, kind), 1)
-        hard = np.flatnonzero(vehicles.acceleration < 0.0)
+        np.add.at(self._braked, (road, kind), goes_on[road])
+        hard = np.flatnonzero((vehicles.acceleration < 0.0) & goes_on[road])
         braking = -vehicles.acceleration[hard].astype(np.float64)
         np.maximum.at(self._hardest, (road[hard], kind[hard]), braking)
         for number, limit in enumerate(BEYOND):
@@ -243,6 +249,7 @@ class MotorwayLog:
             lane_names=road.ways[::-1],
             arrived=int(self._arrived[number]),
             waiting=waiting[:moments],
+            planned=self.planned,
             peak=road.peak,
             free_time=road.free_time,
             trajectories=tuple(stays),

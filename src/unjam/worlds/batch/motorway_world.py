@@ -86,7 +86,9 @@ class MotorwayBatch:
         self._controlled, self._headways_asked = False, False
         self._lasting: Floats | None = None
         """what networks explore with all episode long, of each road"""
-        self._log = MotorwayLog(self.roads, entries, step, self.scenario.decision_step)
+        decision_step = self.scenario.decision_step
+        planned = self.scenario.horizon * decision_step
+        self._log = MotorwayLog(self.roads, entries, step, decision_step, planned)
 
     def _drawn(self, shape: tuple[int, ...]) -> Floats:
         """Return the errors of all vehicles in this step: each road draws its own."""

@@ -10,6 +10,7 @@ from unjam.physics.arrays import Array
 from unjam.scenarios.ring import Loop
 from unjam.scenarios.road import ClosedRoad
 from unjam.scenarios.scenario import VEHICLE_LENGTH
+from unjam.worlds.batch.lanes import CONTACT
 from unjam.worlds.closed import ClosedLog
 from unjam.worlds.record import Episode, Floats
 from unjam.worlds.world import Driven
@@ -60,10 +61,14 @@ class RingLog:
         roads: Sequence[ClosedRoad],
         seeds: Sequence[Sequence[int]],
         decisions: Floats,
+        crashed: Floats,
         driven: Driven,
         cav_share: float | None,
     ) -> tuple[Episode, ...]:
-        """Return the record of each ring, which ends after so many decisions; the share is as it was told."""
+        """Return the record of each ring, which ends after so many decisions; the share is as it was told.
+
+        Who touched in one that has `crashed` may do so no more when it ends: a decision has many steps.
+        """
         rings, cavs = len(roads), len(roads[0].cav_ids)
         decided = [tuple(map(as_numpy, decision)) for decision in driven.decisions]
         last = None if driven.last_observation is None else as_numpy(driven.last_observation)
@@ -71,9 +76,11 @@ class RingLog:
         ways = {name: _stacked(getattr(self, name), -1, rings) for name in ("moved", "speeds")}
         asked = {name: _stacked(getattr(self, name), cavs, rings) for name in ("wanted", "told", "commanded")}
         return tuple(
-            self._episode(scenario, road, seed, number, int(count), driven, cav_share, {**ways, **asked})
-            for number, (scenario, road, seed, count) in enumerate(
-                zip(scenarios, roads, seeds, decisions, strict=True)
+            self._episode(
+                scenario, road, seed, number, int(count), bool(touched), driven, cav_share, {**ways, **asked}
+            )
+            for number, (scenario, road, seed, count, touched) in enumerate(
+                zip(scenarios, roads, seeds, decisions, crashed, strict=True)
             )
         )
 
@@ -84,6 +91,7 @@ class RingLog:
         seed: Sequence[int],
         number: int,
         decisions: int,
+        crashed: bool,
         driven: Driven,
         cav_share: float | None,
         steps: dict[str, Floats],
@@ -98,18 +106,20 @@ class RingLog:
         before = moments[1][:, -1]
         # Not wrapped: who touches the car ahead is a little before or beyond it.
         ahead = np.append(before[1:], before[0] + road.loop_length)
-        collided = self.touching(before, ahead - before - VEHICLE_LENGTH, road.loop_length)
+        gaps = ahead - before - VEHICLE_LENGTH
+        collided = self.touching(before, gaps, road.loop_length)
+        hit = np.roll(collided & (gaps < CONTACT), 1)  # across a crossing both are told of
         facts = {
             "seed": tuple(seed),
-            "status": "collision" if collided.any() else "completed",
+            "status": "collision" if crashed else "completed",
             "step": scenario.decision_step,
             "warmup": scenario.warmup,
             "drawn": road.drawn,
-            "collisions": int((collided | np.roll(collided, 1)).sum()),
+            "collisions": max(2 * crashed, int((collided | hit).sum())),
             "limit_speed": road.limit_speed,
         }
         rows = np.arange(len(road.cav_ids)) * self.start.shape[1] + number
-        return replace(log, crashed=bool(collided.any())).episode(moments, facts, driven, rows)
+        return replace(log, crashed=crashed).episode(moments, facts, driven, rows)
 
 
 def as_numpy(values: Any) -> Floats:

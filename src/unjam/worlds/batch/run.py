@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from typing import cast
 
 import numpy as np
-from numpy.typing import NDArray
 
 from unjam.drivers.driver import Driver, Memory
 from unjam.drivers.local_state import LocalState
@@ -23,7 +22,7 @@ from unjam.worlds.batch.possible import alike, check_together, statistical_why_n
 from unjam.worlds.batch.record import Rings
 from unjam.worlds.batch.world import RingBatch
 from unjam.worlds.drive import Drive, driven_to_the_end
-from unjam.worlds.episode import check_can_drive, rewarded
+from unjam.worlds.episode import check_can_drive, check_cavs_drove, rewarded
 from unjam.worlds.record import Episode
 from unjam.worlds.reward import make_reward
 from unjam.worlds.workers import EpisodeTask
@@ -54,6 +53,10 @@ def begin(
         memory: what the driver remembers already; None: nothing but what the world began with.
     """
     world.asked = driver.asks
+    if memory is None:  # who drives which CAV of a ring does not depend on the other rings
+        rings = len(world.roads)
+        each_ring = driver.initial_memory(world.rows // rings)
+        memory = mapped(lambda values: np.repeat(values, rings, axis=0), each_ring)
     driving = Drive(world, driver, explore, memory)
     driving.memory = mapped(numbers, driving.memory)
     if driver.hold > 1 and AGE in driving.memory:
@@ -70,7 +73,7 @@ def run_batch(
     """Return the episodes of tasks, as `run_episode` does in SUMO, but for rounding; all are stepped at once.
 
     Args:
-        tasks: roads that differ in length and seed alone; motorways also in driver and exploration.
+        tasks: roads that differ in length, seed and driver alone; motorways also in exploration.
         numbers: makes the arrays that are stepped.
         coming: tasks that will follow, alike; they are warmed up beforehand where these have to be.
         statistical: whether roads are allowed whose episodes are SUMO's in distribution alone.
@@ -94,45 +97,59 @@ def _driven_at_once(
         check_can_drive(task.driver, task.scenario)
     if isinstance(first.scenario, OnRamp):
         check_together([task.scenario for task in tasks], statistical)
+        if len(tasks) > 1 and any(_counts_cavs(task.driver) for task in tasks):  # those of its own road
+            return [each for task in tasks for each in _driven_at_once([task], numbers, (), statistical)]
         explore = [task.explore for task in tasks]
         motorways = MotorwayBatch(first.scenario, [task.seed for task in tasks], explore=explore)
-        driver = _of_all(tasks, motorways)
+        driver = _of_all(tasks, lambda owner: owner[motorways.of_road])
         motorways.asked = driver.asks
-        return driven_to_the_end(Drive(motorways, driver, float(any(explore))))
+        episodes = driven_to_the_end(Drive(motorways, driver, float(any(explore))))
+        for episode in episodes:
+            check_cavs_drove(episode, driver)
+        return episodes
     scenarios, seeds = [cast(Loop, each.scenario) for each in tasks], [each.seed for each in tasks]
     world = RingBatch(scenarios, seeds, numbers, first.reward, statistical=statistical)
     if world.scenario.warmup > 0:
         world.begun = BEGUN.of([_ring(task) for task in tasks], [_ring(task) for task in coming], _warm_up)
-    rings: Rings = driven_to_the_end(begin(world, first.driver, numbers, first.explore))
+    driver = _of_all(tasks, lambda owner: numbers(np.tile(owner, world.rows // len(owner))))
+    rings: Rings = driven_to_the_end(begin(world, driver, numbers, first.explore))
     return rings.episodes
 
 
 @dataclass(frozen=True)
 class PerRoad(Mixed):
-    """Drives each motorway of a batch by its own of several drivers."""
+    """Drives each road of a batch by its own of several drivers."""
 
-    motorways: MotorwayBatch
-    owner: NDArray[np.intp]
-    """which driver each road has, shape (W,)"""
+    owner: Callable[[], Array]
+    """returns which driver each CAV's road has, of all CAVs that are there now"""
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
         """Return the acceleration that each CAV's driver wants, and the new memory."""
-        return super().act(state, memory | {KIND: self.owner[self.motorways.of_road]})
+        return super().act(state, memory | {KIND: self.owner()})
 
     def time_headways(self, state: LocalState, memory: Memory) -> Array | None:
         """Return for each CAV that of its driver."""
-        return super().time_headways(state, memory | {KIND: self.owner[self.motorways.of_road]})
+        return super().time_headways(state, memory | {KIND: self.owner()})
 
 
-def _of_all(tasks: Sequence[EpisodeTask], motorways: MotorwayBatch) -> Driver:
-    """Return the driver of all tasks, or who drives each motorway by its own."""
+def _counts_cavs(driver: Driver) -> bool:
+    """Return whether who drives a CAV depends on how many entered before it."""
+    return isinstance(driver, Mixed) or any(map(_counts_cavs, driver.inner.values()))
+
+
+def _of_all(tasks: Sequence[EpisodeTask], of_cavs: Callable[[Array], Array]) -> Driver:
+    """Return the driver of all tasks, or who drives each road by its own.
+
+    `of_cavs` returns what it is given of each road, shape (W,), of each CAV that is there.
+    """
     drivers = list[Driver]()
     for task in tasks:
         if task.driver not in drivers:
             drivers.append(task.driver)
     if len(drivers) == 1:
         return drivers[0]
-    return PerRoad(tuple(drivers), motorways, np.array([drivers.index(task.driver) for task in tasks]))
+    owner = np.array([drivers.index(task.driver) for task in tasks])
+    return PerRoad(tuple(drivers), lambda: of_cavs(owner))
 
 
 def _ring(task: EpisodeTask) -> _Ring:
@@ -196,11 +213,10 @@ def run_where_possible(
 
 def _driven(task: EpisodeTask) -> tuple[object, ...]:
     """Return in what tasks may not differ that are driven at once."""
-    if not isinstance(task.scenario, OnRamp):
-        return task.driver, task.reward, task.explore
     alone = task.driver if task.driver.native or task.driver.shown is not None else None
-    return alone, task.reward, task.explore != 0.0
+    return alone, task.reward, task.explore != 0.0 if isinstance(task.scenario, OnRamp) else task.explore
 
 
 def _alike(one: EpisodeTask, other: EpisodeTask) -> bool:
-    return _driven(one) == _driven(other) and alike(one.scenario, other.scenario)
+    together = isinstance(one.scenario, OnRamp) or one.driver == other.driver
+    return together and _driven(one) == _driven(other) and alike(one.scenario, other.scenario)

@@ -192,7 +192,10 @@ class RingBatch:
 
     def perceive(self) -> LocalState:
         """Return what the CAVs perceive now: arrays of shape (CAVs * W,)."""
-        return self._readings.of_drivers(self.decisions, self._state())
+        state = self._state()
+        if isinstance(state.speed, np.ndarray):
+            state = state.read_only()  # some of it is the world's own
+        return self._readings.of_drivers(self.decisions, state)
 
     def _state(self) -> LocalState:
         """Return what exact sensors of the CAVs would read now."""
@@ -314,16 +317,17 @@ class RingBatch:
     def record(self, driven: Driven) -> Rings:
         """Return what happened since the start."""
         headway, braking = self._with_headway(self._followed()), self._braking
-        made = as_numpy(self._made)
+        share = self.roads[0].share_told(self.asked)
+        made, crashed = as_numpy(self._made), 1.0 - as_numpy(self._running)
         return Rings(
             decisions=made,
-            crashed=1.0 - as_numpy(self._running),
+            crashed=crashed,
             terms={name: as_numpy(total) for name, total in self._sums.items()},
             mean_speed=as_numpy(self._driven) / made,
             headway=as_numpy(headway).min(0),
             braking=as_numpy(braking).max(0),
             episodes=self._log.episodes(
-                self._scenarios, self.roads, self._seeds, made, driven, self.roads[0].share_told(self.asked)
+                self._scenarios, self.roads, self._seeds, made, crashed, driven, share
             )
             if self._keep
             else (),
