@@ -31,7 +31,7 @@ HUMAN = {**GOOD, "cav_max_braking": float("nan"), "people_beyond_4_5": 20.0}
         ({"cav_min_ttc": 0.9}, "0.90 s to a collision"),
         ({"cav_max_braking": 6.5}, "brakes with 6.5 m/s2"),
         ({"overridden": 0.013}, "SUMO overrides 1.3 % of its commands"),
-        ({"collisions": 2.0, "min_headway": 0.1}, "2 vehicles in contact"),
+        ({"status": "collision", "collisions": 2.0, "min_headway": 0.1}, "2 vehicles in contact"),
         ({"status": "failed"}, ""),
         ({"cav_max_braking": float("nan")}, ""),
     ],

@@ -92,7 +92,7 @@ def test_differences_are_paired_and_only_on_seeds_that_both_have() -> None:
 
 def test_an_effect_knows_contacts_failures_and_the_verdict_on_the_cavs_alone() -> None:
     rows = rows_of([99.0, 98.0, nan], people_beyond_4_5=500.0)
-    rows[0]["collisions"] = 2.0
+    rows[0] |= {"status": "collision", "collisions": 2.0}
     rows[2] |= {"status": "failed", "collisions": nan}
     found = effect_of(rows, rows_of([100.0] * 3))
     assert (found.collisions, found.failed, found.travel_time.count) == (2.0, 1, 2)

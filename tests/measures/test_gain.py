@@ -57,9 +57,14 @@ def test_a_gain_is_bounded_on_both_sides() -> None:
 
 @pytest.mark.parametrize(
     "wrong",
-    [{"min_headway": 0.3}, {"collisions": 2.0}, {"overridden": 0.01}, {"throughput_veh_per_h": 900.0}],
+    [
+        {"min_headway": 0.3},
+        {"status": "collision", "collisions": 2.0},
+        {"overridden": 0.01},
+        {"throughput_veh_per_h": 900.0},
+    ],
 )
-def test_what_no_car_could_drive_or_what_lowers_flow_gains_nothing(wrong: dict[str, float]) -> None:
+def test_what_no_car_could_drive_or_what_lowers_flow_gains_nothing(wrong: dict[str, Any]) -> None:
     fast = ring([4.0] * 4, **wrong)
     assert gain(fast, PEOPLE, 4.0).mean == 0.0
     slow = ring([2.5] * 4, **wrong)
@@ -92,5 +97,5 @@ def test_seed_by_seed_a_gain_has_the_same_mean_and_interval() -> None:
 
 
 def test_a_gain_that_a_rule_has_fixed_has_no_errors() -> None:
-    crashed = ring([3.4, 3.7, 3.1, 3.9], collisions=2.0)
+    crashed = ring([3.4, 3.7, 3.1, 3.9], collisions=2.0, status="collision")
     assert gain_by_seed(crashed, PEOPLE, 4.0).tolist() == [0.0] * 4

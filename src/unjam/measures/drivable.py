@@ -139,7 +139,7 @@ def drivable(row: dict[str, Any], people_alone: float | None = None) -> str:
     floor, lanes = row.get("floor") or USUAL_FLOOR, row.get("lanes", False)
     smallest = SMALLEST_WITH_LANES if lanes else FLOOR_MET * floor
     checks = [
-        (row["collisions"] > 0, f"{row['collisions']:.0f} vehicles in contact"),
+        (row["status"] == "collision", f"{row['collisions']:.0f} vehicles in contact"),
         (
             row["min_headway"] < smallest - TOLERANCE,
             f"follows at {row['min_headway']:.2f} s (floor {floor:g} s)",

@@ -89,7 +89,10 @@ def effect_of(
     differences = (paired_difference(rows, people, name, confidence) for name in (TIME, FLOW, FUEL, HARD))
     return Effect(
         *differences,
-        collisions=float(sum(row["collisions"] for row in ran)),
+        collisions=float(
+            sum(row["collisions"] for row in ran)
+            - sum(row["collisions"] for row in people if row["status"] != "failed")
+        ),
         failed=len(rows) - len(ran),
         drivable=drivable_in_all([{**row, HARD: 0.0} for row in rows]),
         people_time=estimate_of(people, TIME).mean,
@@ -132,6 +135,7 @@ def reasons_against(effect: Effect) -> list[str]:
             f"flow may be lower by more than {100 * FLOW_LOST:g} %: {signed(effect.flow)} veh/h",
         ),
         (effect.drivable == DRIVABLE, f"no car could drive so: {effect.drivable or 'no CAV drove'}"),
+        (effect.collisions <= 0, f"{effect.collisions:.0f} more vehicles in contact than without CAVs"),
         (
             effect.hard_braking.mean <= 0,
             "people brake beyond 4.5 m/s² more often than alone: "

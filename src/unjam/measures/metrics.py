@@ -208,7 +208,8 @@ def fuel_ml_per_km(episode: Episode) -> float:
 
 def throughput_veh_per_h(episode: Episode) -> float:
     """Flow [veh/h]: on a closed road distance driven by all vehicles over length and time (Edie 1963); of a
-    road with ends, the vehicles that left it over time, where demand has a peak in its last ten minutes.
+    road with ends, the vehicles that left it over the time that it was to be driven, where demand has a peak
+    in its last ten minutes. Who arrives last does not decide it, where an episode ends with nobody left.
     """
     if episode.peak[1] > 0:
         end = min(round(episode.peak[1] / episode.step), episode.steps)
@@ -218,7 +219,8 @@ def throughput_veh_per_h(episode: Episode) -> float:
         return float(left * 3600.0 / max(end - begin, 1) / episode.step)
     hours = episode.steps * episode.step / 3600.0
     if np.isnan(episode.loop_length):
-        return episode.arrived / hours
+        over = episode.status == "completed" and not np.isnan(episode.planned)
+        return episode.arrived / (episode.planned / 3600.0 if over else hours)
     driven = np.nansum(episode.positions[-1] - episode.positions[0])
     return float(driven / episode.loop_length / hours)
 
@@ -232,7 +234,7 @@ def travel_time(episode: Episode) -> float:
     if not len(episode.waiting):
         return float("nan")
     there = (~np.isnan(episode.speeds)).sum(axis=1)
-    demanded = len(episode.vehicle_ids) + episode.waiting[-1]
+    demanded = len(episode.vehicle_ids) + episode.waiting[-1] - episode.lifted
     return float((there + episode.waiting)[1:].sum() * episode.step / demanded) if demanded else float("nan")
 
 

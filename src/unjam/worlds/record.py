@@ -149,7 +149,7 @@ class Episode:
     every: int = 1
     """where vehicles are is kept of every so many-th moment: not of all where many drive for long"""
     collisions: int = 0
-    """vehicles in contact with another when the episode ended"""
+    """vehicles that were in contact with another"""
     speeds: Floats = field(default_factory=lambda: np.zeros((1, 0)))
     """[m/s], shape (T + 1, N); NaN where a vehicle is not on the road"""
     positions: Floats = field(default_factory=lambda: np.zeros((1, 0)))
@@ -169,10 +169,15 @@ class Episode:
     """times that SUMO lifted a vehicle that had stood for long off the road; until it is put back it waits"""
     peak: tuple[float, float] = (0.0, 0.0)
     """from when to when the most vehicles want to enter [s]; (0, 0) where there is no peak"""
+    planned: float = float("nan")
+    """how long a road with ends was to be driven [s], were nobody to touch; NaN of a closed one"""
     free_time: float = float("nan")
     """mean travel time where nobody disturbs anybody [s]; NaN where it is not known"""
     waiting: Floats = field(default_factory=lambda: np.zeros(0))
-    """vehicles that wanted to enter and could not, at each moment, shape (T + 1,); (0,) of a closed road"""
+    """vehicles that wanted to enter and could not, or were lifted off the road, at each moment, shape
+    (T + 1,); (0,) of a closed road"""
+    lifted: int = 0
+    """of those that wait at the end, how many were lifted off the road and not put back"""
     lines: Floats = field(default_factory=lambda: np.zeros((0, 2)))
     """lanes of a road with ends: rows (x, y) [m], a row of NaN between two; (0, 2) where not recorded"""
     places: Floats = field(default_factory=lambda: np.zeros((0, 0, 3)))

@@ -95,6 +95,8 @@ class OpenTraffic(Traffic[OpenKind]):
         self._lifted: dict[str, bool] = {}
         """whom SUMO has lifted off the road, likewise"""
         self._teleports = 0
+        self._touched = set[str]()
+        """who was in contact with another"""
         self._taken = set[str]()
         """CAVs that were taken control of"""
         self.cavs, self._arrived = [], 0
@@ -108,7 +110,8 @@ class OpenTraffic(Traffic[OpenKind]):
         self._stays = StayLog()
         self._log_waiting: list[int] = []
         self._log_fuel: list[float] = []
-        self._arrived = self._teleports = 0
+        self._arrived = self._teleports = self.collisions = 0
+        self._touched.clear()
         self._forget()
         self._look()
 
@@ -180,7 +183,8 @@ class OpenTraffic(Traffic[OpenKind]):
         self._watch()
         colliding = self._simulation.colliding()
         if colliding:
-            self.collisions = max(self.collisions, len(colliding))
+            self._touched.update(colliding)
+            self.collisions = len(self._touched)
             self.crashed = self.crashed or self._ends_with(colliding)
 
     def _follow(self) -> None:
@@ -264,6 +268,8 @@ class OpenTraffic(Traffic[OpenKind]):
             "arrived": self._arrived,
             "teleports": self._teleports,
             "waiting": np.array(self._log_waiting, np.float64),
+            "lifted": len(self._lifted.keys() & set(vehicles)),
+            "planned": self.scenario.horizon * self.scenario.decision_step,
             "lines": self._lines() if self.full else np.zeros((0, 2)),
             "trajectories": trajectories,
             "audit": self._audit(trajectories),
