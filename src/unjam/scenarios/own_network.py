@@ -89,10 +89,12 @@ class OwnNetwork(Scenario):
     def draw(self, generator: np.random.Generator) -> OwnRoad:
         """Return the network; random is which vehicles the share picks."""
         files = read_sumo_files(Path(self.file))
+        # The horizon ends an episode: at an earlier end of the configuration's SUMO would let flows stop.
+        options = {name: value for name, value in files.options.items() if name != "end"}
         if self.begin is not None:
-            # The horizon ends an episode; SUMO would refuse an end of the configuration that is earlier.
-            options = {name: value for name, value in files.options.items() if name != "end"}
-            files = files._replace(begin=self.begin, options={**options, "begin": str(self.begin)})
+            options["begin"] = str(self.begin)
+        begin = files.begin if self.begin is None else self.begin
+        files = files._replace(begin=begin, options=options)
         cav_seed = int(generator.integers(2**31))
         drivers = self.calibrated.draw(DRAWN, generator) if self.calibrated else ()
         return OwnRoad(

@@ -28,7 +28,7 @@ PASSED = {
     *("ignore-route-errors", "ignore-accidents", "intermodal-collision.action", "collision.stoptime"),
     *("intermodal-collision.stoptime", "collision.check-junctions.mingap", "keep-after-arrival"),
     *("max-num-vehicles", "max-num-persons", "max-num-teleports", "scale", "scale-suffix"),
-    *("max-depart-delay", "sloppy-insert", "eager-insert", "emergency-insert", "insertion-checks"),
+    *("sloppy-insert", "eager-insert", "emergency-insert", "insertion-checks"),
     *("random-depart-offset", "waiting-time-memory", "startup-wait-threshold", "slope-centered"),
     *("time-to-impatience", "pedestrian.model", "pedestrian.timegap-crossing", "mesosim"),
     *("use-stop-ended", "use-stop-started", "routing-algorithm", "replay-rerouting", "time-to-teleport"),

@@ -14,6 +14,7 @@ from unjam.drivers import IDM, Constant, Human, PISaturation
 from unjam.drivers.command import Command
 from unjam.drivers.network import Network
 from unjam.errors import InputError
+from unjam.measures.drivable import drivable
 from unjam.measures.metrics import measure
 from unjam.physics.idm import IDMParameters
 from unjam.scenarios import Scenario, make_scenario
@@ -236,6 +237,51 @@ def test_an_episode_ends_when_the_last_vehicle_has_arrived(tmp_path: Path, simul
     assert episode.steps < 1500
     assert (episode.arrived, len(episode.trajectories)) == (5, 5)
     assert not any(trajectory.terminated for trajectory in episode.trajectories)
+
+
+def test_flow_is_not_decided_by_who_arrives_last(tmp_path: Path, simulation: Simulation) -> None:
+    vehicles = '<flow id="f" type="car" route="along" begin="0" end="20" period="2"/>'
+    scenario = make_scenario(str(straight(tmp_path, vehicles, 800.0, 120.0)), {"cav_share": 1.0})
+    one, other = (
+        run_episode(scenario, driver, (0,), simulation=simulation) for driver in (Human(), Constant(0.3))
+    )
+    assert other.steps != one.steps
+    assert (
+        measure(other)["throughput_veh_per_h"] == measure(one)["throughput_veh_per_h"] == 10 * 3600.0 / 120.0
+    )
+
+
+def test_who_waits_long_to_enter_is_not_forgotten(tmp_path: Path, simulation: Simulation) -> None:
+    vehicles = '<flow id="f" type="van" route="along" begin="0" end="30" period="0.2" departSpeed="0"/>'
+    file = straight(tmp_path, vehicles)
+    file.write_text(file.read_text().replace("<end ", '<max-depart-delay value="5"/><end '))
+    episode = run_episode(scenario_of(file, horizon=350), Human(), (0,), simulation=simulation)
+    assert len(episode.vehicle_ids) + episode.waiting[-1] == 150
+
+
+def test_flows_without_an_end_go_on_until_the_end_that_is_asked_for(
+    tmp_path: Path, simulation: Simulation
+) -> None:
+    file = straight(tmp_path, '<flow id="f" type="car" route="along" begin="0" period="5"/>', end=30.0)
+    asked = [{}, {"end": 100.0}, {"end": 100.0, "begin": 0.0}, {"horizon": 1000}]
+    roads = [make_scenario(str(file), {"cav_share": 0.5, **each}) for each in asked]
+    counts = [len(run_episode(road, Human(), (0,), simulation=simulation).vehicle_ids) for road in roads]
+    assert counts[0] < 8
+    assert counts[1:] == [counts[1]] * 3
+    assert counts[1] >= 20
+
+
+def test_people_who_touch_people_are_counted_once_each_and_end_nothing(
+    tmp_path: Path, simulation: Simulation, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = straight(tmp_path, '<flow id="f" type="car" route="along" begin="0" end="60" period="3"/>')
+    told = iter([["f.0", "f.1"], ["f.0", "f.1"], ["f.1", "f.2"]])
+    monkeypatch.setattr(simulation, "colliding", lambda: next(told, []))
+    episode = run_episode(scenario_of(file, cav_share=0.2, horizon=300), IDM(), (0,), simulation=simulation)
+    row = measure(episode)
+    assert not {"f.0", "f.1", "f.2"} & set(episode.cav_ids)
+    assert (episode.status, row["collisions"]) == ("completed", 3.0)
+    assert "contact" not in drivable(row)
 
 
 def test_an_episode_is_measured_without_complaint(file: Path, simulation: Simulation) -> None:

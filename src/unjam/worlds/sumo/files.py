@@ -51,7 +51,8 @@ def files_of(scenario: Scenario, road: Road) -> Files:
 def _own_files(scenario: Scenario, road: OwnRoad) -> Files:
     """Return what SUMO reads of the user's own network: never its configuration itself."""
     files = road.files
-    options = [f"--{name}={value}" for name, value in files.options.items()]
+    # Who has waited long to enter must not vanish: he is among those whose time is counted.
+    options = ["--max-depart-delay=-1", *(f"--{name}={value}" for name, value in files.options.items())]
     # Validation would fetch the schemas that the files name.
     options += [f"--xml-validation{what}=never" for what in ("", ".net", ".routes")]
     named = {
