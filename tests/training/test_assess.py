@@ -113,6 +113,19 @@ def test_the_answer_does_not_depend_on_the_number_of_workers(
     assert again.document["tried"] == answer.document["tried"]
 
 
+def test_seeds_without_a_cav_are_those_of_people_alone(file: str, tmp_path: Path) -> None:
+    few = question(file, [0.06], 40, 0.02, None, ["acc"], HELD)
+    with Workers(2) as workers:
+        found = assess(few, tmp_path / "out", workers)
+    [tried] = found.document["tried"]
+    assert tried["set_aside"] == ""
+    rows = read_rows(tmp_path / "out" / CHOOSING)
+    people, driven = rows.values()
+    same = [one["travel_time"] == other["travel_time"] for one, other in zip(people, driven, strict=True)]
+    assert any(same)
+    assert not any(row["status"] == "failed" for row in driven)
+
+
 def test_a_folder_with_something_in_it_is_left_alone(asked: Question, tmp_path: Path) -> None:
     (tmp_path / "precious.txt").write_text("keep me")
     with Workers(1) as workers, pytest.raises(InputError, match="is not empty"):

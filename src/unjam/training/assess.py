@@ -11,7 +11,7 @@ from typing import Any
 
 from unjam.controller import BEST, make_driver
 from unjam.drivers.driver import Driver
-from unjam.errors import InputError, wrong
+from unjam.errors import InputError, NoCavError, wrong
 from unjam.files import to_json, write_whole
 from unjam.manifest import manifest
 from unjam.measures.effect import Judged, headline, recommended, shown_beside
@@ -166,8 +166,16 @@ def assess(
         return found
 
     def drive(options: Sequence[Option], seeds: Sequence[Seed]) -> dict[Option, Rows]:
-        found = driven(options, seeds)
-        return {option: found.rows[option.label] for option in options}
+        rows = driven(options, seeds).rows
+        people = rows.get(PEOPLE.label, [])
+        # Of a small share no vehicle is a CAV on some seeds: then it is people alone who drive.
+        return {
+            option: [
+                alone if row["error"] == NoCavError.__name__ else row
+                for row, alone in zip(rows[option.label], people, strict=True)
+            ]
+            for option in options
+        }
 
     choice = choose(asked.options, drive, budget, asked.precision, on_line)
     rows, judged, chose = {PEOPLE: choice.rows[PEOPLE]}, list[Judged](), budget.spent
