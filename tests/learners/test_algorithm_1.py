@@ -113,9 +113,12 @@ def test_what_is_earned_afterwards_is_discounted_look_by_look_to_the_last_one() 
     left = replace(stays, residual=np.zeros(4), applied=np.zeros(4), hold=2)
     whole = replace(episode, speeds=np.zeros((12, 1)), terms={"one": reward})
     expected = 0.9 * (5.0 + 6.0) + 0.9**2 * (7.0 + 8.0) + 0.9**3 * (9.0 + 10.0) + 0.9**4 * 11.0
-    assert afterwards(whole, left, 0.9) == pytest.approx(expected)
-    assert afterwards(whole, replace(left, terminated=True), 0.9) is None
-    assert afterwards(replace(whole, speeds=np.zeros((5, 1))), left, 0.9) is None
+    assert afterwards(whole, left, 0.9, 11) == pytest.approx(expected)
+    assert afterwards(whole, replace(left, terminated=True), 0.9, 11) is None
+    assert afterwards(replace(whole, speeds=np.zeros((5, 1))), left, 0.9, 4) is None
+    assert afterwards(whole, left, 0.9, 12) is None  # broken off
+    ended = (replace(whole, speeds=np.full((12, 1), np.nan)), replace(whole, status="collision"))
+    assert [afterwards(each, left, 0.9, 12) for each in ended] == [pytest.approx(expected)] * 2
     alone, more = experience_of([left], [()]), experience_of([left], [()], [expected])
     assert more.rewards[-1] - alone.rewards[-1] == pytest.approx(expected)
     assert (alone.terminated.tolist(), more.terminated.tolist()) == ([False], [True])
@@ -128,7 +131,10 @@ def test_each_iteration_of_each_run_draws_its_own_numbers() -> None:
         drawn[run, iteration] = (float(torch.rand(1)), float(np.random.rand()))
         seed_iteration(run, iteration)
         assert (float(torch.rand(1)), float(np.random.rand())) == drawn[run, iteration]
-    assert len(set(drawn.values())) == 4
+    for part in (0, 1):  # of several updates of an iteration
+        seed_iteration(1, 2, part)
+        drawn[2, part] = (float(torch.rand(1)), float(np.random.rand()))
+    assert len(set(drawn.values())) == 6
 
 
 @every_learner

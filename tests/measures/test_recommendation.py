@@ -48,5 +48,6 @@ def test_where_nothing_passes_nothing_is_recommended_and_the_quickest_is_shown()
 def test_where_nobody_was_judged_nothing_is_recommended_or_shown() -> None:
     assert shown_beside([]) is None
     assert headline([]) == (
-        "No CAVs are recommended on this road: all that was tried slows traffic, loses flow, or failed."
+        "No CAVs are recommended on this road: all that was tried did worse than people alone on the seeds "
+        "that choose, or failed."
     )

@@ -37,6 +37,18 @@ def test_what_cannot_work_is_told_before_anything_is_written(tmp_path: Path, cha
     assert not (tmp_path / "run").exists()
 
 
+def test_rows_are_not_imagined_where_a_cav_is_told_more_than_they_know(tmp_path: Path) -> None:
+    assert load_config(changes={"scenario": "on-ramp"}).virtual.virtual_ratio == 0.0
+    assert load_config(changes={"scenario": "on-ramp", "virtual.model": "road"}).virtual.virtual_ratio > 0.0
+    with pytest.raises(InputError, match="not allowed on on-ramp, where CAVs have an ACC"):
+        check_possible(load_config(changes={"scenario": "on-ramp", "virtual.virtual_ratio": 5.0}))
+    file = straight(tmp_path, '<flow id="f" type="car" route="along" begin="0" end="60" period="3"/>')
+    asked = {"scenario": str(file), "road.cav_share": 0.5, "expert": "jam-ahead"}
+    with pytest.raises(InputError, match=r"jam-ahead and the network ask for .*lane_speeds"):
+        check_possible(load_config(changes=asked))
+    check_possible(load_config(changes={**asked, "expert": "acc"}))
+
+
 def test_vehicles_on_a_network_of_ones_own_know_no_position(tmp_path: Path) -> None:
     file = straight(tmp_path, '<flow id="f" type="car" route="along" begin="0" end="60" period="3"/>')
     changes = {"scenario": str(file), "road.cav_types": ["car"], "policy.observe": ["route_position"]}

@@ -170,7 +170,7 @@ def algorithm_1(
                 if virtual is None and not with_actual:
                     continue
             # Line 8: update pi_theta and its value network with D_a and D_v.
-            seed_iteration(training.seed, training.iteration)
+            seed_iteration(training.seed, training.iteration, part if parts and not with_actual else None)
             given = actual if with_actual else None
             with _timed(seconds, "update"):
                 try:
@@ -229,14 +229,20 @@ def experience_on(training: Training, index: int, episodes: Sequence[Episode]) -
     if policy.afterwards:
         came = [trajectory.start / scenario.horizon for _, trajectory in pairs]
         extra = np.column_stack([extra, came])
-        later = [afterwards(episode, trajectory, training.learner.gamma) for episode, trajectory in pairs]
+        gamma, horizon = training.learner.gamma, scenario.horizon
+        later = [afterwards(episode, trajectory, gamma, horizon) for episode, trajectory in pairs]
     return experience_of([trajectory for _, trajectory in pairs], extra, later)
 
 
-def afterwards(episode: Episode, trajectory: Trajectory, gamma: float) -> float | None:
-    """Return what was earned after a CAV had left, discounted to its last choice; None: it never left."""
+def afterwards(episode: Episode, trajectory: Trajectory, gamma: float, horizon: int) -> float | None:
+    """Return what was earned after a CAV had left, discounted to its last choice.
+
+    None where it never left, or where the episode was broken off before its `horizon`, as one is that is
+    imagined for a while: what would have been earned then nobody knows.
+    """
     end = trajectory.during.stop
-    if end >= episode.steps or trajectory.terminated:
+    goes_on = episode.status == "completed" and not np.isnan(episode.speeds[-1]).all()
+    if end >= episode.steps or trajectory.terminated or (goes_on and episode.steps < horizon):
         return None
     earned = np.add.reduceat(episode.reward[end:], np.arange(0, episode.steps - end, trajectory.hold))
     return float(earned @ gamma ** np.arange(1, len(earned) + 1))
@@ -270,12 +276,14 @@ def seen_by_critic(tasks: Sequence[Task], policy: PolicySettings, index: int, dr
     return np.hstack([*columns, np.tile(np.eye(len(tasks))[index], (len(drawn), 1))])
 
 
-def seed_iteration(run_seed: int, iteration: int) -> None:
+def seed_iteration(run_seed: int, iteration: int, part: int | None = None) -> None:
     """Seed every generator that an update uses, from the run's seed and the iteration alone.
 
-    So a run that goes on from a checkpoint draws what the uninterrupted one would have drawn.
+    So a run that goes on from a checkpoint draws what the uninterrupted one would have drawn. Where an
+    iteration has several updates, each of a `part` of virtual rows draws its own.
     """
-    torch_seed, numpy_seed = np.random.SeedSequence([run_seed, iteration, 1]).generate_state(2)
+    which = (1,) if part is None else (1, 1 + part)  # a zero at the end changes nothing
+    torch_seed, numpy_seed = np.random.SeedSequence([run_seed, iteration, *which]).generate_state(2)
     torch.manual_seed(int(torch_seed))
     np.random.seed(int(numpy_seed))
 

@@ -192,7 +192,9 @@ def headline(judged: Sequence[Judged]) -> str:
     best = recommended(judged)
     if best is None:
         if not judged:
-            return f"{NONE}: all that was tried slows traffic, loses flow, or failed."
+            return (
+                f"{NONE}: all that was tried did worse than people alone on the seeds that choose, or failed."
+            )
         worse = sum(bool(harm_of(each.effect)) for each in judged)
         harm = f" ({worse} of {len(judged)} slow traffic or lose flow)" if worse else ""
         return f"{NONE}: none of the shares judged on fresh seeds passes the rule{harm}."

@@ -75,6 +75,11 @@ class Loop(Scenario):
             raise ValueError(f"{self.size}: {high} m is not allowed as the largest; allowed: >= {low} m")
         if self.cavs > self.vehicles:
             raise ValueError(f"cavs: {self.cavs} is not allowed; allowed: <= vehicles, {self.vehicles}")
+        if self.human_control == "native" and self.calibrated and self.calibrated.residual is not None:
+            raise ValueError(
+                "human_control: native is not allowed for a population with a residual network, which SUMO's "
+                "own IDM knows nothing of; allowed: commanded"
+            )
         return self
 
     def lap(self, size: float) -> Lap:

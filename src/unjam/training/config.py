@@ -225,7 +225,12 @@ def load_config(
         if "tasks" in started and "tasks" not in given:
             _check_heeded(preset, started["tasks"], given)
         values = {**started, "preset": preset}
-    return build(RunConfig, changed(values, given), "")
+    wanted = changed(values, given)
+    if getattr(road, "actuation", "") == "cruise" and wanted.get("virtual", {}).get("model", "row") == "row":
+        wanted = changed(
+            {"virtual": {"virtual_ratio": 0.0}}, wanted
+        )  # rows know no ACC: model-free, unless said
+    return build(RunConfig, wanted, "")
 
 
 def _check_heeded(preset: str, tasks: Sequence[dict[str, Any]], given: dict[str, Any]) -> None:

@@ -48,6 +48,8 @@ GENERATIONS = 2
 MANIFEST, PROGRESS = "manifest.json", "progress.jsonl"
 STATE, TENSORS = "state.json", "tensors.safetensors"
 LOG = logging.getLogger(__name__)
+ROWS_TELL = {"to_crossing", "cav_share"}
+"""of what a road tells a CAV, what virtual rows go on with"""
 
 
 def check_possible(config: RunConfig) -> None:
@@ -68,7 +70,9 @@ def check_possible(config: RunConfig) -> None:
         make_reward(road.reward or scenario.reward)
         for name in road.evaluation.baselines:
             make_driver(name, scenario.decision_step)
-        if config.virtual.model == "road" and config.virtual.virtual_ratio > 0:
+        if config.virtual.virtual_ratio > 0 and config.virtual.model == "row":
+            _check_rows(road, scenario, expert)
+        if config.virtual.virtual_ratio > 0 and config.virtual.model == "road":
             from unjam.virtual.motorways import check_motorways  # which needs torch
             from unjam.virtual.roads import check_roads
 
@@ -77,6 +81,20 @@ def check_possible(config: RunConfig) -> None:
             else:
                 check_roads(scenario)
     config.make_tasks()
+
+
+def _check_rows(road: RunConfig, scenario: Scenario, expert: Driver) -> None:
+    """Raise `InputError` where rows cannot go on with what a CAV is told, or with how it is driven."""
+    told = set(expert.asks).union(*(feature(name).told for name in road.policy.observe))
+    missed = sorted(told & set(scenario.tells) - ROWS_TELL)
+    why = f"{expert.describe()} and the network ask for {', '.join(missed)}" if missed else ""
+    if scenario.actuation == "cruise":
+        why = "CAVs have an ACC of their own"
+    if why:
+        raise InputError(
+            f"virtual.model: row is not allowed on {scenario.title}, where {why}; allowed: road, or "
+            "virtual.virtual_ratio 0"
+        )
 
 
 def make_new_folder(folder: Path, otherwise: str = "") -> None:

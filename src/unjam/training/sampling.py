@@ -105,7 +105,8 @@ def episodes_of(
     for task, driver, count in zip(tasks, drivers, counts, strict=True):
         for part in range(count):
             turn = part % len(explore)
-            scenario = task.scenario.part(part - turn, count) if spread else task.scenario
+            together = part // len(explore), ceil(count / len(explore))
+            scenario = task.scenario.part(*together) if spread else task.scenario
             own = (*seed, len(wanted) - turn)
             wanted.append(EpisodeTask(scenario, driver, own, task.reward, explore[turn]))
     return wanted

@@ -162,7 +162,7 @@ def known_speed(base: str, scenario: Scenario) -> People:
         follow = commanded_speed if scenario.human_control == "commanded" else people_speed
         return partial(follow, people=scenario.humans, step=step)
     if make is None:
-        return lambda speed, leader_speed, gap: speed
+        return lambda speed, leader_speed, gap: speed + 0.0  # the caller writes into what it gets
     person = make(scenario)
 
     def driven(speed: Array, leader_speed: Array, gap: Array) -> Array:

@@ -130,6 +130,10 @@ def test_a_population_with_a_residual_is_refused_where_sumo_drives(tmp_path: Pat
     write_population(people, Population(one, (one,), (-9.0, 3.0), residual))
     with pytest.raises(InputError, match="residual network is not allowed on your own network"):
         scenario_of(game(tmp_path, "ramp"), population=str(people))
+    with pytest.raises(
+        InputError, match="human_control: native is not allowed for a population with a residual"
+    ):
+        make_scenario("ring", {"population": str(people), "human_control": "native"})
 
 
 def test_everyone_may_be_a_cav_and_nobody(file: Path, simulation: Simulation) -> None:
