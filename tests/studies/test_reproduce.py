@@ -50,6 +50,14 @@ def test_a_training_that_two_studies_want_is_planned_once(tmp_path: Path) -> Non
     assert both.seconds(4) < both.seconds(2)
 
 
+def test_a_study_that_was_begun_with_fewer_trainings_does_not_go_on_with_more(tmp_path: Path) -> None:
+    (tmp_path / "rings").mkdir()
+    (tmp_path / "rings/manifest.json").write_text('{"seeds": 2}')
+    assert make_plan(["rings"], 2, StudyFolder(tmp_path)).seeds == 2
+    with pytest.raises(InputError, match="seeds: 5 is not allowed; allowed: 2"):
+        make_plan(["rings"], 5, StudyFolder(tmp_path))
+
+
 def test_the_paper_settings_cost_what_their_budget_says() -> None:
     short, long = (estimated_seconds(PlannedRun("ring", name, 0)) for name in ("trpo", "trpo-exact"))
     assert long == pytest.approx(short * 4_000_000 / 300_000)

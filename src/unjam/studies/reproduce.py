@@ -59,6 +59,13 @@ def make_plan(names: Sequence[str], seeds: int, studies: StudyFolder) -> "Plan":
             if before != run.config:
                 words = f"out: {str(folder)!r} was trained with other settings; allowed: a new folder"
                 raise InputError(words)
+    for name in (name for name, study in chosen.items() if study.goes_on):
+        begun = studies.folder / name / "manifest.json"
+        before = json.loads(begun.read_text()).get("seeds", seeds) if begun.is_file() else seeds
+        if before != seeds:  # what is there already is of so many trainings
+            raise InputError(
+                f"seeds: {seeds} is not allowed; allowed: {before}, as in {begun}, or a new --out"
+            )
     missing = [run for run in wanted if not studies.has(run)]
     roads = dict.fromkeys(road for study in chosen.values() for road in study.roads)
     undriven = [road for road in roads if not (studies.drives_of(road) / EVALUATION_FILE).is_file()]
@@ -114,7 +121,7 @@ def reproduce(
         study, target = STUDIES[name], studies.folder / name
         on_line(f"writing {name}: {study.title}")
         make_folder(target)
-        begun = about_study(target) if study.goes_on else manifest()
+        begun = about_study(target, seeds=plan.seeds) if study.goes_on else manifest()
         study.write(studies, plan.seeds, target, workers)
         about = {"study": name, "title": study.title, "seeds": plan.seeds, **begun}
         about["trainings"] = [_trained_by(run, studies) for run in study.runs(plan.seeds)]

@@ -60,10 +60,10 @@ def planned(roads: Iterable[str], variants: Sequence[str], seeds: int) -> "list[
     ]
 
 
-def about_study(folder: Path) -> dict[str, Any]:
-    """Return where a study comes from: the manifest of its first call, and when it went on, by what."""
+def about_study(folder: Path, **facts: Any) -> dict[str, Any]:
+    """Return where a study comes from: its first call's manifest and `facts`, and when it went on, by what."""
     make_folder(folder)
-    path, about = folder / "manifest.json", manifest()
+    path, about = folder / "manifest.json", {**facts, **manifest()}
     if path.is_file():
         went_on = {"commit": about["commit"], "started": about["started"]}
         about = json.loads(path.read_text(encoding="utf-8"))
