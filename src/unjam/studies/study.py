@@ -61,7 +61,7 @@ def planned(roads: Iterable[str], variants: Sequence[str], seeds: int) -> "list[
 
 
 def about_study(folder: Path, **facts: Any) -> dict[str, Any]:
-    """Return where a study comes from: `facts`, the manifest of its first call, and when it went on by what."""
+    """Return where a study comes from: its first call (`facts`, manifest), and what went on with it when."""
     make_folder(folder)
     path, about = folder / "manifest.json", {**facts, **manifest()}
     if path.is_file():
