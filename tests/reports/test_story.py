@@ -74,7 +74,7 @@ def test_an_expert_that_earns_more_than_its_own_is_told_of() -> None:
     ("changes", "words"),
     [
         ({}, "; a car could drive so."),
-        ({"collisions": 2.0}, "; no car could drive so: 2 vehicles in contact"),
+        ({"status": "collision", "collisions": 2.0}, "; no car could drive so: 2 vehicles in contact"),
     ],
 )
 def test_the_lead_says_whether_a_car_could_drive_so(changes: dict[str, Any], words: str) -> None:

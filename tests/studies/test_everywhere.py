@@ -76,7 +76,7 @@ def test_the_best_of_a_road_could_have_driven_so_in_every_episode() -> None:
     measured = {who: [{**row, "travel_time": nan} for row in rows[who]] for who in (PEOPLE, "unjam:best")}
     careful = measured["unjam:best"]
     reckless = [{**row, "mean_speed_second_half": 9.0} for row in careful]
-    reckless[1]["collisions"] = 1.0
+    reckless[1] |= {"status": "collision", "collisions": 1.0}
     assert best_of({**measured, "reckless": reckless}) == "unjam:best"
     assert best_of({PEOPLE: measured[PEOPLE], "reckless": reckless}) == PEOPLE
 

@@ -208,8 +208,7 @@ def fuel_ml_per_km(episode: Episode) -> float:
 
 def throughput_veh_per_h(episode: Episode) -> float:
     """Flow [veh/h]: on a closed road distance driven by all vehicles over length and time (Edie 1963); of a
-    road with ends, the vehicles that left it over the time that it was to be driven, where demand has a peak
-    in its last ten minutes. Who arrives last does not decide it, where an episode ends with nobody left.
+    road with ends, who left it over the time that it was to be driven; of a peak, in its last ten minutes.
     """
     if episode.peak[1] > 0:
         end = min(round(episode.peak[1] / episode.step), episode.steps)
@@ -217,10 +216,9 @@ def throughput_veh_per_h(episode: Episode) -> float:
         there = ~np.isnan(episode.speeds[begin : end + 1])
         left = (there[:-1] & ~there[1:]).sum()
         return float(left * 3600.0 / max(end - begin, 1) / episode.step)
-    hours = episode.steps * episode.step / 3600.0
+    hours, planned = episode.steps * episode.step / 3600.0, np.nan_to_num(episode.planned) / 3600.0
     if np.isnan(episode.loop_length):
-        over = episode.status == "completed" and not np.isnan(episode.planned)
-        return episode.arrived / (episode.planned / 3600.0 if over else hours)
+        return episode.arrived / (hours if episode.status == "collision" else max(hours, planned))
     driven = np.nansum(episode.positions[-1] - episode.positions[0])
     return float(driven / episode.loop_length / hours)
 

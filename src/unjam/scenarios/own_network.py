@@ -42,7 +42,7 @@ class OwnNetwork(Scenario):
     """
 
     title: ClassVar[str] = "own-network"
-    reward: ClassVar[str] = "released"
+    reward: ClassVar[str] = "travel-time"
     closed: ClassVar[bool] = False
     has_coordinate: ClassVar[bool] = False
     tells: ClassVar[tuple[str, ...]] = ("allowed_speed", "lane_speeds", "cav_share")

@@ -72,7 +72,7 @@ def check_possible(config: RunConfig) -> None:
             make_driver(name, scenario.decision_step)
         if config.virtual.virtual_ratio > 0 and config.virtual.model == "row":
             _check_rows(road, scenario, expert)
-        if config.virtual.virtual_ratio > 0 and config.virtual.model == "road":
+        elif config.virtual.virtual_ratio > 0:
             from unjam.virtual.motorways import check_motorways  # which needs torch
             from unjam.virtual.roads import check_roads
 
@@ -91,10 +91,8 @@ def _check_rows(road: RunConfig, scenario: Scenario, expert: Driver) -> None:
     if scenario.actuation == "cruise":
         why = "CAVs have an ACC of their own"
     if why:
-        raise InputError(
-            f"virtual.model: row is not allowed on {scenario.title}, where {why}; allowed: road, or "
-            "virtual.virtual_ratio 0"
-        )
+        allowed = "allowed: road, or virtual.virtual_ratio 0"
+        raise InputError(f"virtual.model: row is not allowed on {scenario.title}, where {why}; {allowed}")
 
 
 def make_new_folder(folder: Path, otherwise: str = "") -> None:

@@ -192,9 +192,8 @@ class RingBatch:
 
     def perceive(self) -> LocalState:
         """Return what the CAVs perceive now: arrays of shape (CAVs * W,)."""
-        state = self._state()
-        if isinstance(state.speed, np.ndarray):
-            state = state.read_only()  # some of it is the world's own
+        state = self._state()  # of which some is the world's own
+        state = state.read_only() if isinstance(state.speed, np.ndarray) else state
         return self._readings.of_drivers(self.decisions, state)
 
     def _state(self) -> LocalState:
@@ -316,19 +315,15 @@ class RingBatch:
 
     def record(self, driven: Driven) -> Rings:
         """Return what happened since the start."""
-        headway, braking = self._with_headway(self._followed()), self._braking
-        share = self.roads[0].share_told(self.asked)
+        headway, share = self._with_headway(self._followed()), self.roads[0].share_told(self.asked)
         made, crashed = as_numpy(self._made), 1.0 - as_numpy(self._running)
+        kept = self._scenarios, self.roads, self._seeds, made, crashed
         return Rings(
             decisions=made,
             crashed=crashed,
             terms={name: as_numpy(total) for name, total in self._sums.items()},
             mean_speed=as_numpy(self._driven) / made,
             headway=as_numpy(headway).min(0),
-            braking=as_numpy(braking).max(0),
-            episodes=self._log.episodes(
-                self._scenarios, self.roads, self._seeds, made, crashed, driven, share
-            )
-            if self._keep
-            else (),
+            braking=as_numpy(self._braking).max(0),
+            episodes=self._log.episodes(*kept, driven, share) if self._keep else (),
         )
