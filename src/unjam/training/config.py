@@ -226,10 +226,9 @@ def load_config(
             _check_heeded(preset, started["tasks"], given)
         values = {**started, "preset": preset}
     wanted = changed(values, given)
-    if getattr(road, "actuation", "") == "cruise" and wanted.get("virtual", {}).get("model", "row") == "row":
-        wanted = changed(
-            {"virtual": {"virtual_ratio": 0.0}}, wanted
-        )  # rows know no ACC: model-free, unless said
+    if road.actuation == "cruise" and wanted.get("virtual", {}).get("model", "row") == "row":
+        # Virtual rows know no ACC of a CAV's own: without a model, unless one is asked for.
+        wanted = changed({"virtual": {"virtual_ratio": 0.0}}, wanted)
     return build(RunConfig, wanted, "")
 
 
