@@ -40,6 +40,8 @@ class ClosedTraffic(Traffic[ClosedRoad]):
         super().__init__(scenario, road, seed, simulation, full)
         vehicles = len(road.vehicle_ids)
         self.cavs, self.entered = road.cav_ids, len(road.cav_ids)
+        self.collisions = 0
+        """vehicles in contact with another when the episode ended"""
         self._places = [road.vehicle_ids.index(name) for name in road.cav_ids]
         """of the CAVs, in road order"""
         self._near = loop_neighbours(np.array(self._places), vehicles)
@@ -245,7 +247,8 @@ class ClosedTraffic(Traffic[ClosedRoad]):
     def record(self, driven: Driven) -> Episode:
         """Return what happened since the start."""
         log, rows = self._log(), None if self.single else np.arange(len(self.cavs))
-        return log.episode(self._checked(log), self._facts(), driven, rows)
+        facts = {**self._facts(), "collisions": self.collisions}
+        return log.episode(self._checked(log), facts, driven, rows)
 
     def _checked(self, log: ClosedLog) -> tuple[Floats, Floats]:
         speeds, positions = log.moments()

@@ -110,7 +110,7 @@ class OpenTraffic(Traffic[OpenKind]):
         self._stays = StayLog()
         self._log_waiting: list[int] = []
         self._log_fuel: list[float] = []
-        self._arrived = self._teleports = self.collisions = 0
+        self._arrived = self._teleports = 0
         self._touched.clear()
         self._forget()
         self._look()
@@ -184,7 +184,6 @@ class OpenTraffic(Traffic[OpenKind]):
         colliding = self._simulation.colliding()
         if colliding:
             self._touched.update(colliding)
-            self.collisions = len(self._touched)
             self.crashed = self.crashed or self._ends_with(colliding)
 
     def _follow(self) -> None:
@@ -267,6 +266,7 @@ class OpenTraffic(Traffic[OpenKind]):
             "fuel": held if self.full else np.zeros((0, 0)),
             "arrived": self._arrived,
             "teleports": self._teleports,
+            "collisions": len(self._touched),
             "waiting": np.array(self._log_waiting, np.float64),
             "lifted": len(self._lifted.keys() & set(vehicles)),
             "planned": self.scenario.horizon * self.scenario.decision_step,

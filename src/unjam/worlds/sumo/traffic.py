@@ -76,8 +76,6 @@ class Traffic(World[Episode], Generic[RoadKind]):
         self.crashed = False
         self.over = False
         """whether nobody is on the road any more, nor will be"""
-        self.collisions = 0
-        """vehicles in contact with another"""
         self.decisions = 0
         """made since the log began"""
         self.entered = 0
@@ -184,6 +182,5 @@ class Traffic(World[Episode], Generic[RoadKind]):
             "step": self.scenario.decision_step,
             "warmup": self.scenario.warmup,
             "drawn": self.road.drawn,
-            "collisions": self.collisions,
             "limit_speed": self.road.limit_speed,
         }
