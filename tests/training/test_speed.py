@@ -2,11 +2,14 @@ import os
 from collections.abc import Iterator
 
 import pytest
+import torch
 
 from unjam.drivers import PISaturation
 from unjam.drivers.from_file import check_driver
-from unjam.training import speed
-from unjam.training.speed import measure_speed, neural_driver
+from unjam.errors import MissingPartError
+from unjam.training import batch_speed, speed
+from unjam.training.batch_speed import measure_batches, neural_driver
+from unjam.training.speed import measure_speed
 
 RATES = ("bare_steps_per_s", "episode_steps_per_s", "traci_steps_per_s", "every_step_steps_per_s")
 
@@ -18,7 +21,7 @@ def short(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(speed, "VIRTUAL", {"long": (500, 20), "short": (50, 10)})
     monkeypatch.setattr(speed, "SIZES", {22: 200, 66: 100})
     monkeypatch.setattr(speed, "BATCH", 2200)
-    monkeypatch.setattr(speed, "BATCH_DECISIONS", 20)
+    monkeypatch.setattr(batch_speed, "DECISIONS", 20)
 
 
 @pytest.fixture(autouse=True)
@@ -70,3 +73,26 @@ def test_measures_rates_and_their_ratios_and_gives_back_the_cores_that_it_did_no
     assert found["growth"] == max(costs) / costs[0]
     assert told == ["round 1 of 1", "larger roads"]
     assert cores is None or os.sched_getaffinity(0) == cores
+
+
+def test_batches_of_growing_size_are_measured_with_people_who_have_networks_and_without(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(batch_speed, "DECISIONS", 3)
+    monkeypatch.setattr(batch_speed, "RINGS", {"cpu": (2, 5)})
+    told: list[str] = []
+    found = measure_batches("cpu", told.append)
+    assert found["device"] == "one core"
+    assert list(found["batches"]) == ["people by IDM", "by IDM and networks"]
+    for rates in found["batches"].values():
+        assert [entry["rings"] for entry in rates] == [2, 5]
+        assert all(
+            entry["vehicle_steps_per_s"] == pytest.approx(22 * entry["steps_per_s"]) for entry in rates
+        )
+    assert len(told) == 4
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="a GPU")
+def test_batches_on_a_graphics_card_that_is_not_there_are_refused() -> None:
+    with pytest.raises(MissingPartError, match="device: cuda is not there; use cpu"):
+        measure_batches("cuda")

@@ -3,13 +3,15 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 from unjam.drivers import PISaturation
 from unjam.errors import InputError
 from unjam.scenarios import FigureEight, Merge, Ring
 from unjam.scenarios.ring import Loop
+from unjam.virtual.ensemble import torch_generator
 from unjam.virtual.fitting import Fit
-from unjam.virtual.roads import RoadModel, check_roads, fit_roads, moments_of
+from unjam.virtual.roads import RoadModel, check_roads, fit_roads, known_speed, moments_of, people_of
 from unjam.virtual.settings import VirtualSettings
 from unjam.worlds.batch.run import run_batch
 from unjam.worlds.record import Episode
@@ -93,3 +95,13 @@ def test_moments_are_what_was_recorded_and_what_came_next(episodes: list[Episode
 def test_other_roads_are_refused_in_one_line(road: Any, why: str) -> None:
     with pytest.raises(InputError, match=f"virtual.model: road is not allowed; allowed: row, for .*{why}"):
         check_roads(road)
+
+
+def test_people_with_networks_drive_on_tensors_as_on_arrays(episodes: list[Episode]) -> None:
+    model, _ = fitted(episodes, base="none", epochs=5)
+    seen = [np.array([[3.0, 9.0], [0.0, 25.0]]), np.array([[4.0, 2.0], [1.0, 20.0]])]
+    seen.append(np.array([[5.0, 12.0], [2.0, 30.0]]))
+    on_arrays, on_tensors = (people_of(model, RING, torch_generator((1,), "cpu")) for _ in range(2))
+    found = on_tensors(*map(torch.from_numpy, seen))
+    assert torch.equal(found, torch.from_numpy(on_arrays(*seen)))
+    assert not torch.equal(found, known_speed("none", RING)(*map(torch.from_numpy, seen)))

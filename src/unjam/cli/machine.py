@@ -7,7 +7,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from importlib.metadata import PackageNotFoundError, version
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 from rich.markup import escape
@@ -23,6 +23,9 @@ TESTED_SUMO = RESULTS_SUMO.rpartition(".")[0]
 """minor version of SUMO that is supported"""
 TORCH_CPU = "https://download.pytorch.org/whl/cpu"
 """index of builds of torch that are a tenth of the size of those for graphics cards"""
+
+
+HEADINGS = ("steps/s", "vehicle-steps/s")
 
 
 def doctor(json: JsonOption = False) -> None:
@@ -161,6 +164,10 @@ def _episode() -> str:
 
 def bench(
     rounds: Annotated[int, typer.Option(min=1, help="Rounds in which all parts are measured in turn.")] = 7,
+    device: Annotated[
+        Literal["cpu", "cuda"] | None,
+        typer.Option(help="Measure batches of growing size there instead, SUMO aside."),
+    ] = None,
     json: JsonOption = False,
 ) -> None:
     """Measure how fast episodes run here, beside bare SUMO, over TraCI, in a batch, and virtual ones.
@@ -171,6 +178,9 @@ def bench(
 
       unjam bench
     """
+    if device:
+        _bench_batches(device, json)
+        return
     from unjam.training.speed import measure_speed
 
     found = measure_speed(rounds, aside.print)
@@ -210,3 +220,19 @@ def bench(
     for entry in batch["scaling"]:
         cost = f"{1e3 * entry['us_per_vehicle_step']:.1f} ns a vehicle-step in a batch"
         console.print(f"{entry['vehicles']:>5} vehicles: {cost}")
+
+
+def _bench_batches(device: Literal["cpu", "cuda"], json: bool) -> None:
+    """Measure batches of growing size on a device, and print it."""
+    from unjam.training.batch_speed import measure_batches
+
+    found = measure_batches(device, aside.print)
+    if json:
+        print_json(found)
+        return
+    for name, rates in found["batches"].items():
+        table = new_table((f"rings of {found['vehicles']} vehicles on {found['device']}, {name}",), HEADINGS)
+        for entry in rates:
+            speeds = (f"{entry[key]:,.0f}" for key in ("steps_per_s", "vehicle_steps_per_s"))
+            table.add_row(f"{entry['rings']:,} at once", *speeds)
+        console.print(table)

@@ -4,11 +4,8 @@ Machines differ, and one machine differs from minute to minute: what counts are 
 their parts measured in turn.
 """
 
-import itertools
 import os
-import time
 from collections import deque
-from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
 from statistics import median
@@ -17,23 +14,19 @@ from typing import Any
 import numpy as np
 import torch
 
-from unjam.drivers.network import Network
-from unjam.drivers.pi_saturation import PISaturation
 from unjam.drivers.residual import ResidualDriver
 from unjam.learners.settings import PolicySettings
 from unjam.scenarios import SCENARIOS
-from unjam.scenarios.ring import Ring
 from unjam.scenarios.scenario import Scenario
+from unjam.training.batch_speed import batch_of, batch_rate, neural_driver, rate, ring_of
 from unjam.training.executors import OnLine
 from unjam.virtual.data import ActualData
 from unjam.virtual.ensemble import torch_generator
 from unjam.virtual.model import EnvironmentModel
 from unjam.virtual.rollout import begin, draw_starts, imagine
 from unjam.virtual.settings import VirtualSettings
-from unjam.virtual.world import VirtualDynamics, on_device
+from unjam.virtual.world import VirtualDynamics
 from unjam.worlds.audit import brakings, following
-from unjam.worlds.batch.run import begin as begin_batch
-from unjam.worlds.batch.world import RingBatch
 from unjam.worlds.drive import Drive
 from unjam.worlds.episode import run_episode
 from unjam.worlds.record import Episode
@@ -49,25 +42,11 @@ VIRTUAL = {"long": (2000, 50), "short": (1200, 10)}
 of training on the ring"""
 BATCH = 90_112
 """vehicles on all rings of a batch together: 4,096 rings of 22"""
-BATCH_DECISIONS = 100
-"""driven in each round"""
-METRES_PER_VEHICLE = 245 / 22
 OTHER_ROADS = ("figure-eight", "merge")
 """roads beside the ring on which `run_episode` is compared with SUMO alone"""
 
 Rates = dict[str, list[float]]
 """steps per second, by what was measured, of each round"""
-
-
-def neural_driver(hold: int) -> ResidualDriver:
-    """Return PI with a residual network of the paper's size that chooses every `hold` decisions."""
-    generator = np.random.default_rng(0)
-    sizes = [5, 64, 64, 1]
-    layers = tuple(
-        (generator.normal(size=(inputs, outputs)) / 100, np.zeros(outputs))
-        for inputs, outputs in itertools.pairwise(sizes)
-    )
-    return ResidualDriver(PISaturation(), Network(layers, 1.0, 0.1), 1.0, hold=hold)
 
 
 def measure_speed(rounds: int = ROUNDS, on_line: OnLine = lambda line: None) -> dict[str, Any]:
@@ -102,7 +81,7 @@ def _measure(rounds: int, on_line: OnLine) -> dict[str, Any]:
     roads: dict[str, Rates] = {name: {"bare": [], "episode": []} for name in ("ring", *OTHER_ROADS)}
     rates: Rates = {name: [] for name in ("every_step", "unfiltered", "audit", "loop", "traci", *VIRTUAL)}
     torch.set_num_threads(1)
-    batches = {vehicles: _batch(vehicles, driver) for vehicles in SIZES}
+    batches = {vehicles: batch_of(BATCH // vehicles, vehicles, driver) for vehicles in SIZES}
     rates |= {f"batch {vehicles}": [] for vehicles in batches}
     with Simulation() as simulation:
         for name in OTHER_ROADS:  # networks made, caches warm
@@ -115,16 +94,16 @@ def _measure(rounds: int, on_line: OnLine) -> dict[str, Any]:
                 road = SCENARIOS[name]
                 make_traffic(road, (number,), simulation)
                 steps = road.horizon * road.steps_per_decision
-                found["bare"].append(_rate(partial(_step, simulation, steps), road.horizon))
+                found["bare"].append(rate(partial(_step, simulation, steps), road.horizon))
                 found["episode"].append(_episode_rate(road, driver, number, simulation))
             rates["every_step"].append(_episode_rate(ring, every_step, number, simulation))
             bare = replace(ring, safety=replace(ring.safety, active=False))
             rates["unfiltered"].append(_episode_rate(bare, driver, number, simulation))
-            rates["audit"].append(_rate(partial(_audit, driven), ring.horizon))
+            rates["audit"].append(rate(partial(_audit, driven), ring.horizon))
             for name, (rows, decisions) in VIRTUAL.items():
                 rates[name].append(_virtual_rate(driven, ring, driver, rows, decisions))
             for vehicles, batch in batches.items():
-                rates[f"batch {vehicles}"].append(_batch_rate(batch, vehicles))
+                rates[f"batch {vehicles}"].append(batch_rate(batch, BATCH // vehicles))
             rates["loop"].append(_loop_rate(ring, driver, simulation))
         with Simulation("traci") as simulation:
             rates["traci"].append(_loop_rate(replace(ring, horizon=TRACI_STEPS), driver, simulation))
@@ -181,53 +160,21 @@ def _scaling(driver: ResidualDriver, rounds: int) -> list[dict[str, float]]:
     costs: dict[int, list[float]] = {vehicles: [] for vehicles in SIZES}
     for _ in range(rounds):
         for vehicles, horizon in SIZES.items():
-            ring = _ring(vehicles, horizon)
+            ring = ring_of(vehicles, horizon)
             with Simulation() as simulation:
                 costs[vehicles].append(1e6 / _loop_rate(ring, driver, simulation) / vehicles)
     return [{"vehicles": vehicles, "us_per_vehicle_step": median(found)} for vehicles, found in costs.items()]
 
 
-def _ring(vehicles: int, horizon: int) -> Ring:
-    """Return a ring of the usual density, one CAV in 22."""
-    length = round(vehicles * METRES_PER_VEHICLE)
-    return Ring(length=(length, length), vehicles=vehicles, cavs=vehicles // 22, horizon=horizon)
-
-
-def _batch(vehicles: int, driver: ResidualDriver) -> Iterator[object]:
-    """Begin a batch of rings of that many vehicles each, and return what drives on as far as it is asked."""
-    rings, generator = BATCH // vehicles, torch_generator((0,), "cpu")
-    world = RingBatch(
-        [_ring(vehicles, 10**9)] * rings,
-        [(number,) for number in range(rings)],
-        partial(on_device, device="cpu"),
-        keep=False,
-        draw=lambda shape: torch.randn(shape, generator=generator),
-    )
-    return iter(begin_batch(world, driver, partial(on_device, device="cpu"), explore=True))
-
-
-@torch.no_grad()
-def _batch_rate(driving: Iterator[object], vehicles: int) -> float:
-    """Return steps of whole rings per second."""
-    some = itertools.islice(driving, BATCH_DECISIONS)
-    return _rate(lambda: deque(some, maxlen=0), BATCH // vehicles * BATCH_DECISIONS)
-
-
-def _rate(run: Callable[[], object], steps: int) -> float:
-    started = time.perf_counter()
-    run()
-    return steps / (time.perf_counter() - started)
-
-
 def _episode_rate(road: Scenario, driver: ResidualDriver, seed: int, simulation: Simulation) -> float:
     run = partial(run_episode, road, driver, (seed,), explore=True, simulation=simulation)
-    return _rate(run, road.horizon)
+    return rate(run, road.horizon)
 
 
 def _loop_rate(scenario: Scenario, driver: ResidualDriver, simulation: Simulation) -> float:
     """Return decisions per second of the driving loop alone."""
     traffic = make_traffic(scenario, (1,), simulation, driver.plain_numbers)
-    return _rate(lambda: deque(Drive(traffic, driver, explore=True), maxlen=0), scenario.horizon)
+    return rate(lambda: deque(Drive(traffic, driver, explore=True), maxlen=0), scenario.horizon)
 
 
 def _virtual_rate(
@@ -241,7 +188,7 @@ def _virtual_rate(
     world = VirtualDynamics(model, scenario, "", generator)
     starts = draw_starts(data, rows, 1, (0,))
 
-    return _rate(
+    return rate(
         lambda: imagine(driver, world, begin(data, starts, driver.expert, "cpu"), decisions, generator),
         rows * decisions,
     )

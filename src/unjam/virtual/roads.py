@@ -20,7 +20,7 @@ from torch import Tensor
 
 from unjam.drivers.local_state import LARGEST_GAP, LocalState
 from unjam.errors import InputError
-from unjam.physics.arrays import Array
+from unjam.physics.arrays import Array, at_least
 from unjam.physics.kinematics import gap_on_loop, next_speed
 from unjam.scenarios.ring import Loop
 from unjam.scenarios.road import ClosedRoad
@@ -174,7 +174,8 @@ def known_speed(base: str, scenario: Scenario) -> People:
 
 def _inputs(speed: Array, leader_speed: Array, gap: Array, known: Array) -> Tensor:
     """Return what the networks see of vehicles of any shape, one row each."""
-    return torch.from_numpy(np.stack([each.ravel() for each in (speed, leader_speed, gap, known)], 1))
+    seen = [each.ravel() for each in (speed, leader_speed, gap, known)]
+    return torch.from_numpy(np.stack(seen, 1)) if isinstance(speed, np.ndarray) else torch.stack(seen, 1)
 
 
 def residual_of(model: RoadModel, generator: torch.Generator) -> Learned | None:
@@ -183,10 +184,11 @@ def residual_of(model: RoadModel, generator: torch.Generator) -> Learned | None:
         return None
     layers = model.layers()
 
-    def residual(speed: Floats, leader_speed: Floats, gap: Floats, known: Floats) -> Floats:
-        members = random_members(model.members, speed.size, generator)
-        found = predict(layers, _inputs(speed, leader_speed, gap, known).float(), members)
-        return found.numpy().reshape(speed.shape)
+    def residual(speed: Array, leader_speed: Array, gap: Array, known: Array) -> Array:
+        inputs = _inputs(speed, leader_speed, gap, known).float()
+        found = predict(layers, inputs, random_members(model.members, len(inputs), generator))
+        found = found.numpy() if isinstance(speed, np.ndarray) else found
+        return found.reshape(speed.shape)
 
     return residual
 
@@ -197,9 +199,9 @@ def people_of(model: RoadModel, scenario: Scenario, generator: torch.Generator) 
     if residual is None:
         return known
 
-    def driven(speed: Floats, leader_speed: Floats, gap: Floats) -> Floats:
+    def driven(speed: Array, leader_speed: Array, gap: Array) -> Array:
         base = known(speed, leader_speed, gap)
-        return np.maximum(base + residual(speed, leader_speed, gap, base), 0.0)
+        return at_least(base + residual(speed, leader_speed, gap, base), 0.0)
 
     return driven
 

@@ -23,7 +23,7 @@ from unjam.measures.metrics import measure
 from unjam.physics.arrays import Array
 from unjam.scenarios import FigureEight, Ring
 from unjam.scenarios.population import Population, write_population
-from unjam.training.speed import neural_driver
+from unjam.training.batch_speed import neural_driver
 from unjam.worlds.batch.begun import Begun, BegunRings
 from unjam.worlds.batch.noise import NoiseState
 from unjam.worlds.batch.possible import why_not
