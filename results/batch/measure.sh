@@ -9,3 +9,5 @@ unjam bench --json --rounds 5 > bench.json
 python parity-eight.py > parity-eight.json
 PYTHONPATH=../.. python one-step-eight.py > one-step-eight.json
 python parity-on-ramp.py > parity-on-ramp.json
+unjam bench --device cpu --json > sizes-cpu.json
+# where there is a graphics card, which needs a torch that knows it: unjam bench --device cuda --json > sizes-gpu.json
