@@ -55,6 +55,18 @@ def mean_of(name: str, driver: str, metric: str) -> float:
     return estimate_of(rows_of(name)[driver], metric).mean
 
 
+def batch_sizes() -> pd.DataFrame:
+    """Return how many steps vehicles make in a second, by how many rings are stepped at once and on what."""
+    columns = {}
+    for name in ("cpu", "gpu"):
+        measured = json.loads((RESULTS / f"batch/sizes-{name}.json").read_text())
+        for people, found in measured["batches"].items():
+            columns[f"{measured['device']}, {people} [million/s]"] = {
+                f"{entry['rings']:,} rings": f"{entry['vehicle_steps_per_s'] / 1e6:,.1f}" for entry in found
+            }
+    return pd.DataFrame(columns).fillna("")
+
+
 def knowledge_rows(road: str) -> pd.DataFrame:
     """Return what the study of knowledge measured on a road: a row per model, number of steps and seed."""
     rows = json.loads((RESULTS / "model/knowledge.json").read_text())["rows"]
