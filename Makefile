@@ -59,16 +59,22 @@ bench: $(VENV)/.installed
 clean:
 	rm -rf $(VENV) docs/_build .pytest_cache .ruff_cache
 
-$(VENV)/.installed: pyproject.toml constraints.txt
+# What comes with Python is an old pip, which takes twice as long
+define set_up
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 		{ echo "unjam needs Python 3.11 or newer; name one: make demo PYTHON=python3.11"; exit 3; }
 	@echo "setting up $(VENV): a few minutes, once"
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	@$(PIP) "pip>=26"
 	@$(PIP) $(TORCH_INDEX) torch
-	@$(PIP) -e ".[train]"
+	@$(PIP) -e ".[$(1)]"
 	@touch $@
+endef
 
-$(VENV)/.installed-dev: $(VENV)/.installed
-	@echo "adding what tests, checks and docs need"
-	@$(PIP) -e ".[dev]"
-	@touch $@
+$(VENV)/.installed: pyproject.toml constraints.txt
+	$(call set_up,train)
+
+# with what tests, checks and docs need
+$(VENV)/.installed-dev: pyproject.toml constraints.txt
+	$(call set_up,dev)
+	@touch $(VENV)/.installed

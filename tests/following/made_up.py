@@ -47,7 +47,7 @@ def write_table(path: Path, drivers: int = 3) -> None:
     """Write a CSV file of trajectories as a user has them, of drivers who differ in their headway."""
     parts = []
     for number in range(drivers):
-        pair = idm_driver(IDMParameters(time_headway=0.9 + 0.1 * number), seed=number, seconds=24.0)
+        pair = idm_driver(IDMParameters(time_headway=0.9 + 0.1 * number), seed=number, seconds=20.0)
         times = STEP * np.arange(len(pair.speed))
         numbers = {"t": times, "v_foll": pair.speed, "v_lead": pair.leader_speed, "gap": pair.gap}
         parts.append(pd.DataFrame({"pair": number, **numbers}))
