@@ -166,7 +166,7 @@ def bench(
     rounds: Annotated[int, typer.Option(min=1, help="Rounds in which all parts are measured in turn.")] = 7,
     device: Annotated[
         Literal["cpu", "cuda"] | None,
-        typer.Option(help="Measure batches of growing size there instead, SUMO aside."),
+        typer.Option(help="Step batches of rings there instead, and say how fast by their size."),
     ] = None,
     json: JsonOption = False,
 ) -> None:
