@@ -64,10 +64,6 @@ COLUMNS = {
     "collisions": ("collisions", 2),
 }
 """what the honest tables show: a metric and its digits"""
-OF_RECORDINGS = ("field/field.json", "field/ngsim-drivers.json")
-"""results of recorded people, among whom is no CAV"""
-FILTERED = "2026-11-22T13:41"
-"""since when there is a safety filter"""
 OF_THE_RING = ("return", "mean speed [m/s]", "of the limit, steady", "std across vehicles [m/s]")
 OF_THE_RING += ("smallest headway [s]", "collisions")
 OF_THE_EIGHT = ("return", "return, Eq. 16", "mean speed [m/s]", "steady [m/s]", "std across vehicles [m/s]")
@@ -95,19 +91,6 @@ def honest(
         cells["better"] = "" if better is None else interval({"low": None, "high": None, **better}, 2)
         table.append(cells)
     return pd.DataFrame(table)
-
-
-def made_before_the_filter() -> str:
-    """Return which results were measured before CAVs had a safety filter, but for those without any CAV."""
-    before = set[str]()
-    for path in RESULTS.rglob("*.json"):
-        place, found = path.relative_to(RESULTS), json.loads(path.read_text())
-        about = found if isinstance(found, dict) else {}
-        when = (about.get("manifest") or about).get("started", FILTERED)
-        if when < FILTERED and place.parts[0] != "tried" and str(place) not in OF_RECORDINGS:
-            before.add(place.parts[0])
-    words = "Made before CAVs had [the safety filter](safety.md)"
-    return f"{words}: {', '.join(sorted(before))}." if before else ""
 
 
 def merge_capacity() -> pd.DataFrame:

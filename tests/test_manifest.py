@@ -73,3 +73,20 @@ def test_a_package_installed_inside_somebody_elses_checkout_has_no_commit(
 def test_without_git_there_is_no_commit(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PATH", "")
     assert manifest()["commit"] is None
+
+
+RESULTS = Path(__file__).parents[1] / "results"
+FILTERED = "2026-11-22T13:41"
+"""since when CAVs have a safety filter"""
+WITHOUT_CAVS = {"field/field.json", "field/ngsim-drivers.json", "figure-6/figure-6.json"}
+"""results of people, recorded or made up"""
+
+
+def test_no_result_with_cavs_is_older_than_their_filter() -> None:
+    older = set[str]()
+    for path in RESULTS.rglob("*.json"):
+        place, found = path.relative_to(RESULTS), json.loads(path.read_text())
+        about = found if isinstance(found, dict) else {}
+        if (about.get("manifest") or about).get("started", FILTERED) < FILTERED:
+            older.add(str(place))
+    assert {place for place in older if not place.startswith("tried/")} == WITHOUT_CAVS
