@@ -62,9 +62,11 @@ def batch_sizes() -> pd.DataFrame:
         measured = json.loads((RESULTS / f"batch/sizes-{name}.json").read_text())
         for people, found in measured["batches"].items():
             columns[f"{measured['device']}, {people} [million/s]"] = {
-                f"{entry['rings']:,} rings": f"{entry['vehicle_steps_per_s'] / 1e6:,.1f}" for entry in found
+                entry["rings"]: f"{entry['vehicle_steps_per_s'] / 1e6:,.1f}" for entry in found
             }
-    return pd.DataFrame(columns).fillna("")
+    table = pd.DataFrame(columns).fillna("")
+    table.insert(0, "rings at once", [f"{rings:,}" for rings in table.index])
+    return table
 
 
 def knowledge_rows(road: str) -> pd.DataFrame:
