@@ -177,6 +177,8 @@ def bench(
     Example:
 
       unjam bench
+
+      unjam bench --device cuda
     """
     if device:
         _bench_batches(device, json)
