@@ -174,7 +174,7 @@ def bench(
 
     One core. Look at the ratios: steps per second change with the machine, and with the minute.
 
-    Example:
+    Examples:
 
       unjam bench
 

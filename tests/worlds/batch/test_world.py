@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -24,8 +25,9 @@ from unjam.physics.arrays import Array
 from unjam.scenarios import FigureEight, Ring
 from unjam.scenarios.population import Population, write_population
 from unjam.training.batch_speed import neural_driver
+from unjam.virtual.world import on_device
 from unjam.worlds.batch.begun import Begun, BegunRings
-from unjam.worlds.batch.noise import NoiseState
+from unjam.worlds.batch.noise import NoiseState, Numbers
 from unjam.worlds.batch.possible import why_not
 from unjam.worlds.batch.run import BEGUN, begin, run_batch, run_batches
 from unjam.worlds.batch.world import RingBatch
@@ -35,6 +37,7 @@ from unjam.worlds.record import Episode, Floats
 from unjam.worlds.sumo.simulation import Simulation
 from unjam.worlds.workers import EpisodeTask
 
+NEEDS_A_CARD = pytest.mark.skipif(not torch.cuda.is_available(), reason="no graphics card")
 SHORT = Ring(horizon=300)
 NO_FILTER = SafetyFilter(active=False)
 WRONG: dict[str, Any] = {
@@ -231,10 +234,6 @@ def doubles(values: Floats) -> Tensor:
     return torch.as_tensor(values)
 
 
-def singles(values: Floats) -> Tensor:
-    return torch.as_tensor(values, dtype=torch.float32)
-
-
 @pytest.mark.parametrize("wrong", [{}, WRONG], ids=["exact sensors", "wrong sensors"])
 def test_tensors_do_what_arrays_do(wrong: dict[str, Any]) -> None:
     asked = tasks(Ring(horizon=200, cavs=2, warmup=100, **wrong), neural_driver(10), range(3))
@@ -242,9 +241,14 @@ def test_tensors_do_what_arrays_do(wrong: dict[str, Any]) -> None:
         assert_alike(one, other)
 
 
-def test_single_precision_is_near() -> None:
+def singles(device: str) -> Numbers:
+    return partial(on_device, device=device)
+
+
+@pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=NEEDS_A_CARD)])
+def test_single_precision_is_near(device: str) -> None:
     asked = tasks(Ring(horizon=300), neural_driver(10), range(3))
-    for one, other in zip(run_batch(asked), run_batch(asked, singles), strict=True):
+    for one, other in zip(run_batch(asked), run_batch(asked, singles(device)), strict=True):
         assert np.abs(one.speeds - other.speeds).max() < 1e-3
         assert other.reward.sum() == pytest.approx(one.reward.sum(), rel=1e-4)
 
@@ -282,8 +286,10 @@ def test_quick_noise_is_of_the_same_size_and_cavs_have_none() -> None:
         return torch.randn(shape, generator=generator)
 
     ring = Ring(horizon=30, noise=2.0, humans=replace(Ring().humans, time_headway=0.5))
-    world = RingBatch([replace(ring, warmup=60)] * 50, [(seed,) for seed in range(50)], singles, draw=draw)
-    episodes = driven_to_the_end(begin(world, Constant(0.2), singles)).episodes
+    world = RingBatch(
+        [replace(ring, warmup=60)] * 50, [(seed,) for seed in range(50)], singles("cpu"), draw=draw
+    )
+    episodes = driven_to_the_end(begin(world, Constant(0.2), singles("cpu"))).episodes
     noise = [
         each.speeds[1:] - np.diff(each.positions, axis=0) / each.step
         for each in episodes
