@@ -78,8 +78,8 @@ def test_without_git_there_is_no_commit(monkeypatch: pytest.MonkeyPatch) -> None
 RESULTS = Path(__file__).parents[1] / "results"
 FILTERED = "2026-11-22T13:41"
 """since when CAVs have a safety filter"""
-WITHOUT_CAVS = {"field/field.json", "field/ngsim-drivers.json", "figure-6/figure-6.json"}
-"""results of people, recorded or made up"""
+OF_RECORDED_PEOPLE = {"field/field.json", "field/ngsim-drivers.json"}
+"""among whom is no CAV"""
 
 
 def test_no_result_with_cavs_is_older_than_their_filter() -> None:
@@ -89,4 +89,4 @@ def test_no_result_with_cavs_is_older_than_their_filter() -> None:
         about = found if isinstance(found, dict) else {}
         if (about.get("manifest") or about).get("started", FILTERED) < FILTERED:
             older.add(str(place))
-    assert {place for place in older if not place.startswith("tried/")} == WITHOUT_CAVS
+    assert {place for place in older if not place.startswith("tried/")} == OF_RECORDED_PEOPLE
