@@ -25,9 +25,6 @@ TORCH_CPU = "https://download.pytorch.org/whl/cpu"
 """index of builds of torch that are a tenth of the size of those for graphics cards"""
 
 
-HEADINGS = ("steps/s", "vehicle-steps/s")
-
-
 def doctor(json: JsonOption = False) -> None:
     """Check SUMO, its version, a display, the cache, and one real episode; say what to do where one fails.
 
@@ -233,7 +230,8 @@ def _bench_batches(device: Literal["cpu", "cuda"], json: bool) -> None:
         print_json(found)
         return
     for name, rates in found["batches"].items():
-        table = new_table((f"rings of {found['vehicles']} vehicles on {found['device']}, {name}",), HEADINGS)
+        heading = f"rings of {found['vehicles']} vehicles on {found['device']}, {name}"
+        table = new_table((heading,), ("steps/s", "vehicle-steps/s"))
         for entry in rates:
             speeds = (f"{entry[key]:,.0f}" for key in ("steps_per_s", "vehicle_steps_per_s"))
             table.add_row(f"{entry['rings']:,} at once", *speeds)

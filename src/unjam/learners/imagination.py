@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from unjam.drivers.network import Network
 from unjam.drivers.residual import ResidualDriver
-from unjam.errors import MissingPartError
 from unjam.following.calibration import calibrated_people
 from unjam.learners.experience import Experience
 from unjam.learners.learner import under
@@ -27,7 +26,7 @@ from unjam.virtual.model import EnvironmentModel
 from unjam.virtual.roads import RoadModel
 from unjam.virtual.rollout import Rollouts, begin, draw_starts, imagine, return_bound, rollout_length
 from unjam.virtual.settings import VirtualSettings
-from unjam.virtual.world import VirtualDynamics
+from unjam.virtual.world import VirtualDynamics, check_is_there
 from unjam.worlds.episode import Task
 from unjam.worlds.record import Episode, Floats
 from unjam.worlds.workers import EpisodeTask
@@ -70,8 +69,7 @@ class Imagination(Generic[Model]):
         Raises:
             MissingPartError: the device that the settings name is not there.
         """
-        if settings.device == "cuda" and not torch.cuda.is_available():
-            raise MissingPartError("virtual.device: cuda is not there; use cpu")
+        check_is_there(settings.device, "virtual.device")
         self.settings = settings
         self.name = f"virtual-{index}" if index else "virtual"
         """in checkpoints"""

@@ -5,7 +5,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from functools import partial
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
@@ -14,20 +14,18 @@ from unjam.drivers.driver import Driver
 from unjam.drivers.network import Network
 from unjam.drivers.pi_saturation import PISaturation
 from unjam.drivers.residual import ResidualDriver
-from unjam.errors import MissingPartError
 from unjam.learners.settings import PolicySettings
 from unjam.manifest import manifest
 from unjam.scenarios.ring import Ring
 from unjam.training.executors import OnLine
 from unjam.virtual.ensemble import torch_generator
 from unjam.virtual.roads import RoadModel, people_of
-from unjam.virtual.settings import VirtualSettings
-from unjam.virtual.world import on_device
+from unjam.virtual.settings import Device, VirtualSettings
+from unjam.virtual.world import check_is_there, on_device
 from unjam.worlds.batch.people import People
 from unjam.worlds.batch.run import begin
 from unjam.worlds.batch.world import RingBatch
 
-Device = Literal["cpu", "cuda"]
 DECISIONS = 100
 """driven in each round"""
 METRES_PER_VEHICLE = 245 / 22
@@ -109,8 +107,7 @@ def measure_batches(device: Device, on_line: OnLine = lambda line: None) -> dict
     Raises:
         MissingPartError: there is no such device.
     """
-    if device == "cuda" and not torch.cuda.is_available():
-        raise MissingPartError("device: cuda is not there; use cpu")
+    check_is_there(device)
     torch.set_num_threads(1)
     driver = neural_driver(PolicySettings().decisions_held(ring_of(VEHICLES, 1).decision_step))
     model = RoadModel(LEARNED, (0,)).to(device)

@@ -8,6 +8,7 @@ from pydantic.dataclasses import dataclass
 from unjam.parameters import STRICT, Count, CountOrNone, NotNegative, Positive
 
 BaseName = Literal["idm", "population", "acc", "ovm", "none"]
+Device = Literal["cpu", "cuda"]
 ErrorName = Literal["unexplained", "transitions", "total_variation", "released"]
 
 
@@ -66,7 +67,7 @@ class VirtualSettings:
     times from virtual ones alone, each time with those of the newest policy, as the released code"""
     updates: Count = 5
     """updates on virtual rows of `sequential`"""
-    device: Literal["cpu", "cuda"] = "cpu"
+    device: Device = "cpu"
     """where the virtual environment runs"""
 
     @model_validator(mode="after")

@@ -12,6 +12,7 @@ from unjam.drivers.driver import Driver, Memory
 from unjam.drivers.from_file import check_acceleration, is_file_reference
 from unjam.drivers.local_state import LocalState
 from unjam.drivers.safety import Ahead
+from unjam.errors import MissingPartError
 from unjam.physics.kinematics import distance_driven
 from unjam.scenarios.scenario import Scenario
 from unjam.tree import mapped
@@ -26,12 +27,19 @@ from unjam.virtual.model import (
     largest_gap,
     model_inputs,
 )
+from unjam.virtual.settings import Device
 from unjam.worlds.reward import Outcome, Reward, make_reward
 
 GAP_ROWS = slice(len(SPEEDS), len(NUMBERS))
 """where the gaps are among NUMBERS"""
 BOUNDS = ("speed", "gap", "reward")
 """what is kept within physical bounds"""
+
+
+def check_is_there(device: Device, name: str = "device") -> None:
+    """Raise `MissingPartError` where there is no such device; `name` says who names it."""
+    if device == "cuda" and not torch.cuda.is_available():
+        raise MissingPartError(f"{name}: cuda is not there; use cpu")
 
 
 def on_device(values: NDArray[Any], device: torch.device | str) -> Tensor:
