@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from unjam.cli import app
-from unjam.studies import STUDIES, comparison, study
+from unjam.studies import STUDIES, references, study
 from unjam.studies import reproduce as reproduction
 from unjam.studies.comparison import comparison_of
 from unjam.studies.reproduce import make_plan, reproduce
@@ -29,6 +29,7 @@ LITTLE = comparison_of("two ways to learn on a little ring", ("plain", "virtual"
 
 
 REFERENCES = {"human": "human", "PI": "pi", "ACC": "acc"}
+TUNED = {"tuned PI": "pi:window=20"}
 VARIANTS = {
     "plain": Variant("plain", "", {"virtual.virtual_ratio": 0.0}, 320),
     "virtual": Variant("with a model", "", {"virtual.virtual_ratio": 1.0}, 320),
@@ -43,8 +44,8 @@ def little() -> Iterator[pytest.MonkeyPatch]:
         patch.setitem(study.ROADS, "little", SMALL)
         for name, variant in VARIANTS.items():
             patch.setitem(study.VARIANTS, name, variant)
-        patch.setattr(reproduction, "REFERENCES", REFERENCES)
-        patch.setattr(comparison, "EXPERTS", ("PI", "ACC"))
+        patch.setattr(references, "REFERENCES", REFERENCES)
+        patch.setitem(references.TUNED, "little", TUNED)
         yield patch
 
 

@@ -91,8 +91,8 @@ def test_what_is_there_is_not_trained_again(reproduced: Made) -> None:
 def test_the_table_is_made_of_the_rows_of_its_trainings(reproduced: Made) -> None:
     folder, _ = reproduced
     table = {row["name"]: row for row in json.loads((folder / "little" / "table.json").read_text())}
-    assert list(table) == ["human", "PI", "ACC", "plain", "with a model"]
-    experts = {name: table[name]["return"]["mean"] for name in ("PI", "ACC")}
+    assert list(table) == ["human", "PI", "ACC", "tuned PI", "plain", "with a model"]
+    experts = {name: table[name]["return"]["mean"] for name in ("PI", "ACC", "tuned PI")}
     best = max(experts, key=lambda name: experts[name])
     assert [name for name in experts if table[name]["best_expert"]] == [best]
     returns = []

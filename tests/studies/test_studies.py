@@ -81,7 +81,7 @@ def test_the_same_traffic_is_shown_of_all(monkeypatch: pytest.MonkeyPatch, repro
     shown = comparison.shown_on(StudyFolder(folder), "little")
     human, expert, *learned = (episode.driver for episode in shown)
     assert human == "human"
-    assert expert in ("PI", "ACC")
+    assert expert in ("PI", "ACC", "tuned PI")
     assert learned == ["plain", "with a model"]
     assert len({episode.loop_length for episode in shown}) == 1
     assert len({episode.speeds.shape for episode in shown}) == 1

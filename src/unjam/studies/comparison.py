@@ -31,9 +31,9 @@ from unjam.measures.statistics import (
 from unjam.measures.table import cell_of, unbroken
 from unjam.reports.figures import INK, LINES, STYLE, new_figure, space_time
 from unjam.reports.results import Shown, read_results, validations_of
+from unjam.studies.references import best_expert
 from unjam.studies.study import (
     PAPERS_ROADS,
-    REFERENCES,
     ROADS,
     VARIANTS,
     PlannedRun,
@@ -78,7 +78,6 @@ HONEST = (
     *("min_headway", "collisions"),
 )
 """metrics of the deterministic policy on held-out seeds"""
-EXPERTS = tuple(label for label in REFERENCES if label not in ("human", "zero", "constant +0.1"))
 INTERQUARTILE = 0.25
 """share left out at either end: Agarwal et al. 2021, `Deep RL at the edge of the statistical precipice`"""
 POINTS = 100
@@ -107,12 +106,6 @@ def comparison_of(title: str, variants: Sequence[str], road: str = "ring") -> St
 def metric_of(road: str, variant: str) -> str:
     """Return which return trainings are judged by: one that all drivers have, of the reward as meant."""
     return "return_eq16" if PlannedRun(road, variant, 0).config.reward.startswith("eq16") else "return"
-
-
-def best_expert(references: dict[str, Table], metric: str = "return") -> str:
-    """Return the label of the expert with the largest mean of a metric."""
-    there = [label for label in EXPERTS if label in references]
-    return max(there, key=lambda label: estimate_of(references[label], metric).mean)
 
 
 def table_rows(studies: StudyFolder, road: str, variants: Sequence[str], seeds: int) -> Table:

@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from unjam.controller import make_driver
 from unjam.controller.file import WEIGHTS, hash_of, unpack_parts
 from unjam.errors import InputError, wrong_name
 from unjam.files import make_folder, to_json, write_whole
@@ -14,8 +13,8 @@ from unjam.manifest import manifest
 from unjam.reports.results import EVALUATION_FILE
 from unjam.scenarios import SCENARIOS
 from unjam.studies import STUDIES, TOGETHER
+from unjam.studies.references import drive_references
 from unjam.studies.study import (
-    REFERENCES,
     ROADS,
     OnProgress,
     PlannedRun,
@@ -23,13 +22,8 @@ from unjam.studies.study import (
     StudyFolder,
     about_study,
 )
-from unjam.training.config import load_config
-from unjam.training.evaluate import evaluate, raise_failures, save_evaluation
 from unjam.training.executors import Executor, run_all, training_command
 from unjam.training.folder import read_config
-from unjam.training.seeds import held_out_seeds
-from unjam.worlds.episode import can_drive
-from unjam.worlds.workers import Workers
 
 SECONDS: dict[str, dict[str, float]] = {
     "trpo": {"ring": 45, "figure-eight": 80, "merge": 900, "on-ramp": 170},
@@ -135,18 +129,6 @@ def _trained_by(run: PlannedRun, studies: StudyFolder) -> dict[str, Any]:
     commit = json.loads((folder / "manifest.json").read_text())["commit"]
     weights = unpack_parts(studies.controller_of(run) / "controller.unjam")[WEIGHTS]
     return {"run": run.name, "commit": commit, "weights_sha256": hash_of(weights)}
-
-
-def drive_references(road: str, studies: StudyFolder, workers: int) -> None:
-    """Drive a road with the drivers that do not learn, on the held-out seeds of the trainings."""
-    config = load_config(changes=ROADS[road])
-    scenario = config.make_scenario()
-    made = {label: make_driver(name, scenario.decision_step) for label, name in REFERENCES.items()}
-    drivers = {label: driver for label, driver in made.items() if can_drive(driver, scenario)}
-    with Workers(workers) as processes:
-        found = evaluate(scenario, drivers, held_out_seeds(config.evaluation.episodes), processes)
-    raise_failures(found)
-    save_evaluation(studies.drives_of(road), found, {"scenario": config.scenario, "manifest": manifest()})
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,6 @@ from unjam.scenarios.scenario import Scenario
 from unjam.training.config import RunConfig, load_config
 from unjam.training.evaluate import TRAINED, evaluate, raise_failures
 from unjam.training.folder import read_config
-from unjam.training.presets import CLOSING_ABSORBER
 from unjam.training.seeds import held_out_seeds
 from unjam.worlds.workers import Workers
 
@@ -201,27 +200,6 @@ VARIANTS: dict[str, Variant] = {
     "everywhere-ppo": Variant("PPO", "everywhere", {"agent": "ppo", **PLAIN}, MILLION),
 }
 """the paper's methods with the paper's settings, and what we make of them"""
-
-
-REFERENCES: dict[str, str] = {
-    "human": "human",
-    "zero": "constant",
-    "constant +0.1": "constant:acceleration=0.1",
-    "PI (paper)": "pi:time_constant=0",
-    "PI": "pi",
-    "FollowerStopper": "follower-stopper",
-    "IDM": "idm",
-    "ACC": "acc",
-    "LACC": "lacc",
-    "BCM": "bcm",
-    "OVM": "ovm",
-    "pacer": "pacer",
-    "varying pacer": "pacer:varying=true",
-    "gentle varying pacer": "pacer:varying=true,time_constant=1",
-    "jam absorber": "jam-absorber",
-    "closing jam absorber": CLOSING_ABSORBER,
-}
-"""drivers that do not learn, beside those that do: label and how `unjam drive` names them"""
 
 
 @dataclass(frozen=True)
