@@ -88,7 +88,7 @@ def judged() -> pd.DataFrame:
             {
                 "": label,
                 "trainings": len(curves),
-                "beyond the best expert": interval(row["beyond_best_expert"], 0, "+"),
+                "beyond the best tuned expert": interval(row["beyond_best_expert"], 0, "+"),
                 "each": ", ".join(f"{gain:+.0f}" for gain in row["gains"]),
                 f"reach {level:.0f}": f"{len(there)} of {len(curves)}",
                 "after actual steps": ", ".join(f"{count:,}" for count in sorted(there)),

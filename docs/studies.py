@@ -11,8 +11,9 @@ from tables import rows_of as rows_of_file
 from unjam.measures.statistics import over_trainings
 from unjam.measures.table import unbroken
 from unjam.studies import STUDIES
-from unjam.studies.comparison import entries, interval, number
-from unjam.studies.study import REFERENCES, VARIANTS
+from unjam.studies.comparison import HONEST, entries, estimates, interval, number
+from unjam.studies.references import REFERENCES, TUNED
+from unjam.studies.study import VARIANTS
 
 FREE = 15.0
 """mean speed of an episode on the merge in which no jam stayed [m/s]"""
@@ -25,7 +26,7 @@ def page_table(study: str, name: str) -> pd.DataFrame:
 
 
 def rows_of(study: str, road: str) -> list[dict[str, Any]]:
-    """Return the rows of a study's table on a road.
+    """Return the rows of a study's table on a road, beside the best tuned expert.
 
     Tables of before have percentile intervals: they are made anew from the trainings' gains, where these are.
     """
@@ -34,7 +35,45 @@ def rows_of(study: str, road: str) -> list[dict[str, Any]]:
         if "gains" in row and "smallest" not in row["beyond_best_expert"]:
             row["beyond_best_expert"] = entries(over_trainings(row["gains"]))
             row["probability_of_improvement"] = {"mean": row["probability_of_improvement"]["mean"]}
-    return [row for row in rows if row["road"] == road]
+    rows = [row for row in rows if row["road"] == road]
+    path = RESULTS / f"experts/tuned-on-{road}.json"
+    known = any(row["name"].startswith("tuned ") for row in rows)
+    return rows if known or not path.is_file() else beside_tuned(rows, rows_of_file(str(path)))
+
+
+def beside_tuned(rows: list[dict[str, Any]], tuned: dict[str, list[dict[str, Any]]]) -> list[dict[str, Any]]:
+    """Return a table's rows as beyond the best tuned expert, which was driven later, on the same seeds.
+
+    Episodes of its trainings are not kept, so intervals are over the trainings' means alone.
+    """
+    metric = next(row["beyond"]["metric"] for row in rows if row["learns"])
+    names = {name: label for label, name in TUNED[rows[0]["road"]].items()}
+    driven = [
+        {"name": names[name], "learns": False, "trainings": 0, **estimates(found, HONEST)}
+        for name, found in tuned.items()
+        if name in names
+    ]
+    best = max(driven, key=lambda row: row[metric]["mean"])
+    before = next(row for row in rows if row.get("best_expert"))
+    more = best[metric]["mean"] - before[metric]["mean"]
+    if more <= 0:
+        return rows
+    learned = [
+        {**row, "beyond_best_expert": entries(over_trainings([gain - more for gain in row["gains"]]))}
+        for row in rows
+        if row["learns"]
+    ]
+    others = [{**row, "best_expert": False, "beyond_best_expert": None} for row in rows if not row["learns"]]
+    driven = [{**row, "best_expert": row is best} for row in driven]
+    return [*others, *driven, *({**row, "probability_of_improvement": None} for row in learned)]
+
+
+def beyond_own_expert(rows: dict[str, dict[str, Any]], name: str, expert: str) -> dict[str, Any]:
+    """Return what the trainings of a row earn beyond an expert of their table, over the trainings' means."""
+    row = rows[name]
+    metric, best = row["beyond"]["metric"], row["beyond"]["expert"]
+    more = rows[best][metric]["mean"] - rows[expert][metric]["mean"]
+    return entries(over_trainings([gain + more for gain in row["gains"]]))
 
 
 def paper_convention(study: str, road: str) -> pd.DataFrame:
@@ -87,7 +126,8 @@ def honest(
         for name in columns:
             key, digits = COLUMNS[name]
             cells[name] = number(row[key]["mean"], digits)
-        cells["beyond"] = "" if beyond is None else interval(beyond, 0, "+")
+        nothing = beyond is None or row.get("best_expert")
+        cells["beyond"] = "" if nothing else interval(beyond, 0, "+")
         cells["better"] = "" if better is None else interval({"low": None, "high": None, **better}, 2)
         table.append(cells)
     return pd.DataFrame(table)
@@ -131,4 +171,10 @@ def commands() -> pd.DataFrame:
 
 def drivers() -> pd.DataFrame:
     """Return how drivers that do not learn are named on the command line."""
-    return pd.DataFrame([{"row": label, "--driver": name} for label, name in REFERENCES.items()])
+    on_all = [{"row": label, "--driver": name, "on": ""} for label, name in REFERENCES.items()]
+    tuned = [
+        {"row": label, "--driver": name, "on": road}
+        for road, found in TUNED.items()
+        for label, name in found.items()
+    ]
+    return pd.DataFrame([*on_all, *tuned])
