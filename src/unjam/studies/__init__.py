@@ -10,7 +10,7 @@ from unjam.studies.drivable import (
 from unjam.studies.envelope import ENVELOPE
 from unjam.studies.everywhere import EVERYWHERE_STUDY, JUDGING
 from unjam.studies.figure_6 import FIGURE_6
-from unjam.studies.imagined import imagined
+from unjam.studies.imagined import LOOKS_ON_RAMPS, imagined
 from unjam.studies.ramp_trained import ramp_trained
 from unjam.studies.roads_together import (
     BESIDE_EVERYWHERE,
@@ -52,7 +52,7 @@ STUDIES: dict[str, Study] = {
     "imagined": imagined("ring", "best"),
     "imagined-jammed": imagined("ring-jammed", "jammed"),
     "imagined-eight": imagined("figure-eight", "eight"),
-    "imagined-ramp": imagined("on-ramp", "ramp"),
+    "imagined-ramp": imagined("on-ramp", "ramp", LOOKS_ON_RAMPS),
     "eq16": comparison_of(
         "Eq. 16 as it is printed and as it is meant, on the ring",
         ("trpo-eq16", "trpo-as-printed", "proposed-eq16", "proposed-as-printed"),

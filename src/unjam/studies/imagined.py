@@ -20,6 +20,8 @@ from unjam.worlds.record import Floats
 
 LOOKS = (190_000, 380_000, 750_000, 1_500_000, 3_000_000, 6_000_000)
 """actual steps after which trainings are looked at"""
+LOOKS_ON_RAMPS = (48_000, 96_000, 144_000, 288_000, 432_000, 1_152_000)
+"""the same where an iteration has fewer"""
 TIMES = (1, 2, 3)
 """how many times the actual steps the method may take without the model: few, twice as many, all"""
 
@@ -27,25 +29,26 @@ TIMES = (1, 2, 3)
 def compared_with(prefix: str) -> tuple[str, ...]:
     """Return the variants whose names begin with `prefix`, the one with the model first, and `best`.
 
-    On figures eight, which a batch steps in distribution alone, that is trained in batches, too.
+    On figures eight, which a batch steps in distribution alone, that is trained in batches, too; on the
+    on-ramp all have another expert than `best`.
     """
-    every = "best-in-batches" if prefix == "eight" else "best"
+    every = {"eight": "best-in-batches", "ramp": "ramp-all"}.get(prefix, "best")
     return (*(f"{prefix}-{name}" for name in ("imagined", "few", "middle")), every)
 
 
-def efficiency(road: str, compared: Sequence[str], folder: Path) -> pd.DataFrame:
+def efficiency(road: str, compared: Sequence[str], looks: Sequence[int], folder: Path) -> pd.DataFrame:
     """Return what trainings earn on the validation seeds after so many actual steps, and what more it is.
 
     Of the variants that are compared the first has the model.
     """
     curves, (modelled, *others) = read_part(folder, "curves")[road], compared
     seen = {name: partial(_returns, curves[name], _first_look(road, name)) for name in compared}
-    rows = [_row(VARIANTS[name].label, [seen[name](at) for at in LOOKS]) for name in compared]
+    names = [f"{steps:,}" for steps in looks]
+    rows = [_row(VARIANTS[name].label, names, [seen[name](at) for at in looks]) for name in compared]
     for name, times in zip(others, TIMES, strict=True):
-        beyond = [seen[modelled](at) - seen[name](times * at) for at in LOOKS]
-        rows.append(
-            _row(f"with the model beyond “{VARIANTS[name].label}” after {times} times as many", beyond, "+")
-        )
+        beyond = [seen[modelled](at) - seen[name](times * at) for at in looks]
+        label = f"with the model beyond “{VARIANTS[name].label}” after {times} times as many"
+        rows.append(_row(label, names, beyond, "+"))
     return pd.DataFrame(rows)
 
 
@@ -63,13 +66,13 @@ def _returns(curve: dict[str, list[float]], first: int, steps: int) -> Floats:
     return np.array([np.interp(steps, curve["steps"], each, np.nan, np.nan) for each in trainings])
 
 
-def _row(label: str, columns: list[Floats], sign: str = "") -> dict[str, str]:
+def _row(label: str, names: Sequence[str], columns: list[Floats], sign: str = "") -> dict[str, str]:
     cells = [str(cell_of(over_trainings(values.tolist()), 0, sign=sign)) for values in columns]
-    return {"": label, **dict(zip((f"{steps:,}" for steps in LOOKS), cells, strict=True))}
+    return {"": label, **dict(zip(names, cells, strict=True))}
 
 
-def imagined(road: str, prefix: str) -> Study:
+def imagined(road: str, prefix: str, looks: Sequence[int] = LOOKS) -> Study:
     """Return the study of a road and of its variants whose names begin with `prefix`."""
     compared = compared_with(prefix)
     study = comparison_of(f"what a model of the whole road saves, on the {road}", compared, road)
-    return replace(study, tables={**study.tables, "efficiency": partial(efficiency, road, compared)})
+    return replace(study, tables={**study.tables, "efficiency": partial(efficiency, road, compared, looks)})

@@ -130,12 +130,13 @@ class Variant:
     """the variant whose numbers the paper gives for it, if it is another"""
 
 
-def few_steps(prefix: str, batch: int, steps: int, horizon: int = 3000) -> dict[str, Variant]:
+def few_steps(prefix: str, batch: int, steps: int, horizon: int = 3000, **same: Any) -> dict[str, Variant]:
     """Return `best` with an eighth of a road's steps: alone, with as many again, with roads imagined.
 
-    Of the last an eighth of an iteration is actual, the rest are whole episodes of `horizon` decisions.
+    Of the last an eighth of an iteration is actual, the rest are whole episodes of `horizon` decisions. What
+    is the `same` differs from `best` in all of them.
     """
-    few, twice = ({"world": "batch", "trpo.batch_steps": times * batch} for times in (1, 2))
+    few, twice = ({"world": "batch", **same, "trpo.batch_steps": times * batch} for times in (1, 2))
     whole = {"virtual_ratio": 7.0, "model": "road", "begin": "first", "k_max": horizon}
     imagined = {**few, **{f"virtual.{key}": value for key, value in whole.items()}}
     return {
@@ -145,6 +146,11 @@ def few_steps(prefix: str, batch: int, steps: int, horizon: int = 3000) -> dict[
     }
 
 
+LEFT_TO_LEARN = {
+    "expert": "jam-ahead:margin=2,margin_by_share=0",
+    **{"evaluation.every": 3, "evaluation.validation_episodes": 32},
+}
+"""the on-ramp's best method on a law that gains nothing there: on the tuned one nothing is left to learn"""
 ALONE = {"expert": "none", "virtual.virtual_ratio": 0.0}
 TO_THE_END = {"evaluation.converged": 0}
 TWO_EACH = {"evaluation.episodes": 2}
@@ -188,7 +194,10 @@ VARIANTS: dict[str, Variant] = {
     **few_steps("best", 12_000, 756_000),
     **few_steps("jammed", 24_000, 768_000),
     **few_steps("eight", 6_000, 612_000, horizon=1500),
-    **few_steps("ramp", 19_200, 576_000, horizon=2400),
+    **few_steps("ramp", 9_600, 144_000, horizon=2400, **LEFT_TO_LEARN, **{"virtual.kappa": 10_000.0}),
+    "ramp-all": Variant(
+        "ours, all its steps", "best", {**LEFT_TO_LEARN, "trpo.batch_steps": 76_800}, 1_152_000
+    ),
     "best-in-batches": Variant("ours, all its steps", "best", {"world": "batch"}, None),
     "by-150-seconds": Variant("residual", "best", BY_150_SECONDS, None),
     "rings": Variant("residual", "rings", TWO_EACH, None),
