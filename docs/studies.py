@@ -8,6 +8,7 @@ import pandas as pd
 from tables import RESULTS, metrics_of
 from tables import rows_of as rows_of_file
 
+from unjam.measures.drivable import DRIVABLE
 from unjam.measures.statistics import over_trainings
 from unjam.measures.table import unbroken
 from unjam.studies import STUDIES
@@ -100,14 +101,12 @@ COLUMNS = {
     "smallest headway [s]": ("min_headway", 2),
     "leave [veh/h]": ("throughput_veh_per_h", 0),
     "wait [veh]": ("backlog_veh", 0),
-    "collisions": ("collisions", 2),
 }
 """what the honest tables show: a metric and its digits"""
 OF_THE_RING = ("return", "mean speed [m/s]", "of the limit, steady", "std across vehicles [m/s]")
-OF_THE_RING += ("smallest headway [s]", "collisions")
+OF_THE_RING += ("smallest headway [s]",)
 OF_THE_EIGHT = ("return", "return, Eq. 16", "mean speed [m/s]", "steady [m/s]", "std across vehicles [m/s]")
-OF_THE_EIGHT += ("collisions",)
-OF_THE_MERGE = ("return", "mean speed [m/s]", "steady [m/s]", "leave [veh/h]", "wait [veh]", "collisions")
+OF_THE_MERGE = ("return", "mean speed [m/s]", "steady [m/s]", "leave [veh/h]", "wait [veh]")
 
 
 def honest(
@@ -126,11 +125,20 @@ def honest(
         for name in columns:
             key, digits = COLUMNS[name]
             cells[name] = number(row[key]["mean"], digits)
+        if "drivable" in row:
+            cells["drivable"] = _drivable(row["drivable"])
         nothing = beyond is None or row.get("best_expert")
         cells["beyond"] = "" if nothing else interval(beyond, 0, "+")
         cells["better"] = "" if better is None else interval({"low": None, "high": None, **better}, 2)
         table.append(cells)
     return pd.DataFrame(table)
+
+
+def _drivable(verdicts: str | list[str]) -> str:
+    """Return whether a driver is drivable, or how many trainings are; a dash for people alone."""
+    if isinstance(verdicts, str):
+        return {"": "–", DRIVABLE: "yes"}.get(verdicts, "no")
+    return f"{verdicts.count(DRIVABLE)} of {len(verdicts)}"
 
 
 def merge_capacity() -> pd.DataFrame:

@@ -101,6 +101,8 @@ def test_the_table_is_made_of_the_rows_of_its_trainings(reproduced: Made) -> Non
         rows = json.loads((run / "evaluation.json").read_text())["rows"]
         returns.append(np.mean([row["return"] for row in rows if row["driver"] == "trained"]))
     assert table["plain"]["return"]["mean"] == pytest.approx(np.mean(returns))
+    assert [table[name]["drivable"] for name in ("human", "PI")] == ["", "drivable"]
+    assert len(table["plain"]["drivable"]) == 2
     beyond = table["plain"]["beyond_best_expert"]["mean"]
     assert beyond == pytest.approx(np.mean(returns) - experts[best])
     progress = [

@@ -17,6 +17,7 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 
 from unjam.files import to_json, write_whole
+from unjam.measures.drivable import drivable_in_all, verdicts
 from unjam.measures.metrics import METRICS
 from unjam.measures.statistics import (
     Estimate,
@@ -111,11 +112,11 @@ def metric_of(road: str, variant: str) -> str:
 def table_rows(studies: StudyFolder, road: str, variants: Sequence[str], seeds: int) -> Table:
     """Return a row per driver that does not learn, and per variant, on a road."""
     references = studies.references(road)
-    best = best_expert(references, metric_of(road, variants[0]))
+    best, said = best_expert(references, metric_of(road, variants[0])), verdicts(references)
     rows: Table = []
     for label, found in references.items():
         row = {"road": road, "name": label, "learns": False, "trainings": 0, "episodes": len(found)}
-        row |= {"best_expert": label == best, **estimates(found, HONEST)}
+        row |= {"best_expert": label == best, "drivable": said[label], **estimates(found, HONEST)}
         beyond = paired_difference(found, references[best], metric_of(road, variants[0]))
         row["beyond_best_expert"] = entries(beyond)
         convention = {key: _mean_and_std(_finite(found, name)) for key, (name, _) in CONVENTION.items()}
@@ -156,6 +157,7 @@ def _of_variant(
         "beyond_best_expert": entries(crossed_estimate(differences)),
         "probability_of_improvement": entries(probability_of_improvement(differences)),
         "kept_untrained": sum(best <= 0 for best, _ in validated),
+        "drivable": [drivable_in_all(run.rows, references["human"]) for run in runs],
         "seconds": _mean([run.seconds for run in runs]),
         "gains": differences.mean(1).tolist(),
     }
