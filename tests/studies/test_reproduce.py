@@ -69,8 +69,10 @@ def test_a_study_leaves_its_trainings_numbers_picture_and_manifest(reproduced: M
         for seed in (0, 1):
             assert (folder / "runs" / "little" / variant / str(seed) / "report.html").is_file()
     assert {path.name for path in (folder / "little").iterdir()} == {
-        *("table.json", "table.csv", "curves.json", "curves.png", "manifest.json")
+        *("table.json", "table.csv", "curves.json", "curves.png", "manifest.json", "controllers")
     }
+    kept, made = folder / "little/controllers/virtual-1.unjam", folder / "runs/little/virtual/1"
+    assert kept.read_bytes() == (made / "controller.unjam").read_bytes()
     assert sum("failed" in line for line in told) == 0
     manifest = json.loads((folder / "little" / "manifest.json").read_text())
     assert manifest["seeds"] == 2

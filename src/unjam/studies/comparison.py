@@ -99,6 +99,7 @@ def comparison_of(title: str, variants: Sequence[str], road: str = "ring") -> St
         references = {"all human": found["human"], "best expert": found[best_expert(found, metric)]}
         write_whole(folder / "curves.json", to_json({road: curves}))
         draw_curves(road, curves, references, metric).savefig(folder / "curves.png")
+        studies.keep_controllers(planned([road], variants, seeds), folder / "controllers")
 
     tables = {"checkpoints": partial(_checkpoints, road)}
     return Study(title, lambda seeds: planned([road], variants, seeds), write, (road,), tables=tables)

@@ -269,6 +269,13 @@ class StudyFolder:
         """Return where its controller is: of several roads, which one network drives, that of the first."""
         return self.folder_of(run) / next(iter(run.config.roads()))
 
+    def keep_controllers(self, runs: Iterable[PlannedRun], folder: Path) -> None:
+        """Copy the controllers of trainings into a folder, VARIANT-SEED.unjam: a row can be driven again."""
+        make_folder(folder)
+        for run in runs:
+            found = self.controller_of(run) / "controller.unjam"
+            write_whole(folder / f"{run.variant}-{run.seed}.unjam", found.read_bytes())
+
     def drives_of(self, road: str) -> Path:
         """Return where the drivers that do not learn are, on a road."""
         return self.folder / "drives" / road
