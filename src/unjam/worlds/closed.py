@@ -200,6 +200,12 @@ class ClosedLog:
         return self._added().reshape(decisions, -1, len(self.road.cav_ids)).max(1).clip(0.0, None)
 
     def _added(self) -> Floats:
-        """Return the braking that SUMO added to each command in each step [m/s2], shape (S, C)."""
+        """Return the braking that SUMO added to each command in each step [m/s2], shape (S, C).
+
+        A car that is told to drive faster than it can does not, which is no braking.
+        """
         moved = self.moved[:, self.places]
-        return ((self.commanded if len(self.wanted) else moved) - moved) / self.scenario.simulation_step
+        if not len(self.wanted):
+            return np.zeros_like(moved)
+        commanded = np.minimum(self.commanded, self.scenario.top_speed)
+        return (commanded - moved) / self.scenario.simulation_step
