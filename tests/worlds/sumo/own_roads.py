@@ -38,13 +38,15 @@ def grid(folder: Path, kind: str = "traffic_light") -> Path:
     return path
 
 
-def straight(folder: Path, vehicles: str, length: float = 1000.0, end: float = 60.0) -> Path:
-    """One road with one lane and a limit of 20 m/s, and vehicles on the route `along`."""
+def straight(
+    folder: Path, vehicles: str, length: float = 1000.0, end: float = 60.0, speed: float = 20.0
+) -> Path:
+    """One road with one lane and a limit of 20 m/s or another, and vehicles on the route `along`."""
     (folder / "nodes.xml").write_text(
         f'<nodes><node id="a" x="0" y="0"/><node id="b" x="{length}" y="0"/></nodes>'
     )
     (folder / "edges.xml").write_text(
-        '<edges><edge id="road" from="a" to="b" numLanes="1" speed="20"/></edges>'
+        f'<edges><edge id="road" from="a" to="b" numLanes="1" speed="{speed}"/></edges>'
     )
     (folder / "demand.rou.xml").write_text(
         f'<routes><vType id="car" carFollowModel="IDM" speedDev="0" minGap="1.5"/>'

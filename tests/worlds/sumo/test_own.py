@@ -383,3 +383,26 @@ def test_a_network_that_breaks_later_fails_its_episode_and_nothing_else(tmp_path
     assert (broken.status, broken.error) == ("failed", "InputError")
     assert "the network has no version" in broken.reason
     assert mended.status == "completed"
+
+
+def test_who_drives_fast_stops_behind_who_stands_beyond_what_drivers_see(
+    tmp_path: Path, simulation: Simulation
+) -> None:
+    stands = '<vehicle id="stands" type="van" route="along" depart="0" departPos="900"><stop lane="road_0" '
+    stands += 'endPos="905" duration="100"/></vehicle>'
+    fast = '<vehicle id="fast" type="car" route="along" depart="1" departSpeed="max"/>'
+    file = straight(tmp_path, stands + fast, end=50, speed=45)
+    road = scenario_of(
+        file,
+        cav_share=0.0,
+        cav_types=("car",),
+        horizon=480,
+        actuation="raw",
+        action_limit=6.0,
+        safety={"active": True},
+    )
+    episode = run_episode(road, Constant(acceleration=1.0), (0,), simulation=simulation)
+    fastest = max(each.states.speed.max() for each in episode.trajectories)
+    assert fastest > 36.0, "from there nobody stops within 100 m"
+    assert episode.status == "completed"
+    assert episode.audit.cavs.hardest <= 6.0 + 1e-6

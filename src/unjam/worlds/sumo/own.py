@@ -21,6 +21,8 @@ from unjam.worlds.sumo.sections import RoadAhead
 from unjam.worlds.sumo.simulation import Neighbours
 from unjam.worlds.world import OnProgress
 
+FILTER_SEES = 400.0
+"""how far a safety filter looks ahead [m]: what a car at 60 m/s needs"""
 FUEL_SECONDS = 1.0
 """time for which what all vehicles burn is held: SUMO computes it as long as it takes to drive"""
 
@@ -111,8 +113,13 @@ class OwnTraffic(LaneTraffic[OwnRoad]):
     def _ahead(self, names: Sequence[str]) -> list[Ahead]:
         if not self.scenario.safety.active:
             return super()._ahead(names)
-        near = zip(self._simulation.speeds(names), map(self._neighbours, names), strict=True)
-        return [Ahead(speed, ahead, gap) for speed, (_, ahead, gap, *_) in near]
+        near = zip(names, self._simulation.speeds(names), map(self._neighbours, names), strict=True)
+        found: list[Ahead] = []
+        for name, speed, (leader, ahead, gap, *_) in near:
+            if not leader:  # who drives fast must see farther than what drivers are told
+                _, ahead, gap, *_ = self._simulation.neighbours(name, FILTER_SEES)
+            found.append(Ahead(speed, ahead, gap))
+        return found
 
     def _neighbours(self, name: str) -> Neighbours:
         """Return who is ahead of a vehicle and behind it; SUMO is asked once in a step."""
