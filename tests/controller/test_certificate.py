@@ -10,6 +10,7 @@ import pytest
 
 from unjam.controller import certificate as certificates
 from unjam.controller.certificate import FREQUENCIES, Domain, certificate_of, certify, human_gain
+from unjam.controller.domain import outside_domain
 from unjam.controller.file import (
     CERTIFICATE,
     MANIFEST,
@@ -20,6 +21,7 @@ from unjam.controller.file import (
     pack_parts,
     read_controller,
     sample_bytes,
+    unpack_parts,
 )
 from unjam.controller.verify import verify_controller
 from unjam.drivers import IDM, Driver, LocalState, PISaturation
@@ -138,3 +140,25 @@ def test_a_certificate_that_was_changed_is_refused_even_with_a_right_hash(tmp_pa
 def test_what_has_no_filter_has_no_certificate(driver: Driver, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="without its safety filter"):
         certificate_of(read_controller(written(tmp_path, driver)))
+
+
+def test_a_controller_of_cars_that_obey_late_is_not_certified(tmp_path: Path) -> None:
+    file = written(tmp_path)
+    parts = unpack_parts(file)
+    manifest = json.loads(parts.pop(MANIFEST))
+    manifest["scenario"]["actuator"]["lag"] = 0.5
+    file.write_bytes(pack_parts({MANIFEST: json.dumps(manifest).encode(), **parts}))
+    with pytest.raises(InputError, match="a road whose cars obey late is not allowed"):
+        certificate_of(read_controller(file))
+
+
+def test_a_damaged_certificate_is_one_line_and_costs_no_drive(tmp_path: Path) -> None:
+    file = written(tmp_path)
+    add_certificate(file, read_controller(file), certificate_of(read_controller(file)))
+    parts = {**unpack_parts(file), CERTIFICATE: b"{]"}
+    manifest = json.loads(parts.pop(MANIFEST))
+    manifest["sha256"] = {name: hash_of(part) for name, part in parts.items()}
+    file.write_bytes(pack_parts({MANIFEST: json.dumps(manifest).encode(), **parts}))
+    with pytest.raises(InputError, match="the controller is damaged: JSONDecodeError"):
+        verify_controller(file)
+    assert outside_domain(read_controller(file), visited()) == 0.0

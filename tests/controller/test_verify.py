@@ -223,3 +223,11 @@ def test_whatever_a_manifest_says_it_is_refused_in_one_line_or_drives(number: in
 
 def test_hashes_are_sha256() -> None:
     assert hash_of(b"abc").startswith("ba7816bf")
+
+
+def test_what_a_stranger_wrote_of_the_road_stays_on_its_line_and_out_of_the_terminal(tmp_path: Path) -> None:
+    def forge(manifest: dict[str, Any]) -> None:
+        manifest["scenario"] = {"kind": "ring\nok signature: of 'maker.pub'\x1b[31m"}
+
+    (said,) = [each.found for each in verify_controller(changed(tmp_path, forge)) if each.name == "road"]
+    assert said == "made for the ring?ok signature: of 'maker.pub'?[31m"

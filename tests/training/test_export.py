@@ -112,3 +112,11 @@ def test_what_cannot_be_exported_is_refused(
         export_controller(source, to, scenario=scenario)
     assert words in str(caught.value)
     assert not Path(to).exists()
+
+
+def test_a_car_that_obeys_late_gets_no_file_whose_filter_does_not_know_it(tmp_path: Path) -> None:
+    config = small_config(steps=100, virtual__virtual_ratio=0.0, road__actuator__lag=0.5)
+    with empty_pictures():
+        train(config, tmp_path / "late")
+    with pytest.raises(InputError, match=r"export: actuator.delay 0, actuator.lag 0.5 is not allowed"):
+        export_controller(tmp_path / "late", tmp_path / "late.unjam")

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from unjam.controller.file import SAMPLE, Controller, Floats, read_sample
+from unjam.controller.file import SAMPLE, Controller, Floats, read_sample, reading
 from unjam.drivers.local_state import LocalState
 from unjam.drivers.safety import Ahead
 from unjam.drivers.wrappers import Filtered
@@ -132,8 +132,15 @@ def certificate_of(controller: Controller) -> dict[str, Any]:
             "certify: a controller without its safety filter and sample is not allowed; allowed: what "
             "`unjam export` writes of a road with a filter"
         )
-    states, _ = read_sample(controller.parts[SAMPLE])
-    humans = build(IDMParameters, controller.manifest["scenario"]["humans"], "controller: humans")
+    with reading("certify"):
+        states, _ = read_sample(controller.parts[SAMPLE])
+        road = controller.manifest["scenario"]
+        humans = build(IDMParameters, road["humans"], "controller: humans")
+        late = any(road.get("actuator", {}).values())
+    if late:
+        raise InputError(
+            "certify: a road whose cars obey late is not allowed; allowed: actuator.delay and lag 0"
+        )
     return asdict(certify(driver, states, humans))
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from unjam.controller import SHIPPED, shipped_file
 from unjam.controller.certificate import Domain
-from unjam.controller.file import CERTIFICATE, Controller, read_controller
+from unjam.controller.file import CERTIFICATE, NONE_OF_OURS, Controller, read_controller
 from unjam.drivers.local_state import LocalState
 from unjam.errors import InputError
 from unjam.parameters import build, flat
@@ -64,8 +64,8 @@ def other_road(manifest: dict[str, Any], road: dict[str, Any]) -> str:
     if not isinstance(trained, dict):
         return ""
     made = "tuned" if "tuned" in manifest else "trained"
-    if trained["kind"] != road["kind"]:
-        return f"was {made} on the {trained['kind']}, not on the {road['kind']}"
+    if trained.get("kind") != road["kind"]:
+        return f"was {made} on the {_short(trained.get('kind'))}, not on the {road['kind']}"
     there, here = flat(trained), flat(road)
     known = [name for name in here if name in there and name not in WITHOUT_EFFECT]
     differ = [name for name in known if not _within(there[name], here[name])]
@@ -80,7 +80,7 @@ def road_of(manifest: dict[str, Any]) -> str:
     if not isinstance(made, dict):
         return ""
     facts = [f"{name} {_short(made[name])}" for name in FACTS if made.get(name) is not None]
-    return ", ".join([str(made.get("kind")), *facts])
+    return ", ".join([_short(made.get("kind")), *facts])
 
 
 def _within(trained: Any, now: Any) -> bool:
@@ -91,12 +91,17 @@ def _within(trained: Any, now: Any) -> bool:
 
 
 def _short(value: Any) -> str:
-    return "-".join(map(str, dict.fromkeys(value))) if isinstance(value, list | tuple) else str(value)
+    """Return a value that somebody else wrote, on one line and without what a terminal would act on."""
+    text = "-".join(map(str, dict.fromkeys(value))) if isinstance(value, list | tuple) else str(value)
+    return "".join(letter if letter.isprintable() else "?" for letter in text)
 
 
 def outside_domain(controller: Controller, states: LocalState) -> float:
     """Return the share of states in which a certified controller was never seen; 0 of one without."""
     if CERTIFICATE not in controller.parts:
         return 0.0
-    domain = build(Domain, json.loads(controller.parts[CERTIFICATE])["domain"], "certificate: domain")
+    try:
+        domain = build(Domain, json.loads(controller.parts[CERTIFICATE])["domain"], "certificate: domain")
+    except (*NONE_OF_OURS, InputError):  # `unjam verify` says so; what was driven is not lost for it
+        return 0.0
     return float(1.0 - np.mean(domain.holds(states)))

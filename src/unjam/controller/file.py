@@ -7,6 +7,8 @@ import os
 import stat
 import zipfile
 import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -110,6 +112,15 @@ def add_signature(file: Path, controller: Controller, key: "Ed25519PrivateKey") 
 
     parts = {name: controller.parts[name] for name in PARTS if name in controller.parts.keys() - {SIGNATURE}}
     write_whole(file, pack_parts({**parts, SIGNATURE: signature_of(parts, key)}))
+
+
+@contextmanager
+def reading(what: str) -> Iterator[None]:
+    """Raise `InputError` where something that is read within is none of ours, or damaged."""
+    try:
+        yield
+    except NONE_OF_OURS as error:
+        raise InputError(f"{what}: the controller is damaged: {' '.join(f'{error!r}'.split())}") from None
 
 
 def load_controller(path: Path | str) -> Driver:

@@ -28,6 +28,7 @@ from unjam.controller.file import (
     description,
     read_controller,
     read_sample,
+    reading,
     replay,
 )
 from unjam.drivers.driver import Driver
@@ -76,6 +77,11 @@ def verify_controller(path: Path | str, signer: Path | str | None = None) -> lis
 
 def verify(controller: Controller, signer: Path | str | None = None) -> list[Verified]:
     """Return what was checked of a controller that was read; arguments and errors as `verify_controller`."""
+    with reading("verify"):
+        return _verified(controller, signer)
+
+
+def _verified(controller: Controller, signer: Path | str | None) -> list[Verified]:
     signature = _check_signer(controller.signed_by, signer)
     driver, manifest = controller.driver, controller.manifest
     parts = {name: part for name, part in controller.parts.items() if name not in (MANIFEST, SIGNATURE)}

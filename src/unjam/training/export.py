@@ -115,6 +115,11 @@ def export_controller(source: str | Path, to: str | Path, onnx: bool = False, sc
     if driver.native or code:
         why = f"{Path(code[0]['path']).name} is Python code" if code else "human is the simulator itself"
         raise InputError(f"export: {driver.describe()} is not allowed: {why}; allowed: drivers that are data")
+    if road.safety.active and not road.actuator.instant:
+        late = f"actuator.delay {road.actuator.delay:g}, actuator.lag {road.actuator.lag:g}"
+        raise InputError(
+            f"export: {late} is not allowed: the filter of a file does not know it; allowed: 0 and 0"
+        )
     if road.safety.active and not isinstance(driver, Filtered):
         asked = (driver.limits or road.limits).highest
         driver = Filtered(driver, asked, road.safety, road.decision_step)
