@@ -3,6 +3,7 @@ import subprocess
 import sys
 import warnings
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -263,3 +264,23 @@ def test_rewards_are_for_what_happens_and_not_for_what_sensors_read() -> None:
     earned = [environment.step(np.zeros(1))[1] for _ in range(60)]
     environment.close()
     np.testing.assert_allclose(earned, expected.reward, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("name", "shown", "words"),
+    [
+        ("merge", "place", "observe: 'place' is not allowed on a road with ends"),
+        ("ring", "to_merge", "observe: 'to_merge' is not allowed on ring"),
+    ],
+)
+def test_what_the_road_does_not_tell_is_not_shown(name: str, shown: str, words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        RoadEnv(name, observe=("local", shown))
+
+
+def test_a_feature_of_ones_own_is_told_what_the_road_tells(tmp_path: Path) -> None:
+    file = tmp_path / "share.py"
+    file.write_text("def share(state):\n    return state.cav_share\n")
+    with closing(RoadEnv("ring", observe=("local", f"{file}:share"))) as environment:
+        observation, _ = environment.reset(seed=0)
+    assert observation[-1] == np.float32(1 / 22)

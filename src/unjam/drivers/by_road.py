@@ -25,6 +25,7 @@ class ByRoad(Wrapper):
 
     tensors: ClassVar[bool] = False  # pyright: ignore[reportIncompatibleMethodOverride]
     needs_loop: ClassVar[bool] = False  # pyright: ignore[reportIncompatibleMethodOverride]
+    sees: ClassVar[tuple[str, ...]] = ()  # pyright: ignore[reportIncompatibleMethodOverride]
     told: ClassVar[tuple[str, ...]] = ("to_crossing", "cav_share")
 
     motorway: Driver

@@ -67,6 +67,9 @@ class Driver:
     told: ClassVar[tuple[str, ...]] = ()
     """fields of a `LocalState` that it looks at and that only some roads offer"""
 
+    sees: ClassVar[tuple[str, ...]] = ()
+    """features that networks in it see, whatever the road: by name"""
+
     observed_memory: ClassVar[tuple[Observed, ...]] = ()
     """what `memory_features` are, in order"""
 

@@ -234,6 +234,13 @@ def _own_feature(name: str) -> Feature:
     return Feature(look, tuple(words), plain=False)
 
 
+def asked_by(names: Sequence[str]) -> frozenset[str]:
+    """Return the fields of a `LocalState` that features look at: of a user's own, which alone knows, all."""
+    if any(is_file_reference(name) for name in names):
+        return frozenset(LocalState._fields)
+    return frozenset(field for name in names for field in feature(name).told)
+
+
 def observe(names: Sequence[str], seen: Seen) -> Array:
     """Return what the network sees: the chosen features side by side, shape (n, inputs), no unit."""
     blocks = [block for name in names if (block := feature(name).look(seen)) is not None]

@@ -10,7 +10,7 @@ from unjam.drivers.command import Command, Limits
 from unjam.drivers.driver import Decision, Driver, Memory, Noise, Recipe
 from unjam.drivers.local_state import LocalState, Observed
 from unjam.drivers.network import Network, network_arrays
-from unjam.drivers.observation import Seen, feature, observe, observed, own_files
+from unjam.drivers.observation import Seen, asked_by, feature, observe, observed, own_files
 from unjam.drivers.wrappers import Wrapper
 from unjam.physics.arrays import Array, namespace
 from unjam.tree import Arrays
@@ -54,6 +54,16 @@ class ResidualDriver(Wrapper):
     def told(self) -> tuple[str, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
         """What the features look at."""
         return tuple(name for part in self.parts for name in feature(part).told)
+
+    @property
+    def sees(self) -> tuple[str, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """The features of its network, and those of networks in its expert."""
+        return (*self.parts, *self.expert.sees)
+
+    @property
+    def asks(self) -> frozenset[str]:
+        """What the expert and the features look at; features of the user's own, at all that is told."""
+        return super().asks | asked_by(self.parts)
 
     @property
     def observed_memory(self) -> tuple[Observed, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]

@@ -44,6 +44,11 @@ class Wrapper(Driver):
         """Whether one that it holds must know its place on a closed road."""
         return any(held.needs_loop for held in self.inner.values())
 
+    @property
+    def sees(self) -> tuple[str, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """What networks in those that it holds see."""
+        return tuple(name for held in self.inner.values() for name in held.sees)
+
 
 class Around(Wrapper):
     """A driver around one other."""
@@ -170,8 +175,8 @@ class Impaired(Around):
 class Filtered(Around):
     """Another driver with the limits and the safety filter of a road, for a car that has none of its own.
 
-    A controller is shipped so: what drives elsewhere is what was proven. Where the road filters as well, as
-    all of unjam's do, nothing changes.
+    A controller is shipped so: what drives elsewhere is what was proven, of a car that obeys at once. Where
+    the road filters as well, and a decision is one simulation step, nothing changes.
     """
 
     driver: Driver

@@ -14,12 +14,12 @@ from unjam.drivers.car_following import Constant
 from unjam.drivers.command import Command, Limits
 from unjam.drivers.driver import Decision, Driver, Memory, Noise
 from unjam.drivers.local_state import LocalState
-from unjam.drivers.observation import FeatureName, Seen, feature, observation_size, observe
+from unjam.drivers.observation import FeatureName, Seen, asked_by, observation_size, observe
 from unjam.errors import EpisodeError, InputError, MissingPartError, UnjamError, wrong_name
 from unjam.processes import has_display
 from unjam.scenarios import make_scenario
 from unjam.worlds.drive import Drive
-from unjam.worlds.episode import check_can_drive
+from unjam.worlds.episode import check_can_drive, check_can_see
 from unjam.worlds.reward import Outcome, make_reward, time_headway
 from unjam.worlds.sumo import make_traffic
 from unjam.worlds.sumo.apart import simulation_for
@@ -45,7 +45,12 @@ class Outside(Driver):
     @property
     def asks(self) -> frozenset[str]:
         """What the expert and the features look at."""
-        return self.expert.asks.union(*(feature(name).told for name in self.names))
+        return self.expert.asks | asked_by(self.names)
+
+    @property
+    def sees(self) -> tuple[str, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """What is shown outside, and what networks in the expert see."""
+        return (*self.names, *self.expert.sees)
 
     def initial_memory(self, n: int) -> Memory:
         """Return the expert's."""
@@ -105,8 +110,9 @@ class SteppedRoad:
         self.scenario = make_scenario(scenario, changes)
         self._reward = make_reward(reward or self.scenario.reward)
         driver = make_driver(expert, self.scenario.decision_step) if expert else Constant()
-        check_can_drive(driver, self.scenario)
         self._driver = Outside(driver, observe_parts, self.scenario.limits)
+        check_can_drive(driver, self.scenario)
+        check_can_see(self._driver.names, self.scenario, "observe")
         self._backend: Backend = backend
         self._simulation: Simulation | None = None
         self._traffic: Traffic | None = None
@@ -151,8 +157,8 @@ class SteppedRoad:
         """
         traffic, before, seen = self.traffic, list(self.traffic.cavs), self._seen
         self._driver.actions = np.asarray(actions, np.float64)
-        done = next(self._decisions)
-        assert done is not None
+        if next(self._decisions, None) is None:
+            raise UnjamError("step: the episode is over; allowed: reset")
         kept = list(range(len(before)) if traffic.kept is None else traffic.kept)
         speeds, state = np.array(traffic.speeds), traffic.exact_state()
         headways = time_headway(state.leader_gap, state.speed)[: len(kept)]

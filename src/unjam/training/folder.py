@@ -40,7 +40,7 @@ from unjam.kernels import kernels
 from unjam.parameters import build, flat
 from unjam.scenarios.own_network import OwnNetwork
 from unjam.sumo_files import read_sumo_files
-from unjam.worlds.episode import Task, check_can_drive
+from unjam.worlds.episode import Task, check_can_drive, check_can_see
 
 FORMAT = 4
 """of what a checkpoint holds; one of another unjam is refused"""
@@ -56,14 +56,7 @@ def check_possible(config: RunConfig) -> None:
     """Raise `InputError` where an expert, what the network sees, a reward or a baseline is at fault."""
     for road in config.roads().values():
         scenario = road.make_scenario()
-        for name in road.policy.observe:
-            needs, told = feature(name).needs, feature(name).told
-            if needs == "loop" and not scenario.closed:
-                raise InputError(f"policy.observe: {name!r} is not allowed on a road with ends")
-            if not set(told) <= set(scenario.tells):
-                raise InputError(f"policy.observe: {name!r} is not allowed on {scenario.title}")
-            if needs == "coordinate" and not scenario.has_coordinate:
-                raise InputError(f"policy.observe: {name!r} is not allowed on a network of one's own")
+        check_can_see(road.policy.observe, scenario, "policy.observe")
         expert = road.make_expert()
         check_can_drive(expert, scenario)
         observation_size(road.policy.observe, expert)

@@ -9,6 +9,7 @@ import numpy as np
 
 from unjam.drivers.driver import Driver
 from unjam.drivers.from_file import DriverLike, as_driver
+from unjam.drivers.observation import feature
 from unjam.errors import InputError, NoCavError, wrong
 from unjam.scenarios.scenario import Scenario
 from unjam.worlds.drive import drive
@@ -91,6 +92,19 @@ def check_can_drive(driver: Driver, scenario: Scenario) -> None:
     """Raise `InputError` where a driver cannot drive on a scenario's road."""
     if not can_drive(driver, scenario):
         raise InputError(f"driver: it is not allowed on {scenario.title}: it needs a closed road")
+    check_can_see(driver.sees, scenario, "driver: its network's feature")
+
+
+def check_can_see(features: Sequence[str], scenario: Scenario, where: str) -> None:
+    """Raise `InputError` where features look at what a scenario's road does not tell."""
+    for name in features:
+        needs, told = feature(name).needs, feature(name).told
+        if needs == "loop" and not scenario.closed:
+            raise InputError(f"{where}: {name!r} is not allowed on a road with ends")
+        if not set(told) <= set(scenario.tells):
+            raise InputError(f"{where}: {name!r} is not allowed on {scenario.title}")
+        if needs == "coordinate" and not scenario.has_coordinate:
+            raise InputError(f"{where}: {name!r} is not allowed on a network of one's own")
 
 
 def check_cavs_drove(episode: Episode, driver: Driver) -> None:
