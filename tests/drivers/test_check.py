@@ -36,6 +36,25 @@ class WritesIntoMemory(Good):
         return state.speed * 0.0, memory
 
 
+class WritesIntoState(Good):
+    def act(self, state: Any, memory: Any) -> Any:
+        state.leader_gap.fill(7.0)
+        return state.speed * 0.0, memory
+
+
+class RemembersNoDict(Good):
+    def initial_memory(self, n: int) -> Any:
+        return np.zeros(n)
+
+
+class Forgets:
+    def initial_memory(self, n: int) -> Any:
+        return {}
+
+    def act(self, state: Any, memory: Any) -> Any:
+        return 0.0 * state.speed
+
+
 class NotFinite(Good):
     def act(self, state: Any, memory: Any) -> Any:
         return np.log(state.speed), memory  # some vehicles stand
@@ -67,6 +86,9 @@ def test_accepts_good_drivers(driver: Any) -> None:
         (RemembersItself(), "step 0: the same state and memory gave another acceleration"),
         (MixesRows(), "step 0: row 0 gave .* alone and .* among 8 rows"),
         (WritesIntoMemory(), r"step 0: act\(\) changed the memory"),
+        (WritesIntoState(), r"step 0: act\(\) changed the state"),
+        (RemembersNoDict(), r"initial_memory\(8\) answers .*; allowed: a dict of arrays"),
+        (Forgets(), r"act\(\) answers .*; allowed: \(accelerations, memory\)"),
         (NotFinite(), r"step \d: acceleration is -inf"),
         (WrongShape(), r"step 0: acceleration has shape \(8, 1\)"),
         (Words(), "step 0: acceleration is not numbers"),

@@ -68,3 +68,16 @@ def test_a_users_driver_is_not_asked_while_no_cav_is_on_the_road(tmp_path: Path)
     (trajectory,) = episode.trajectories
     assert trajectory.start > 3
     np.testing.assert_allclose(trajectory.applied, 0.001 * trajectory.states.leader_gap[:-1], atol=1e-12)
+
+
+def test_files_of_two_folders_have_neighbours_of_the_same_name(tmp_path: Path) -> None:
+    found = []
+    for folder, gain in (("a", -0.1), ("b", 0.3)):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "gains.py").write_text(f"GAIN = {gain}")
+        (tmp_path / folder / "mine.py").write_text(
+            "from gains import GAIN\ndef hold(state):\n    return GAIN"
+        )
+        found.append(FileDriver(tmp_path / folder / "mine.py", "hold"))
+    state = random_state(np.random.default_rng(0), 1)
+    assert [driver.act(state, {})[0] for driver in found] == [-0.1, 0.3]

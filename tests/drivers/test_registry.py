@@ -1,7 +1,9 @@
+from typing import Any
+
 import pytest
 
 from unjam.drivers import Constant, FollowerStopper, PISaturation
-from unjam.drivers.registry import named_driver, recipe_of
+from unjam.drivers.registry import driver_from_recipe, named_driver, recipe_of
 from unjam.errors import InputError
 
 
@@ -47,3 +49,17 @@ def test_a_class_of_ones_own_must_come_from_a_file() -> None:
 
     with pytest.raises(InputError, match="put your class in a file"):
         recipe_of(Mine())
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"kind": "impaired", "delay": -3.0, "gap_noise": 0.0, "time_step": 0.1},
+        {"kind": "impaired", "delay": 1e6, "gap_noise": 0.0, "time_step": 0.1},
+        {"kind": "impaired", "delay": 1.0, "gap_noise": 0.0, "time_step": 0.0},
+        {"kind": "remembering", "time_step": float("nan")},
+    ],
+)
+def test_a_recipe_of_what_no_driver_is_is_refused(wrong: dict[str, Any]) -> None:
+    with pytest.raises(InputError):
+        driver_from_recipe({"driver": PISaturation().recipe(), **wrong}, {})

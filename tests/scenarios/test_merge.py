@@ -171,7 +171,7 @@ def test_recipe_makes_the_same_scenario_again() -> None:
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"standing": 101}, "standing: 101 is not allowed; allowed: <= 100"),
+        ({"standing": 81}, "standing: 81 is not allowed; allowed: <= 80"),
         ({"standing": -1}, "standing"),
         ({"cavs": 167}, "cavs: 167 is not allowed; allowed: <= 166, who enter in the first half"),
         ({"cavs": 0}, "cavs"),

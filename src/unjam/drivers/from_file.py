@@ -12,6 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from traceback import extract_tb
+from types import ModuleType
 from typing import Any, Protocol
 
 import numpy as np
@@ -72,6 +73,7 @@ class FileReference:
         remember(path)  # what a folder names was checked before it comes here
         module = importlib.util.module_from_spec(spec)
         sys.modules[module_name] = module
+        before = set(sys.modules)
         sys.path.insert(0, str(path.parent))  # so that the file may import its neighbours
         try:
             spec.loader.exec_module(module)
@@ -79,6 +81,9 @@ class FileReference:
             raise InputError(f"{path.name}: {type(error).__name__} when loading it: {error}") from error
         finally:
             sys.path.remove(str(path.parent))
+            for name in set(sys.modules) - before:  # another folder's file may have neighbours of that name
+                if _lies_in(sys.modules[name], path.parent):
+                    del sys.modules[name]
         if not hasattr(module, self.name):
             public = ", ".join(key for key in vars(module) if not key.startswith("_")) or "nothing"
             raise InputError(f"{path.name}: has no {self.name!r}; it has: {public}")
@@ -106,6 +111,12 @@ class FileReference:
             raise InputError(f"{self}: {type(error).__name__}: {error}{place}") from error
 
 
+def _lies_in(module: ModuleType, folder: Path) -> bool:
+    """Return whether a module was imported from a folder."""
+    file = getattr(module, "__file__", None)
+    return file is not None and folder.resolve() in Path(file).resolve().parents
+
+
 class Brought(Driver):
     """A driver of the user's own, by what it holds: anything with `act` and `initial_memory`."""
 
@@ -122,12 +133,12 @@ class Brought(Driver):
 
     def initial_memory(self, n: int) -> Memory:
         """Return what the user's driver remembers before its first step."""
-        return self.held.initial_memory(n)
+        return self.ask(self.held.initial_memory, n)
 
     def recall(self, memory: Memory, history: LocalState) -> Memory:
         """Return what the user's driver makes of the warm-up, if it has `recall`."""
         recall = getattr(self.held, "recall", None)
-        return recall(memory, history) if recall else memory
+        return self.ask(recall, memory, history) if recall else memory
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
         """Return the user's acceleration and memory; raise `InputError` where the user's code fails.
@@ -136,7 +147,12 @@ class Brought(Driver):
         """
         if np.size(state.speed) == 0:
             return np.zeros(0), memory
-        return self.ask(self.held.act, state, memory)
+        found = self.ask(self.held.act, state, memory)
+        if not (isinstance(found, tuple) and len(found) == 2):
+            raise InputError(
+                f"{self.describe()}: act() answers {found!r:.60}; allowed: (accelerations, memory)"
+            )
+        return found
 
     def time_headways(self, state: LocalState, memory: Memory) -> Array | None:
         """Return what the user's driver asks of its cars' ACCs, if it asks for anything."""
@@ -146,7 +162,7 @@ class Brought(Driver):
     def memory_features(self, memory: Memory) -> Array | None:
         """Return the user's features of the memory, if the driver has any."""
         features = getattr(self.held, "memory_features", None)
-        return features(memory) if features else None
+        return self.ask(features, memory) if features else None
 
 
 @dataclass(frozen=True)
@@ -264,15 +280,20 @@ def check_driver(
     """
     driver = as_driver(driver)
     generator, told = np.random.default_rng(seed), told or bool(driver.told)
-    memory = driver.initial_memory(rows)
-    single = [driver.initial_memory(1) for _ in range(rows)]
+    memory, *single = (driver.initial_memory(count) for count in (rows, *[1] * rows))
+    if not isinstance(memory, dict):
+        raise InputError(f"driver: initial_memory({rows}) answers {memory!r}; allowed: a dict of arrays")
     for step in range(steps):
         state = random_state(generator, rows, told)
-        before = mapped(np.array, memory)  # a copy
+        before, shown = mapped(np.array, memory), state.each(np.array)  # copies
         acceleration, after = _asked(driver, state, memory, step)
         acceleration = check_acceleration(acceleration, rows, f"step {step}")
         if not _equal(memory, before):
             raise InputError(f"driver: step {step}: act() changed the memory that it was given")
+        if not all(
+            np.array_equal(one, other) for one, other in zip(state, shown, strict=True) if one is not None
+        ):
+            raise InputError(f"driver: step {step}: act() changed the state that it was given")
         again, _ = _asked(driver, state, before, step)
         if not np.array_equal(acceleration, again):
             raise InputError(f"driver: step {step}: the same state and memory gave another acceleration")

@@ -1,7 +1,7 @@
 """All drivers by name, and every driver from how it is written down, so that another process can make it."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import fields
+from dataclasses import field, fields
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -21,6 +21,7 @@ from unjam.drivers.pi_saturation import PIFromGap, PISaturation
 from unjam.drivers.residual import EXPERT, ResidualDriver
 from unjam.drivers.road_experts import Cruise, GapMaker, JamAbsorber, JamAhead, Pacer
 from unjam.drivers.safety import SafetyFilter
+from unjam.drivers.speed_history import LONGEST
 from unjam.drivers.while_gathered import LEADING, OTHERWISE, WhileGathered
 from unjam.drivers.wrappers import INNER, Filtered, Impaired, Mixed, Remembering
 from unjam.errors import InputError, did_you_mean, wrong
@@ -134,9 +135,43 @@ def _residual(recipe: Recipe, arrays: Arrays, held: Held) -> Driver:
     return ResidualDriver(expert, network, found.action_limit, found.parts, found.hold)
 
 
+@dataclass(frozen=True, config=STRICT)
+class _ImpairedRecipe:
+    """How a driver with what is worse about it is written down."""
+
+    kind: Literal["impaired"]
+    driver: dict[str, Any]
+    delay: NotNegative
+    gap_noise: NotNegative
+    time_step: Positive
+
+
 def _impaired(recipe: Recipe, arrays: Arrays, held: Held) -> Driver:
-    worse = {key: float(recipe[key]) for key in ("delay", "gap_noise", "time_step")}
-    return Impaired(held(recipe["driver"], INNER), **worse)
+    found = build(_ImpairedRecipe, recipe, "driver recipe")
+    if found.delay / found.time_step > LONGEST:
+        raise wrong("delay", found.delay, f"at most {LONGEST:,} steps of {found.time_step:g} s")
+    return Impaired(held(found.driver, INNER), found.delay, found.gap_noise, found.time_step)
+
+
+@dataclass(frozen=True, config=STRICT)
+class _SteppedRecipe:
+    """How a driver around others that must know its time step is written down."""
+
+    kind: Literal["remembering", "while-gathered"]
+    time_step: Positive
+    driver: dict[str, Any] = field(default_factory=dict)
+    drivers: dict[str, dict[str, Any]] = field(default_factory=dict)
+
+
+def _while_gathered(recipe: Recipe, arrays: Arrays, held: Held) -> Driver:
+    found = build(_SteppedRecipe, recipe, "driver recipe")
+    leading, otherwise = (held(found.drivers[name], name) for name in (LEADING, OTHERWISE))
+    return WhileGathered(leading, otherwise, found.time_step)
+
+
+def _remembering(recipe: Recipe, arrays: Arrays, held: Held) -> Driver:
+    found = build(_SteppedRecipe, recipe, "driver recipe")
+    return Remembering(held(found.driver, INNER), found.time_step)
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -169,14 +204,8 @@ RECIPES: dict[str, Callable[[Recipe, Arrays, Held], Driver]] = {
     "by-road": lambda recipe, arrays, held: ByRoad(
         **{kind: held(recipe["drivers"][kind], kind) for kind in KINDS_OF_ROAD if kind in recipe["drivers"]},
     ),
-    "while-gathered": lambda recipe, arrays, held: WhileGathered(
-        held(recipe["drivers"][LEADING], LEADING),
-        held(recipe["drivers"][OTHERWISE], OTHERWISE),
-        float(recipe["time_step"]),
-    ),
-    "remembering": lambda recipe, arrays, held: Remembering(
-        held(recipe["driver"], INNER), float(recipe["time_step"])
-    ),
+    "while-gathered": _while_gathered,
+    "remembering": _remembering,
 }
 """how each kind of recipe becomes a driver again"""
 

@@ -87,6 +87,14 @@ class Pacer(Formula):
     time_constant: Positive = 0.1
     """time over which the wanted speed is reached [s]"""
 
+    @model_validator(mode="after")
+    def _in_pairs(self) -> "Pacer":
+        if len(self.harmonics) % 2 == 0 and self.harmonics:
+            raise ValueError(
+                f"harmonics: {self.harmonics} is not allowed; allowed: an odd count, (V, a1, b1, ...)"
+            )
+        return self
+
     def initial_memory(self, n: int) -> Memory:
         """Return that nobody has gathered yet."""
         return {"gathered": np.zeros(n)}

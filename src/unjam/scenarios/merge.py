@@ -75,7 +75,8 @@ class Merge(Scenario):
 
     @model_validator(mode="after")
     def _fits(self) -> "Merge":
-        most = int((BEFORE + INFLOW_EDGE + AFTER) / (VEHICLE_LENGTH + self.humans.minimum_gap))
+        room = VEHICLE_LENGTH + max(self.humans.minimum_gap, self.people_gap)
+        most = int((BEFORE + INFLOW_EDGE) / room)
         if self.standing > most:
             raise ValueError(f"standing: {self.standing} is not allowed; allowed: <= {most}")
         early = len(self._early())

@@ -214,7 +214,8 @@ class OnRamp(Scenario):
 
     def possible_cavs(self) -> tuple[str, ...]:
         """Return the ids that CAVs may have: any vehicle's."""
-        most = int(self.seconds / 3600.0 * 2.0 * (self.inflow + self.ramp_flow))
+        flow = max(self.inflow, self.calm_inflow) + max(self.ramp_flow, self.calm_ramp_flow)
+        most = int(self.seconds / 3600.0 * 2.0 * flow)
         return tuple(f"vehicle_{number}" for number in range(most))
 
     def facts(self) -> list[tuple[str, str]]:

@@ -10,6 +10,7 @@ import os
 from dataclasses import asdict, dataclass, field
 from functools import lru_cache
 from importlib.resources import files
+from math import isfinite
 from pathlib import Path
 from typing import Any
 
@@ -171,6 +172,10 @@ def _read(path: Path, changed: int, size: int) -> Population:
         if not drivers:
             raise InputError(f"population {path.name}: it has no drivers")
         low, high = (float(limit) for limit in content["limits"])
+        if not (isfinite(low) and isfinite(high) and low < 0.0 < high):
+            raise ValueError(
+                f"limits: [{low:g}, {high:g}] are not allowed; allowed: one below and one above 0"
+            )
         return Population(
             typical=build(IDMParameters, content["typical"], "population.typical"),
             drivers=drivers,
