@@ -1,6 +1,8 @@
+import errno
 from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
+from typing import NoReturn
 
 import numpy as np
 import pytest
@@ -209,3 +211,22 @@ def test_pictures_of_an_empty_road_have_its_lanes_alone(tmp_path: Path) -> None:
     drawn = picture(scene)
     middle = drawn[SIZE // 2 - 3 : SIZE // 2 + 3, 100:-100]
     assert (middle != 255).any(-1).mean() > 0.5
+
+
+@pytest.mark.parametrize("suffix", [".gif", ".mp4"])
+def test_a_film_that_finds_no_room_leaves_the_one_of_before(
+    tmp_path: Path, suffix: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ffmpeg = pytest.importorskip("imageio_ffmpeg", reason="pip install imageio-ffmpeg")
+
+    def full(*arguments: object, **options: object) -> NoReturn:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    path = tmp_path / f"wave{suffix}"
+    path.write_text("of before")
+    monkeypatch.setattr("unjam.files.os.fsync", full)
+    monkeypatch.setattr(ffmpeg, "count_frames_and_secs", full)
+    with pytest.raises(DiskError, match="No space left on device"):
+        write_video(driven(1.0), path, "pi")
+    assert [each.name for each in tmp_path.iterdir()] == [path.name]
+    assert path.read_text() == "of before"

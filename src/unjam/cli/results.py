@@ -10,7 +10,6 @@ import typer
 from unjam.cli.options import DEFAULT_WORKERS, HumansOption, JsonOption, WorkersOption, scenario_changes
 from unjam.cli.output import aside, console, counting_steps, new_table, print_json, print_metrics
 from unjam.errors import InputError
-from unjam.files import make_folder
 from unjam.processes import go_on_limited, owned
 
 
@@ -42,7 +41,7 @@ def evaluate(
     from unjam.drivers.registry import DRIVERS
     from unjam.reports.results import read_results
     from unjam.training.evaluate import gain_of, judge, steps_to_judge
-    from unjam.training.folder import read_config
+    from unjam.training.folder import new_and_owned, read_config
     from unjam.worlds.workers import Workers
 
     if humans is not None and out is None:
@@ -58,8 +57,7 @@ def evaluate(
 
     total = steps_to_judge(config, run, list(DRIVERS), episodes)
     target = out or run
-    make_folder(target)
-    with owned(target):
+    with owned(target) if out is None else new_and_owned(out):
         with counting_steps("evaluating", total) as steps, Workers(workers) as pool:
             found = judge(run, config, pool, list(DRIVERS), episodes, steps, out)
         page = write_report([target], target / "report.html")

@@ -1,5 +1,6 @@
 """One moment of a road and a film of many, drawn without a display; environments render with it too."""
 
+import io
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from textwrap import fill
@@ -7,8 +8,8 @@ from textwrap import fill
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from unjam.errors import MissingPartError, wrong
-from unjam.files import check_folder
+from unjam.errors import DiskError, MissingPartError, wrong
+from unjam.files import check_folder, write_whole
 from unjam.reports.figures import CAV_COLOUR, INK, colour_table
 from unjam.reports.results import shown_of
 from unjam.scenarios.scenario import VEHICLE_LENGTH
@@ -116,7 +117,7 @@ def write_video(episode: Episode, path: Path, title: str, pace: float = 10.0) ->
 
     Raises:
         InputError: another kind of file.
-        DiskError: there is no folder for it.
+        DiskError: there is no folder for it, or no room: a file of before stays as it was.
         MissingPartError: .mp4 without imageio-ffmpeg.
     """
     check_format(path)
@@ -131,7 +132,9 @@ def write_video(episode: Episode, path: Path, title: str, pace: float = 10.0) ->
     # A .gif counts in hundredths of a second: rounded one by one they would not add up to the whole.
     ends = np.round(100 * seconds * np.arange(1, 2 + (len(episode.speeds) - 1) // every))
     durations = (10 * np.diff(ends, prepend=0)).astype(int).tolist()
-    next(frames).save(path, save_all=True, append_images=frames, duration=durations, loop=0)
+    film, kind = io.BytesIO(), path.suffix.lower().removeprefix(".")
+    next(frames).save(film, kind, save_all=True, append_images=frames, duration=durations, loop=0)
+    write_whole(path, film.getvalue())
 
 
 def check_format(path: Path) -> None:
@@ -145,16 +148,27 @@ def _write_mp4(frames: Iterator[Image.Image], path: Path, rate: float) -> None:
         import imageio_ffmpeg
     except ImportError:
         raise MissingPartError("video: .mp4 needs imageio-ffmpeg: pip install imageio-ffmpeg") from None
+    half = path.with_name(f".{path.stem}-half{path.suffix}")  # ffmpeg writes by itself, and says little
     writer = imageio_ffmpeg.write_frames(
-        str(path),
+        str(half),
         (SIZE, SIZE),
         fps=rate,  # pyright: ignore[reportArgumentType]  ffmpeg takes fractions too
         ffmpeg_log_level="error",
     )
     writer.send(None)
-    for frame in frames:
-        writer.send(np.asarray(frame.convert("RGB")).tobytes())
-    writer.close()
+    try:
+        for frame in frames:
+            writer.send(np.asarray(frame.convert("RGB")).tobytes())
+        writer.close()
+        imageio_ffmpeg.count_frames_and_secs(str(half))  # which one that was cut short does not survive
+        film = half.read_bytes()
+    except (OSError, RuntimeError) as error:
+        raise DiskError(
+            f"video: {path.name} could not be written: {' '.join(str(error).split())[:200]}"
+        ) from None
+    finally:
+        half.unlink(missing_ok=True)
+    write_whole(path, film)
 
 
 def _frames(episode: Episode, title: str, every: int) -> Iterator[Image.Image]:
