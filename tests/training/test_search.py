@@ -109,6 +109,10 @@ def test_a_trial_says_what_its_last_checkpoint_earns(
     assert words_of_trial(Trial(3, {"agent": "ppo"}, Path("trials/3"), gain, last)) == words
 
 
+EARNS = {"constant": 100.0}
+"""experts that earn something, in trainings that stand for real ones"""
+
+
 class Trainings:
     """Stands for trainings: each is worth what its target_kl says, and can be made to fail or to stop."""
 
@@ -126,7 +130,8 @@ class Trainings:
         folder = Path(command.words[-1])
         folder.mkdir(parents=True)
         worth = -abs(math.log10(config.trpo.target_kl) + 2)
-        row = {"iteration": 1, "return_validation": worth, "return_expert": 0.0}
+        expert = EARNS.get(config.expert, 0.0)
+        row = {"iteration": 1, "return_validation": expert + worth, "return_expert": expert}
         (folder / "progress.jsonl").write_text(to_json(row))
         self.done.append(folder)
         return 0
@@ -230,3 +235,11 @@ def test_real_trainings_are_searched(tmp_path: Path) -> None:
     for trial in found:
         assert trial.gain == validation_gain(trial.folder)
         assert (trial.folder / "report.html").is_file()
+
+
+def test_among_several_experts_that_wins_whose_controller_earns_most(
+    tmp_path: Path, trainings: Trainings
+) -> None:
+    space = space_of(["expert=constant,pi", "trpo.target_kl=0.001..0.1:log"])
+    best, *_ = search(BASE, space, 12, tmp_path / "search", 1)
+    assert best.values["expert"] == "constant"

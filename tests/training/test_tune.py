@@ -160,7 +160,8 @@ def test_on_several_roads_the_mean_gain_is_maximised_and_the_worst_road_named(tm
     steps = each * ((FINALISTS + 1) * 2 + 3) + 2 * each
     with Workers(1) as workers:
         found = tune(roads, "pi", SPACE, steps, tmp_path, workers)
-    assert (len(found.settings), found.actual_steps) == (2, steps)
+    unused = (FINALISTS - 2) * 2 * each  # two settings were tried, so no more than two are finalists
+    assert (len(found.settings), found.actual_steps) == (2, steps - unused)
     assert all(one.score is not None and WORST <= one.score <= MOST for one in found.settings)
     assert found.best.verdict.startswith("worst on ")
     written = json.loads((tmp_path / TUNED).read_text())
@@ -177,6 +178,24 @@ def test_of_roads_of_all_kinds_those_are_screened_that_a_batch_can_step(tmp_path
             tune(roads, "pi", SPACE, final + 2 * each, tmp_path / str(screen), workers, screen=screen)
             for screen in (True, False)
         )
+    final -= (FINALISTS - 2) * 2 * each  # two settings were tried, so no more than two are finalists
     assert (found.actual_steps, found.imagined_steps) == (final + 2 * OF_EACH * 80, 2 * OF_EACH * 60)
     assert (driven.actual_steps, driven.imagined_steps) == (final + 2 * each, 0)
     assert [one.score for one in found.settings] == pytest.approx([one.score for one in driven.settings])
+
+
+def test_what_is_no_parameter_of_the_expert_is_not_varied(tmp_path: Path) -> None:
+    with Workers(1) as workers, pytest.raises(InputError, match="vary: 'catch_up' is not allowed"):
+        tune({"ring": SMALL}, "pi", {"catch_up": Range(0.5, 3.0)}, STEPS, tmp_path, workers)
+
+
+def test_a_reward_whose_file_has_changed_is_another_tuning(tmp_path: Path) -> None:
+    file = tmp_path / "mine.py"
+    text = "import numpy as np\ndef calm(outcome): return {{'speed': {} * outcome.speeds.mean(-1)}}\n"
+    file.write_text(text.format(1))
+    with Workers(1) as workers:
+        arguments = {"ring": SMALL}, "pi", SPACE, STEPS, tmp_path / "tuned", workers, f"{file}:calm"
+        tune(*arguments)
+        file.write_text(text.format(-1000))
+        with pytest.raises(InputError, match="was made with other settings"):
+            tune(*arguments)

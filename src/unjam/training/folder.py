@@ -311,13 +311,16 @@ def _files(road: RunConfig, task: Task) -> dict[str, str]:
     recipe, arrays = recipe_of(task.expert)
     weights = b"".join(arrays[name].tobytes() for name in sorted(arrays))
     found = {f"expert {road.expert}": hash_of(json.dumps(recipe, sort_keys=True).encode() + weights)}
-    paths = [
-        FileReference.of(name).path for name in (road.reward, *road.policy.observe) if is_file_reference(name)
-    ]
-    scenario = task.scenario
-    if isinstance(scenario, OwnNetwork):
-        own = read_sumo_files(Path(scenario.file))
-        paths += [own.path, own.network, *own.additional_files, *own.route_files]
-    if scenario.population:
-        paths.append(population_file(scenario.population))
-    return found | {str(path): hash_of(path.read_bytes()) for path in paths}
+    return found | hashes_of_files((road.reward, *road.policy.observe), task.scenario)
+
+
+def hashes_of_files(names: Iterable[str], *scenarios: Scenario) -> dict[str, str]:
+    """Return hashes of the files that `names` refer to and that scenarios are made from, by path."""
+    paths = [FileReference.of(name).path for name in names if is_file_reference(name)]
+    for scenario in scenarios:
+        if isinstance(scenario, OwnNetwork):
+            own = read_sumo_files(Path(scenario.file))
+            paths += [own.path, own.network, *own.additional_files, *own.route_files]
+        if scenario.population:
+            paths.append(population_file(scenario.population))
+    return {str(path): hash_of(path.read_bytes()) for path in paths}

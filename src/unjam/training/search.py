@@ -95,7 +95,7 @@ def _range(text: str, values: str) -> Range:
     values, log = values.removesuffix(":log"), values.endswith(":log")
     low, high, *more = (parse_value(end.strip()) for end in values.split(".."))
     numbers = all(isinstance(end, int | float) and not isinstance(end, bool) for end in (low, high))
-    if more or not numbers or not low < high or not math.isfinite(high) or (log and low <= 0):
+    if more or not numbers or not low < high or not math.isfinite(high - low) or (log and low <= 0):
         raise wrong("vary", text, "low < high, with :log low > 0")
     return Range(low, high, log)
 
@@ -159,7 +159,10 @@ def search(
             for done in wait(jobs, return_when=FIRST_COMPLETED).done:
                 number = jobs.pop(done)
                 failed = done.result() != 0
-                _tell(study, number, None if failed else validation_gain(_trial_folder(folder, number)))
+                found = None if failed else validation_gain(_trial_folder(folder, number))
+                if found is not None and "expert" in space:  # gains beyond other experts cannot be compared
+                    found = max(found, 0.0) + _expert_of(_trial_folder(folder, number))
+                _tell(study, number, found)
                 on_line(_words(study, number, trials))
     found = [_trial(folder, trial.number, trial.params, trial.value) for trial in study.get_trials()]
     found.sort(key=lambda trial: -math.inf if trial.gain is None else trial.gain, reverse=True)
@@ -262,6 +265,11 @@ def validation_gain(folder: Path) -> float | None:
     """Return a training's best validation beyond its expert's; None where there was no validation."""
     found = validations_of(read_progress(folder))
     return found and found[0]
+
+
+def _expert_of(folder: Path) -> float:
+    """Return what a training's expert earns on the validation seeds; 0 without one."""
+    return float(read_progress(folder)[0]["return_expert"] or 0.0)
 
 
 def words_of_trial(trial: Trial) -> str:

@@ -27,7 +27,7 @@ from unjam.scenarios import scenario_recipe
 from unjam.scenarios.on_ramp import OnRamp
 from unjam.scenarios.scenario import Scenario
 from unjam.training.evaluate import raise_failure
-from unjam.training.folder import origin
+from unjam.training.folder import hashes_of_files, origin
 from unjam.training.search import Choice, Range, Space, quiet_optuna
 from unjam.training.seeds import tuning_seeds
 from unjam.training.tried import Tried, Verdict
@@ -157,6 +157,10 @@ def tune(
         UnjamError: no car could drive any of the settings.
         MissingPartError: Optuna is not installed.
     """
+    known = named_driver(expert, 1.0).recipe()["parameters"]
+    for key in space:
+        if key not in known:
+            raise wrong_name("vary", key, known)
     episodes = EPISODES if len(roads) == 1 else OF_EACH
     each = episodes * sum(scenario.horizon for scenario in roads.values())
     # People, who are the measure on several roads, drive as often as a setting and a finalist.
@@ -171,6 +175,8 @@ def tune(
     screened = [road for road, why in reasons.items() if screen is not False and not why]
     recipes = {road: scenario_recipe(scenario) for road, scenario in roads.items()}
     wanted = {"roads": recipes, "expert": expert, "space": repr(space), "steps": steps, "reward": reward}
+    files = hashes_of_files([reward], *roads.values())
+    wanted |= {"files": files} if files else {}
     tried = Tried(folder, wanted | {"seed": seed, "screen": bool(screened)})
     in_sumo = dict.fromkeys(roads, partial(_in_sumo, workers))
     trying = in_sumo | dict.fromkeys(screened, _in_batch)
@@ -217,8 +223,10 @@ def tune(
         raise UnjamError(f"no car could drive any of {trials} settings of {expert}: {default.verdict}")
     best = max(finalists, key=lambda one: -inf if one.score is None else one.score)
     file = folder / f"{expert}{SUFFIX}"
-    imagined = trials * episodes * sum(roads[road].horizon for road in screened)
-    tuned = Tuned(best, default, settings, trials * each + final - imagined, imagined, file)
+    made = {setting.driver for setting in settings if not _not_made(setting.driver)}
+    imagined = len(made) * episodes * sum(roads[road].horizon for road in screened)
+    unused = (FINALISTS - len(best_values)) * 2 * each
+    tuned = Tuned(best, default, settings, len(made) * each + final - unused - imagined, imagined, file)
     _write(roads, expert, tuned, folder, reward, seed, tried.starts)
     return tuned
 
