@@ -1,9 +1,9 @@
 """Whether CAVs on the left lane had better be held back otherwise than those on the right one.
 
-`python results/tried/on_ramp_lanes.py` writes on-ramp-lanes.json beside itself, in a quarter of an hour: at 5 %
-CAVs the law that was tuned longer, with shifts of its cap by stretch of the way and by lane. Pairs of roads of
-a batch with the same people and opposite shifts, and then one set of shifts in three strengths, read off
-these. Tuning seeds.
+`python results/tried/on_ramp_lanes.py` writes on-ramp-lanes.json beside itself, in a quarter of an hour: at
+5 % CAVs the law that was tuned longer, with shifts of its cap by stretch of the way and by lane. Pairs of
+roads of a batch with the same people and opposite shifts, and then one set of shifts in three strengths, read
+off these. Tuning seeds.
 """
 
 from dataclasses import asdict, replace

@@ -83,3 +83,15 @@ def test_a_run_is_removed_and_nothing_else(under: Path, monkeypatch: pytest.Monk
 def test_a_folder_that_is_not_there_is_told() -> None:
     with pytest.raises(InputError, match="allowed: one that holds run folders"):
         unjam.list_runs("nowhere")
+
+
+def test_a_damaged_run_is_listed_as_such_beside_the_others(under: Path) -> None:
+    file = under / "ring-001/evaluation.json"
+    file.write_text(file.read_text()[:100])
+    found = {run.name: run for run in unjam.list_runs(under)}
+    assert {name: run.state for name, run in found.items()} == {
+        "ring-001": "damaged",
+        "deep/ring-002": "stopped",
+        "merge-001": "stopped",
+    }
+    assert found["ring-001"].gains == {"": None}

@@ -22,7 +22,7 @@ from unjam.cli.options import (
     with_options,
 )
 from unjam.cli.output import after_drive, aside, console, counting_steps, print_json, print_metrics
-from unjam.errors import MissingPartError
+from unjam.errors import InputError, MissingPartError
 from unjam.processes import has_display
 
 if TYPE_CHECKING:
@@ -86,6 +86,8 @@ def drive(
     from unjam.training.evaluate import raise_failures
 
     changes |= assignments(settings)
+    if out is not None and not report:
+        raise InputError("out: it is not allowed with --no-report, which writes nothing")
     if not driver:
         driver = ["human", BEST]
         changes = (WITH_OWN_ACC if scenario.endswith(".sumocfg") else {}) | changes

@@ -157,7 +157,9 @@ def asked_run(
     ] = None,
     preset: Annotated[
         str,
-        typer.Option(help="Named starting point: demo, quick, best, rings, shared-rings, everywhere, paper."),
+        typer.Option(
+            help="Where to start: demo, quick, best, rings, shared-rings, everywhere, paper, paper-exact."
+        ),
     ] = "",
     config: Annotated[Path | None, typer.Option(help="TOML file with any keys of the configuration.")] = None,
     settings: Annotated[
@@ -179,12 +181,16 @@ def asked_run(
     return AskedRun(preset, config, given, assignments(settings))
 
 
+LONGEST_NUMBER = 10
+"""digits that a length or radius may have"""
+
+
 def parse_range(name: str, text: str | None) -> tuple[int, int] | None:
     """Return (230, 230) for `230` and (220, 270) for `220-270`."""
     if text is None:
         return None
     parts = text.split("-")
-    if len(parts) > 2 or not all(part.strip().isdigit() for part in parts):
+    if len(parts) > 2 or not all(part.strip().isdecimal() and len(part) < LONGEST_NUMBER for part in parts):
         raise wrong(name, text, "metres, like 230 or 220-270")
     return int(parts[0]), int(parts[-1])
 

@@ -72,10 +72,11 @@ class FittedDrivers:
     def verdict(self) -> list[str]:
         """Return in words how near the drivers come to the recorded gaps."""
         fit, details = self.population.about["fit"], self.population.details
-        errors = [one["gap_error"] for one in details]
+        errors, seconds = np.array([[one["gap_error"], one["seconds"]] for one in details]).T
+        own = np.sqrt(np.average(np.square(errors), weights=seconds))
         lines = [
-            f"error of the simulated gap: one IDM for all {fit['together']['gap_error']:.2f} m, "
-            f"each driver's own {np.mean(errors):.2f} m on average"
+            "error of the simulated gap, root mean square: "
+            f"one IDM for all {fit['together']['gap_error']:.2f} m, each driver's own {own:.2f} m"
         ]
         unknown = fit["together"]["bounds"]
         if len(unknown) >= SUSPICIOUS:

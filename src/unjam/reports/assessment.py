@@ -131,8 +131,8 @@ def _table(found: dict[str, Any]) -> list[dict[str, Any]]:
     ]
     rows.insert(3, ("travel time, of people's", "%", ["", *relative]))
     people = _estimate(found["people"]["collisions"])
-    touched = [people.mean * people.count, *(each["effect"]["collisions"] for each in judged)]
-    rows.append(("vehicles in collisions, all episodes", "", [f"{each:.0f}" for each in touched]))
+    more = [f"{each['effect']['collisions']:+.0f}" for each in judged]
+    rows.append(("vehicles in collisions, all episodes", "", [f"{people.mean * people.count:.0f}", *more]))
     seeds = [found["seeds"]["judging"], *(each["effect"]["travel_time"].count for each in judged)]
     rows.append(("fresh seeds", "", [str(count) for count in seeds]))
     return [{"label": label, "unit": unit, "cells": cells} for label, unit, cells in rows]

@@ -152,13 +152,15 @@ def _references(results: Sequence[Results]) -> dict[str, float]:
     there, and have those of the held-out seeds.
     """
     found: dict[str, float] = {}
+    several = len({result.about.get("scenario") for result in results}) > 1
     for result in results:
         expert = result.about.get("expert", "none")
+        where = f" ({result.about.get('scenario')})" if several else ""
         if result.progress and expert != "none":
-            found.setdefault(f"{short(expert)}, validation", result.progress[0]["return_expert"])
+            found.setdefault(f"{short(expert)}, validation{where}", result.progress[0]["return_expert"])
         for label, rows in result.rows.items():
             if label not in (result.trained, expert):
-                found.setdefault(f"{short(label)}, held-out", estimate_of(rows, "return").mean)
+                found.setdefault(f"{short(label)}, held-out{where}", estimate_of(rows, "return").mean)
     return found
 
 

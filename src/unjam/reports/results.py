@@ -172,7 +172,7 @@ def read_rows(folder: Path) -> dict[str, list[dict[str, Any]]]:
 
 def read_progress(folder: Path) -> list[dict[str, Any]]:
     """Return the rows of a run's progress; one that is damaged, or cut short by a crash, is left out."""
-    return [row for row in read_lines(folder / "progress.jsonl") if "iteration" in row]
+    return [row for row in read_lines(folder / "progress.jsonl") if isinstance(row.get("iteration"), int)]
 
 
 def validations_of(progress: Sequence[dict[str, Any]]) -> tuple[float, float] | None:

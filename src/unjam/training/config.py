@@ -226,7 +226,8 @@ def load_config(
             _check_heeded(preset, started["tasks"], given)
         values = {**started, "preset": preset}
     wanted = changed(values, given)
-    if road.actuation == "cruise" and wanted.get("virtual", {}).get("model", "row") == "row":
+    virtual = wanted.get("virtual", {})
+    if road.actuation == "cruise" and isinstance(virtual, dict) and virtual.get("model", "row") == "row":
         # Virtual rows know no ACC of a CAV's own: without a model, unless one is asked for.
         wanted = changed({"virtual": {"virtual_ratio": 0.0}}, wanted)
     return build(RunConfig, wanted, "")
@@ -235,7 +236,8 @@ def load_config(
 def _check_heeded(preset: str, tasks: Sequence[dict[str, Any]], given: dict[str, Any]) -> None:
     """Raise `InputError` where the user says what every task of a preset says otherwise."""
     said = {name: value for name, value in given.items() if name in ("scenario", "reward")}
-    said |= {f"road.{name}": value for name, value in given.get("road", {}).items()}
+    changes = given.get("road", {})
+    said |= {f"road.{name}": value for name, value in changes.items()} if isinstance(changes, dict) else {}
     for name, value in said.items():
         if all(flat(task).get(name, "") not in ("", value) for task in tasks):
             raise wrong(name, value, f"none with the preset {preset}, whose roads have their own")

@@ -167,7 +167,7 @@ def _ray(workers: int) -> Iterator[Callable[[CommandLine], int]]:
         ray.init(address="auto", log_to_driver=False)
     except ConnectionError:
         ray.init(address="local", num_cpus=workers, include_dashboard=False, log_to_driver=False)
-    remote = ray.remote(num_cpus=1, max_retries=ATTEMPTS)(_run_here)
+    remote = ray.remote(num_cpus=1, max_retries=ATTEMPTS - 1)(_run_here)
     try:
         yield lambda command: ray.get(remote.remote(command))
     finally:

@@ -1,6 +1,5 @@
 """Controllers as files: those that a run keeps in its folders, and what `unjam export` ships."""
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +17,7 @@ from unjam.errors import InputError, wrong
 from unjam.files import check_folder, make_folder, write_whole
 from unjam.measures.metrics import measure
 from unjam.measures.statistics import summarise
-from unjam.reports.results import EVALUATION_FILE, rows_by_driver
+from unjam.reports.results import EVALUATION_FILE, read_about
 from unjam.scenarios import example_of
 from unjam.scenarios.scenario import Scenario
 from unjam.training.evaluate import TRAINED, raise_failure
@@ -165,11 +164,9 @@ def _of_driver(text: str, scenario: str) -> tuple[Scenario, Driver, dict[str, An
 
 def _held_out(folder: Path) -> dict[str, Any] | None:
     """Return what the run's evaluation measured of the controller and of its expert; None before its end."""
-    path = folder / EVALUATION_FILE
-    if not path.is_file():
+    if not (folder / EVALUATION_FILE).is_file():
         return None
-    found = json.loads(path.read_text())
-    rows_of = rows_by_driver(found["rows"])
+    found, rows_of = read_about(folder)
     measured: dict[str, Any] = {"reward": found["reward"]}
     for label in (TRAINED, found["expert"]):
         if rows := rows_of.get(label):

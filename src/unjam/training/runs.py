@@ -17,7 +17,7 @@ from unjam.training.config import RunConfig
 from unjam.training.folder import MANIFEST, read_config
 from unjam.training.stopping import ends_early
 
-State = Literal["running", "finished", "stopped"]
+State = Literal["running", "finished", "stopped", "damaged"]
 
 
 @dataclass(frozen=True)
@@ -55,12 +55,21 @@ def list_runs(under: Path | str = "runs", scenario: str = "") -> list[Run]:
     under = Path(under)
     if not under.is_dir():
         raise InputError(f"under: {str(under)!r} is not a folder; allowed: one that holds run folders")
-    found = [read_run(folder, str(folder.relative_to(under))) for folder in sorted(_run_folders(under))]
+    found = [_listed(folder, str(folder.relative_to(under))) for folder in sorted(_run_folders(under))]
     return [
         run
         for run in found
         if not scenario or scenario in {Path(road.scenario).name for road in run.config.roads().values()}
     ]
+
+
+def _listed(folder: Path, name: str) -> Run:
+    """Return how far a run is; one that is damaged is listed as such, beside the others."""
+    try:
+        return read_run(folder, name)
+    except InputError:
+        config = read_config(folder, to_run=False)
+        return Run(name, folder, config, "damaged", 0, dict.fromkeys(config.roads()))
 
 
 def _run_folders(under: Path) -> Iterator[Path]:
