@@ -34,7 +34,8 @@ MILLION = 1_000_000
 """where an hour makes no more"""
 
 ROADS: dict[str, dict[str, Any]] = {
-    **{name: {"scenario": name} for name in ("ring", "ring-jammed", "figure-eight", "merge", "on-ramp")},
+    **{name: {"scenario": name} for name in ("ring", "ring-jammed", "figure-eight", "merge")},
+    "on-ramp": {"scenario": "on-ramp", "road.cav_share": 0.05},
     **{name: {"scenario": "ring"} for name in ("rings", "shared-rings", "everywhere")},
     "ring-11": {"scenario": "ring", "road.vehicles": 11},
     "ring-5": {"scenario": "ring", "road.vehicles": 5},
