@@ -6,7 +6,10 @@ import math
 import os
 import shutil
 import sys
-from contextlib import suppress
+import zipfile
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +24,17 @@ DAMAGED = (
     SafetensorError,
 )
 """what reading JSON and arrays can raise where they are not what unjam writes"""
+NONE_OF_OURS = (*DAMAGED, zipfile.BadZipFile, zlib.error, EOFError, MemoryError, RuntimeError)
+"""what reading can raise where a file is none; `RuntimeError`: of a kind that zipfile does not know"""
+
+
+@contextmanager
+def reading(what: str) -> Iterator[None]:
+    """Raise `InputError` where something that is read within is none of ours, or damaged."""
+    try:
+        yield
+    except NONE_OF_OURS as error:
+        raise InputError(f"{what}: the controller is damaged: {' '.join(f'{error!r}'.split())}") from None
 
 
 def write_whole(path: Path, content: bytes | str) -> None:

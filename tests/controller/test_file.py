@@ -19,8 +19,9 @@ from tests.conftest import random_network
 from unjam.controller import controller_bytes, load_controller
 from unjam.controller.file import FORMAT, MANIFEST, WEIGHTS
 from unjam.drivers import IDM, FollowerStopper, PISaturation, ResidualDriver
+from unjam.drivers.check import random_state
 from unjam.drivers.driver import Driver
-from unjam.drivers.from_file import FileDriver, random_state
+from unjam.drivers.from_file import FileDriver
 from unjam.drivers.network import network_arrays
 from unjam.drivers.observation import FeatureName, observation_size
 from unjam.drivers.registry import recipe_of

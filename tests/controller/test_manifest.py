@@ -7,7 +7,8 @@ import pytest
 from tests.controller.test_file import ALL_PARTS, residual
 from unjam.controller.file import description
 from unjam.drivers import IDM, Driver, FollowerStopper, LocalState, Pacer, PISaturation
-from unjam.drivers.from_file import FileDriver, random_state
+from unjam.drivers.check import random_state
+from unjam.drivers.from_file import FileDriver
 from unjam.drivers.local_state import EVERYWHERE
 from unjam.drivers.observation import observed
 from unjam.drivers.wrappers import Mixed

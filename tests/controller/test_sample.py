@@ -5,7 +5,7 @@ from safetensors.numpy import load, save
 from tests.controller.test_file import residual
 from unjam.controller.file import read_sample, replay, sample_bytes
 from unjam.drivers import LocalState, PISaturation
-from unjam.drivers.from_file import random_state
+from unjam.drivers.check import random_state
 from unjam.errors import InputError
 
 

@@ -9,7 +9,7 @@ from unjam.controller import load_controller
 from unjam.controller.file import controller_bytes
 from unjam.drivers import Constant, PISaturation
 from unjam.drivers.by_road import KINDS_OF_ROAD, ByRoad
-from unjam.drivers.from_file import check_driver
+from unjam.drivers.check import check_driver
 from unjam.drivers.local_state import EVERYWHERE, LocalState, like_ones
 from unjam.drivers.registry import driver_from_recipe, recipe_of
 from unjam.scenarios import make_scenario

@@ -6,8 +6,8 @@ import torch
 
 from tests.conftest import random_network
 from unjam.drivers import DRIVERS, Driver, ResidualDriver, check_driver
+from unjam.drivers.check import random_state
 from unjam.drivers.driver import single_row
-from unjam.drivers.from_file import random_state
 from unjam.drivers.registry import driver_from_recipe, named_driver, recipe_of
 
 EXPERTS = [

@@ -5,7 +5,8 @@ import pytest
 
 from unjam import check_driver
 from unjam.controller import make_driver
-from unjam.drivers.from_file import FileDriver, random_state
+from unjam.drivers.check import random_state
+from unjam.drivers.from_file import FileDriver
 from unjam.errors import InputError
 from unjam.scenarios import Merge
 from unjam.worlds.episode import run_episode

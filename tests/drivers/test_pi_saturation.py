@@ -3,8 +3,8 @@ import pytest
 
 from tests.conftest import state_of
 from unjam.drivers import LocalState, PIFromGap, PISaturation
+from unjam.drivers.check import random_state
 from unjam.drivers.driver import Memory
-from unjam.drivers.from_file import random_state
 
 FLOW = PISaturation(time_constant=0, safe_gap_rule="closing", first_command="zero")
 AROUND_A_RING = state_of([5, 7.5, 7.5, 8, 7], [7.5, 7.5, 8, 7, 5], [5, 10, 15, 20, 25])

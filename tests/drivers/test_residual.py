@@ -4,8 +4,8 @@ import torch
 
 from tests.conftest import random_network
 from unjam.drivers import IDM, Driver, LocalState, PISaturation, ResidualDriver, check_driver
+from unjam.drivers.check import random_state
 from unjam.drivers.driver import single_row
-from unjam.drivers.from_file import random_state
 from unjam.drivers.network import Network
 from unjam.drivers.observation import observation_size
 from unjam.drivers.wrappers import Remembering

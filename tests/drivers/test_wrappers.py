@@ -8,8 +8,9 @@ from tests.conftest import random_network
 from unjam.controller import make_driver
 from unjam.drivers import IDM, Driver, FollowerStopper, PISaturation, check_driver
 from unjam.drivers.by_road import ByRoad
+from unjam.drivers.check import random_state
 from unjam.drivers.driver import Memory
-from unjam.drivers.from_file import as_driver, random_state
+from unjam.drivers.from_file import as_driver
 from unjam.drivers.local_state import LocalState
 from unjam.drivers.registry import driver_from_recipe, recipe_of
 from unjam.drivers.residual import ResidualDriver

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from unjam.drivers import PISaturation
-from unjam.drivers.from_file import check_driver
+from unjam.drivers.check import check_driver
 from unjam.errors import MissingPartError
 from unjam.training import batch_speed, speed
 from unjam.training.batch_speed import measure_batches, neural_driver

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from unjam.drivers import IDM, LocalState
-from unjam.drivers.from_file import random_state
+from unjam.drivers.check import random_state
 from unjam.drivers.residual import EXPERT, ResidualDriver
 from unjam.drivers.safety import SafetyFilter
 from unjam.physics.arrays import Array, as_column, namespace, stack_columns

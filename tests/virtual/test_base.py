@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from unjam.drivers import LocalState
-from unjam.drivers.from_file import random_state
+from unjam.drivers.check import random_state
 from unjam.drivers.local_state import EVERYWHERE, LARGEST_GAP
 from unjam.drivers.network import Network
 from unjam.physics.idm import IDMParameters

@@ -7,8 +7,9 @@ import torch
 
 from tests.conftest import random_network
 from unjam.drivers import IDM, Driver, LocalState, PISaturation, ResidualDriver
+from unjam.drivers.check import random_state
 from unjam.drivers.driver import Memory
-from unjam.drivers.from_file import FileDriver, random_state
+from unjam.drivers.from_file import FileDriver
 from unjam.drivers.local_state import EVERYWHERE, like_ones
 from unjam.errors import InputError
 from unjam.scenarios import Ring

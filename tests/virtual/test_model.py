@@ -3,7 +3,7 @@ import torch
 from torch.testing import assert_close
 
 from unjam.drivers import LocalState
-from unjam.drivers.from_file import random_state
+from unjam.drivers.check import random_state
 from unjam.virtual.ensemble import BLOCK, predict, random_members, torch_generator
 from unjam.virtual.model import NUMBERS, TARGETS, EnvironmentModel, model_inputs
 from unjam.virtual.settings import VirtualSettings

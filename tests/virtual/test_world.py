@@ -12,7 +12,7 @@ from torch.testing import assert_close
 
 import unjam.virtual
 from unjam.drivers import LocalState
-from unjam.drivers.from_file import random_state
+from unjam.drivers.check import random_state
 from unjam.drivers.local_state import LARGEST_GAP
 from unjam.drivers.safety import Ahead
 from unjam.scenarios import Ring

@@ -6,11 +6,12 @@ from typing import Any
 
 import numpy as np
 
-from unjam.controller.file import SAMPLE, Controller, Floats, read_sample, reading
+from unjam.controller.file import SAMPLE, Controller, Floats, read_sample
 from unjam.drivers.local_state import LocalState
 from unjam.drivers.safety import Ahead
 from unjam.drivers.wrappers import Filtered
 from unjam.errors import InputError
+from unjam.files import reading
 from unjam.parameters import build
 from unjam.physics.idm import IDMParameters, equilibrium_gap, idm_acceleration
 from unjam.worlds.drive import drive

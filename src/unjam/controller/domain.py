@@ -10,9 +10,10 @@ import numpy as np
 
 from unjam.controller import SHIPPED, shipped_file
 from unjam.controller.certificate import Domain
-from unjam.controller.file import CERTIFICATE, NONE_OF_OURS, Controller, read_controller
+from unjam.controller.file import CERTIFICATE, Controller, read_controller
 from unjam.drivers.local_state import LocalState
 from unjam.errors import InputError
+from unjam.files import NONE_OF_OURS
 from unjam.parameters import build, flat
 from unjam.worlds.record import Episode
 

@@ -6,9 +6,6 @@ import json
 import os
 import stat
 import zipfile
-import zlib
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,7 +19,7 @@ from unjam.drivers.driver import Driver
 from unjam.drivers.local_state import COLUMNS, EVERYWHERE, STATE_UNITS, LocalState
 from unjam.drivers.registry import code_of, driver_from_recipe, recipe_of
 from unjam.errors import InputError
-from unjam.files import DAMAGED, to_json, write_whole
+from unjam.files import NONE_OF_OURS, to_json, write_whole
 from unjam.physics.arrays import Floats
 from unjam.tree import leaves
 from unjam.trust import check_trusted
@@ -46,8 +43,6 @@ PARTS = (MANIFEST, WEIGHTS, SAMPLE, GRAPH, CERTIFICATE, SIGNATURE)
 was certified, the signature where it was signed: in this order then"""
 LARGEST_PART = 64 * 2**20
 """bytes of one part"""
-NONE_OF_OURS = (*DAMAGED, zipfile.BadZipFile, zlib.error, EOFError, MemoryError, RuntimeError)
-"""what reading can raise where a file is none; `RuntimeError`: of a kind that zipfile does not know"""
 
 UNIX = 3
 """of the systems that an archive can name"""
@@ -112,15 +107,6 @@ def add_signature(file: Path, controller: Controller, key: "Ed25519PrivateKey") 
 
     parts = {name: controller.parts[name] for name in PARTS if name in controller.parts.keys() - {SIGNATURE}}
     write_whole(file, pack_parts({**parts, SIGNATURE: signature_of(parts, key)}))
-
-
-@contextmanager
-def reading(what: str) -> Iterator[None]:
-    """Raise `InputError` where something that is read within is none of ours, or damaged."""
-    try:
-        yield
-    except NONE_OF_OURS as error:
-        raise InputError(f"{what}: the controller is damaged: {' '.join(f'{error!r}'.split())}") from None
 
 
 def load_controller(path: Path | str) -> Driver:

@@ -28,13 +28,12 @@ from unjam.controller.file import (
     description,
     read_controller,
     read_sample,
-    reading,
     replay,
 )
 from unjam.drivers.driver import Driver
 from unjam.drivers.local_state import LocalState
 from unjam.errors import InputError, MissingPartError
-from unjam.files import to_json
+from unjam.files import reading, to_json
 from unjam.tree import leaves
 
 REPEATS_TO = 1e-9

@@ -1,10 +1,11 @@
 """Who drives a CAV: experts, learned residuals, your own."""
 
 from unjam.drivers.car_following import ACC, BCM, IDM, LACC, OVM, Constant, Human
+from unjam.drivers.check import check_driver
 from unjam.drivers.command import Command, Limits
 from unjam.drivers.driver import Decision, Driver, Memory
 from unjam.drivers.follower_stopper import FollowerStopper
-from unjam.drivers.from_file import DriverLike, as_driver, check_driver
+from unjam.drivers.from_file import DriverLike, as_driver
 from unjam.drivers.local_state import LocalState
 from unjam.drivers.pi_saturation import PIFromGap, PISaturation
 from unjam.drivers.registry import DRIVERS

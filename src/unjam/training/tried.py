@@ -2,6 +2,7 @@
 
 import json
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,18 @@ ASKED, TRIED = "asked.json", "tried.jsonl"
 
 Verdict = tuple[float | None, str]
 """score and why; no score where it does not count"""
+
+
+@dataclass(frozen=True)
+class Setting:
+    """Parameters of an expert that were tried."""
+
+    driver: str
+    """as `--driver` takes it"""
+    values: dict[str, Any]
+    score: float | None
+    """mean return, on several roads the mean gain; None where no car could drive so"""
+    verdict: str
 
 
 class Tried:

@@ -30,7 +30,7 @@ from unjam.training.evaluate import raise_failure
 from unjam.training.folder import hashes_of_files, origin
 from unjam.training.search import Choice, Range, Space, quiet_optuna
 from unjam.training.seeds import tuning_seeds
-from unjam.training.tried import Tried, Verdict
+from unjam.training.tried import Setting, Tried, Verdict
 from unjam.worlds.batch.possible import statistical_why_not, why_not
 from unjam.worlds.batch.run import run_batch, run_batches
 from unjam.worlds.workers import EpisodeTask, Workers
@@ -51,18 +51,6 @@ TO_ONE = 1.0
 
 Run = Callable[[list[list[EpisodeTask]]], list[Rows]]
 """runs the tasks of each driver on one road, in SUMO or in a batch, and measures their episodes"""
-
-
-@dataclass(frozen=True)
-class Setting:
-    """Parameters of an expert that were tried."""
-
-    driver: str
-    """as `--driver` takes it"""
-    values: dict[str, Any]
-    score: float | None
-    """mean return, on several roads the mean gain; None where no car could drive so"""
-    verdict: str
 
 
 @dataclass(frozen=True)

@@ -8,8 +8,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from unjam.drivers.check import check_acceleration
 from unjam.drivers.driver import Driver, Memory
-from unjam.drivers.from_file import check_acceleration, is_file_reference
+from unjam.drivers.from_file import is_file_reference
 from unjam.drivers.local_state import LocalState
 from unjam.drivers.safety import Ahead
 from unjam.errors import MissingPartError
