@@ -35,6 +35,11 @@ for road in ring ring-warm ring-jammed figure-eight merge; do
         -d human -d idm -d pi:time_constant=0 -d pi -d follower-stopper -d acc -d lacc -d bcm -d ovm $own \
         -d constant -d constant:acceleration=0.1 >/dev/null
 done
+# Tuned experts on the seeds that judge, for tables whose trainings are not kept.
+tuned() { unjam drive "$1" --held-out --episodes 20 --out "$runs/tuned-on-$1" -d human "${@:2}" >/dev/null; }
+tuned ring -d unjam:ring-tuned -d unjam:ring-gap-tuned
+tuned ring-jammed -d pi -d unjam:ring-jammed-tuned
+tuned figure-eight -d unjam:figure-eight-tuned
 python results/experts/pacer_long.py "$runs/pacer"
 cp "$runs/pacer/pacer-long.json" results/experts/ && rm -r "$runs/pacer"
 # Copied at the end: until then the tree is as committed, and the manifests say so.
