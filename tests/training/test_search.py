@@ -243,3 +243,5 @@ def test_among_several_experts_that_wins_whose_controller_earns_most(
     space = space_of(["expert=constant,pi", "trpo.target_kl=0.001..0.1:log"])
     best, *_ = search(BASE, space, 12, tmp_path / "search", 1)
     assert best.values["expert"] == "constant"
+    worth = -abs(math.log10(best.values["trpo.target_kl"]) + 2)
+    assert best.gain == pytest.approx(worth), "beyond its expert, whatever that earns"

@@ -159,13 +159,11 @@ def search(
             for done in wait(jobs, return_when=FIRST_COMPLETED).done:
                 number = jobs.pop(done)
                 failed = done.result() != 0
-                found = None if failed else validation_gain(_trial_folder(folder, number))
-                if found is not None and "expert" in space:  # gains beyond other experts cannot be compared
-                    found = max(found, 0.0) + _expert_of(_trial_folder(folder, number))
-                _tell(study, number, found)
+                _tell(study, number, None if failed else _worth(_trial_folder(folder, number), space))
                 on_line(_words(study, number, trials))
-    found = [_trial(folder, trial.number, trial.params, trial.value) for trial in study.get_trials()]
-    found.sort(key=lambda trial: -math.inf if trial.gain is None else trial.gain, reverse=True)
+    ended = study.get_trials()
+    ended.sort(key=lambda one: -math.inf if one.value is None else one.value, reverse=True)
+    found = [_trial(folder, one.number, one.params, one.value is None) for one in ended]
     rows = [
         {"trial": one.number, "gain": one.gain, "last": one.last, "folder": str(one.folder), **one.values}
         for one in found
@@ -177,10 +175,10 @@ def search(
     return found
 
 
-def _trial(folder: Path, number: int, values: dict[str, Any], gain: float | None) -> Trial:
+def _trial(folder: Path, number: int, values: dict[str, Any], failed: bool) -> Trial:
     place = _trial_folder(folder, number)
-    validated = validations_of(read_progress(place))
-    return Trial(number, values, place, gain, validated[1] if gain is not None and validated else None)
+    validated = None if failed else validations_of(read_progress(place))
+    return Trial(number, values, place, *(validated or (None, None)))
 
 
 def _trial_folder(folder: Path, number: int) -> Path:
@@ -267,9 +265,12 @@ def validation_gain(folder: Path) -> float | None:
     return found and found[0]
 
 
-def _expert_of(folder: Path) -> float:
-    """Return what a training's expert earns on the validation seeds; 0 without one."""
-    return float(read_progress(folder)[0]["return_expert"] or 0.0)
+def _worth(folder: Path, space: Space) -> float | None:
+    """Return what a search maximises: the gain or, as gains beyond other experts say little, the return."""
+    gain = validation_gain(folder)
+    if gain is None or "expert" not in space:
+        return gain
+    return max(gain, 0.0) + float(read_progress(folder)[0]["return_expert"] or 0.0)
 
 
 def words_of_trial(trial: Trial) -> str:
