@@ -8,7 +8,7 @@ import numpy as np
 
 from unjam.controller.file import SAMPLE, Controller, Floats, read_sample
 from unjam.drivers.local_state import LocalState
-from unjam.drivers.safety import Ahead
+from unjam.drivers.safety import Actuator, Ahead
 from unjam.drivers.wrappers import Filtered
 from unjam.errors import InputError
 from unjam.files import reading
@@ -137,8 +137,8 @@ def certificate_of(controller: Controller) -> dict[str, Any]:
         states, _ = read_sample(controller.parts[SAMPLE])
         road = controller.manifest["scenario"]
         humans = build(IDMParameters, road["humans"], "controller: humans")
-        late = any(road.get("actuator", {}).values())
-    if late:
+        actuator = build(Actuator, road.get("actuator", {}), "controller: actuator")
+    if not actuator.instant:
         raise InputError(
             "certify: a road whose cars obey late is not allowed; allowed: actuator.delay and lag 0"
         )

@@ -1,7 +1,7 @@
 """All drivers by name, and every driver from how it is written down, so that another process can make it."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import field, fields
+from dataclasses import fields
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -154,23 +154,31 @@ def _impaired(recipe: Recipe, arrays: Arrays, held: Held) -> Driver:
 
 
 @dataclass(frozen=True, config=STRICT)
-class _SteppedRecipe:
-    """How a driver around others that must know its time step is written down."""
+class _WhileGatheredRecipe:
+    """How a driver that leads while all are gathered is written down, with who drives otherwise."""
 
-    kind: Literal["remembering", "while-gathered"]
+    kind: Literal["while-gathered"]
+    drivers: dict[str, dict[str, Any]]
     time_step: Positive
-    driver: dict[str, Any] = field(default_factory=dict)
-    drivers: dict[str, dict[str, Any]] = field(default_factory=dict)
 
 
 def _while_gathered(recipe: Recipe, arrays: Arrays, held: Held) -> Driver:
-    found = build(_SteppedRecipe, recipe, "driver recipe")
+    found = build(_WhileGatheredRecipe, recipe, "driver recipe")
     leading, otherwise = (held(found.drivers[name], name) for name in (LEADING, OTHERWISE))
     return WhileGathered(leading, otherwise, found.time_step)
 
 
+@dataclass(frozen=True, config=STRICT)
+class _RememberingRecipe:
+    """How a driver that remembers means is written down."""
+
+    kind: Literal["remembering"]
+    driver: dict[str, Any]
+    time_step: Positive
+
+
 def _remembering(recipe: Recipe, arrays: Arrays, held: Held) -> Driver:
-    found = build(_SteppedRecipe, recipe, "driver recipe")
+    found = build(_RememberingRecipe, recipe, "driver recipe")
     return Remembering(held(found.driver, INNER), found.time_step)
 
 
