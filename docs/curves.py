@@ -22,6 +22,8 @@ COLOURS = ("#2b6cb0", "#e07a1f", "#3a8f5c", "#7b8794")
 def imagined(prefix: str) -> dict[str, str]:
     """Return the labels of the variants that a study of imagined roads compares."""
     modelled, few, middle, many = compared_with(prefix)
+    if few == many:
+        return {modelled: "whole roads imagined besides", few: "without"}
     return {
         modelled: "whole roads imagined besides",
         many: "without, in large iterations",

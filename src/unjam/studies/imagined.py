@@ -20,20 +20,23 @@ from unjam.worlds.record import Floats
 
 LOOKS = (190_000, 380_000, 750_000, 1_500_000, 3_000_000, 6_000_000)
 """actual steps after which trainings are looked at"""
-LOOKS_ON_RAMPS = (48_000, 96_000, 144_000, 288_000, 432_000, 1_152_000)
+LOOKS_ON_RAMPS = (28_800, 48_000, 72_000, 144_000)
 """the same where an iteration has fewer"""
 TIMES = (1, 2, 3)
-"""how many times the actual steps the method may take without the model: few, twice as many, all"""
+"""how many times the actual steps the method may take without the model"""
+WITHOUT = {
+    "eight": ("eight-few", "eight-middle", "best-in-batches"),
+    "ramp": ("ramp-few",) * len(TIMES),
+}
+"""who is without it: with few steps, with twice as many, with all; on the on-ramp one goes so far"""
 
 
 def compared_with(prefix: str) -> tuple[str, ...]:
-    """Return the variants whose names begin with `prefix`, the one with the model first, and `best`.
+    """Return the variant whose names begin with `prefix` that has the model, and who is without, by `TIMES`.
 
-    On figures eight, which a batch steps in distribution alone, that is trained in batches, too; on the
-    on-ramp all have another expert than `best`.
+    On figures eight, which a batch steps in distribution alone, the last is trained in batches, too.
     """
-    every = {"eight": "best-in-batches", "ramp": "ramp-all"}.get(prefix, "best")
-    return (*(f"{prefix}-{name}" for name in ("imagined", "few", "middle")), every)
+    return (f"{prefix}-imagined", *WITHOUT.get(prefix, (f"{prefix}-few", f"{prefix}-middle", "best")))
 
 
 def efficiency(road: str, compared: Sequence[str], looks: Sequence[int], folder: Path) -> pd.DataFrame:
@@ -44,7 +47,9 @@ def efficiency(road: str, compared: Sequence[str], looks: Sequence[int], folder:
     curves, (modelled, *others) = read_part(folder, "curves")[road], compared
     seen = {name: partial(_returns, curves[name], _first_look(road, name)) for name in compared}
     names = [f"{steps:,}" for steps in looks]
-    rows = [_row(VARIANTS[name].label, names, [seen[name](at) for at in looks]) for name in compared]
+    rows = [
+        _row(VARIANTS[name].label, names, [at_each(at) for at in looks]) for name, at_each in seen.items()
+    ]
     for name, times in zip(others, TIMES, strict=True):
         beyond = [seen[modelled](at) - seen[name](times * at) for at in looks]
         label = f"with the model beyond “{VARIANTS[name].label}” after {times} times as many"
@@ -74,5 +79,6 @@ def _row(label: str, names: Sequence[str], columns: list[Floats], sign: str = ""
 def imagined(road: str, prefix: str, looks: Sequence[int] = LOOKS) -> Study:
     """Return the study of a road and of its variants whose names begin with `prefix`."""
     compared = compared_with(prefix)
-    study = comparison_of(f"what a model of the whole road saves, on the {road}", compared, road)
+    title = f"what a model of the whole road saves, on the {road}"
+    study = comparison_of(title, tuple(dict.fromkeys(compared)), road)
     return replace(study, tables={**study.tables, "efficiency": partial(efficiency, road, compared, looks)})

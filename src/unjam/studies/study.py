@@ -149,7 +149,7 @@ def few_steps(prefix: str, batch: int, steps: int, horizon: int = 3000, **same: 
 
 LEFT_TO_LEARN = {
     "expert": "jam-ahead:margin=2,margin_by_share=0",
-    **{"evaluation.every": 3, "evaluation.validation_episodes": 32},
+    **{"world": "sumo", "evaluation.every": 3, "evaluation.validation_episodes": 32},
 }
 """the on-ramp's best method on a law that gains nothing there: on the tuned one nothing is left to learn"""
 ALONE = {"expert": "none", "virtual.virtual_ratio": 0.0}
@@ -196,9 +196,6 @@ VARIANTS: dict[str, Variant] = {
     **few_steps("jammed", 24_000, 768_000),
     **few_steps("eight", 6_000, 612_000, horizon=1500),
     **few_steps("ramp", 9_600, 144_000, horizon=2400, **LEFT_TO_LEARN, **{"virtual.kappa": 10_000.0}),
-    "ramp-all": Variant(
-        "ours, all its steps", "best", {**LEFT_TO_LEARN, "trpo.batch_steps": 76_800}, 1_152_000
-    ),
     "best-in-batches": Variant("ours, all its steps", "best", {"world": "batch"}, None),
     "by-150-seconds": Variant("residual", "best", BY_150_SECONDS, None),
     "rings": Variant("residual", "rings", TWO_EACH, None),
