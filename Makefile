@@ -25,6 +25,8 @@ demo: $(VENV)/.installed
 # The tests of a file share what they have made
 SPREAD := -n 2 --dist loadfile --no-loadscope-reorder
 
+# Two processes share two cores: threads of more than one would wait for each other
+test: export OMP_NUM_THREADS = 1
 test: $(VENV)/.installed-dev
 	$(BIN)/python -m pytest $(SPREAD) -m "not slow"
 
