@@ -33,7 +33,7 @@ def main() -> None:
         run = partial(workers.run_each, keep=kept_of)
         for road, scenario in roads_of("everywhere", "seen").items():
             rows = driven(scenario, {name: name for name in (PEOPLE, *experts)}, tuning_seeds(OF_EACH), run)
-            best = float(np.mean([ceiling(row) for row in rows[PEOPLE]]))
+            best = [ceiling(row) for row in rows[PEOPLE]]
             for name in experts:
                 found[name][road] = gain(rows[name], rows[PEOPLE], best)
             print(road, {name: round(of[road].mean, 2) for name, of in found.items()}, flush=True)

@@ -46,14 +46,13 @@ GOOD = Effect(
     drivable="drivable",
     people_time=100.0,
     people_flow=2000.0,
-    people_delay=nan,
+    delay_cut=Estimate(nan, nan, nan, 0),
     speed=NONE,
 )
 
 
 def test_words_say_what_everybody_gains() -> None:
-    known = replace(GOOD, people_delay=40.0)
-    assert known.delay_cut == Estimate(0.1, 0.05, 0.15, 20)
+    known = replace(GOOD, delay_cut=between(0.06, 0.14))
     assert known.words == (
         "travel time -4.0 [-6.0, -2.0] s (10 % less delay), flow +10 [-10, +30] veh/h, "
         "fuel +0.0 [+0.0, +0.0] ml/km"
@@ -62,9 +61,6 @@ def test_words_say_what_everybody_gains() -> None:
     slower = replace(known, travel_time=between(2.0, 6.0))
     assert slower.words.startswith("travel time +4.0 [+2.0, +6.0] s (more delay)")
     assert "delay" not in replace(known, travel_time=between(-6.0, 1.0)).words  # it may be none
-    assert (
-        "delay" not in replace(known, people_delay=-40.0).words
-    )  # nobody has arrived yet: there is none to cut
     assert "flow -20 [-30, -10] veh/h: a loss" in replace(GOOD, flow=between(-30.0, -10.0)).words
     nowhere = Estimate(nan, nan, nan, 0)
     closed = replace(GOOD, travel_time=nowhere, speed=between(0.1, 0.3))
@@ -75,8 +71,16 @@ def test_every_driver_is_seen_beside_people_who_are_there() -> None:
     found = beside_people({"pi": rows_of([98.0, 99.0]), "human": rows_of([100.0, 100.0])})
     assert list(found) == ["pi"]
     assert found["pi"].travel_time.mean == -1.5
-    assert found["pi"].people_delay == 40.0
     assert not beside_people({"pi": rows_of([98.0])})
+
+
+def test_the_share_of_delay_that_is_saved_has_an_interval_of_its_own() -> None:
+    people = [{**row, "delay": row["travel_time"] - 60.0} for row in rows_of([90.0, 100.0, 120.0])]
+    half = effect_of(rows_of([75.0, 80.0, 90.0]), people).delay_cut
+    assert (half.mean, half.low, half.high) == pytest.approx((0.5, 0.5, 0.5))  # on each seed
+    assert effect_of(rows_of([75.0, 80.0, nan]), people).delay_cut.count == 2
+    nobody_arrived = [{**row, "delay": -40.0} for row in people]
+    assert effect_of(rows_of([75.0] * 3), nobody_arrived).delay_cut.count == 0
 
 
 def test_differences_are_paired_and_only_on_seeds_that_both_have() -> None:

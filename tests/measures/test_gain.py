@@ -31,6 +31,8 @@ def ring(speeds: list[float], **changes: Any) -> list[dict[str, Any]]:
 
 
 PEOPLE = ring([3.0, 3.1, 2.9, 3.0])
+BEST = [4.0, 4.1, 3.9, 4.0]
+"""what the best is worth on each of people's seeds"""
 
 
 def test_closed_roads_are_judged_by_speed_and_those_with_ends_by_travel_time() -> None:
@@ -42,17 +44,19 @@ def test_closed_roads_are_judged_by_speed_and_those_with_ends_by_travel_time() -
 
 
 def test_people_gain_nothing_and_the_best_gains_one() -> None:
-    assert gain(PEOPLE, PEOPLE, 4.0).mean == 0.0
-    best = ring([4.0, 4.1, 3.9, 4.0])
-    assert gain(best, PEOPLE, 4.0).mean == pytest.approx(1.0)
-    half = gain(ring([3.4, 3.6, 3.5, 3.5]), PEOPLE, 4.0)
+    assert gain(PEOPLE, PEOPLE, BEST).mean == 0.0
+    best = gain(ring(BEST), PEOPLE, BEST)
+    assert (best.mean, best.low, best.high) == pytest.approx((1.0, 1.0, 1.0))
+    of_each = gain(ring([3.5, 3.6, 3.4, 3.7]), PEOPLE, [4.0, 4.1, 3.9, 4.4])
+    assert (of_each.mean, of_each.low, of_each.high) == pytest.approx((0.5, 0.5, 0.5))
+    half = gain(ring([3.4, 3.6, 3.5, 3.5]), PEOPLE, BEST)
     assert half.mean == pytest.approx(0.5)
     assert half.low < 0.5 < half.high
 
 
 def test_a_gain_is_bounded_on_both_sides() -> None:
-    assert gain(ring([9.0] * 4), PEOPLE, 4.0).mean == MOST
-    assert gain(ring([0.1] * 4), PEOPLE, 4.0).mean == WORST
+    assert gain(ring([9.0] * 4), PEOPLE, BEST).mean == MOST
+    assert gain(ring([0.1] * 4), PEOPLE, BEST).mean == WORST
 
 
 @pytest.mark.parametrize(
@@ -66,36 +70,43 @@ def test_a_gain_is_bounded_on_both_sides() -> None:
 )
 def test_what_no_car_could_drive_or_what_lowers_flow_gains_nothing(wrong: dict[str, Any]) -> None:
     fast = ring([4.0] * 4, **wrong)
-    assert gain(fast, PEOPLE, 4.0).mean == 0.0
+    assert gain(fast, PEOPLE, BEST).mean == 0.0
     slow = ring([2.5] * 4, **wrong)
-    assert gain(slow, PEOPLE, 4.0).mean == pytest.approx(-0.5)
+    assert gain(slow, PEOPLE, BEST).mean == pytest.approx(-0.5)
 
 
 def test_who_cannot_drive_on_a_road_neither_gains_nor_loses_there() -> None:
     failed = ring([nan] * 4, status="failed", cav_max_braking=nan, throughput_veh_per_h=nan)
-    found = gain(failed, PEOPLE, 4.0)
+    found = gain(failed, PEOPLE, BEST)
     assert (found.mean, found.low, found.high) == (0.0, 0.0, 0.0)
 
 
 def test_a_single_disaster_counts_no_more_than_the_worst_that_counts() -> None:
     rows = ring([4.0, 4.1, 3.9, -50.0])
-    found = gain_by_seed(rows, PEOPLE, 4.0)
-    assert found.mean() == pytest.approx(gain(rows, PEOPLE, 4.0).mean)
+    found = gain_by_seed(rows, PEOPLE, BEST)
+    assert found.mean() == pytest.approx(gain(rows, PEOPLE, BEST).mean)
     assert found - found.min() == pytest.approx([1.0 - WORST] * 3 + [0.0])
 
 
 def test_where_nothing_is_to_be_gained_a_loss_is_all_that_counts() -> None:
-    best = 3.0 * (1.0 + LEAST / 2)
+    best = [worth(row) * (1.0 + LEAST / 2) for row in PEOPLE]
     assert gain(ring([3.05] * 4), PEOPLE, best).mean == 0.0
     assert gain(ring([2.955] * 4), PEOPLE, best).mean == pytest.approx(-0.5)
 
 
 def test_seed_by_seed_a_gain_has_the_same_mean_and_interval() -> None:
     rows = ring([3.4, 3.7, 3.1, 3.9])
-    found, alone = estimate(gain_by_seed(rows, PEOPLE, 4.0).tolist()), gain(rows, PEOPLE, 4.0)
+    found, alone = estimate(gain_by_seed(rows, PEOPLE, BEST).tolist()), gain(rows, PEOPLE, BEST)
     assert (found.mean, found.low, found.high) == pytest.approx((alone.mean, alone.low, alone.high))
 
 
 def test_a_gain_that_a_rule_has_fixed_has_no_errors() -> None:
     crashed = ring([3.4, 3.7, 3.1, 3.9], collisions=2.0, status="collision")
-    assert gain_by_seed(crashed, PEOPLE, 4.0).tolist() == [0.0] * 4
+    assert gain_by_seed(crashed, PEOPLE, BEST).tolist() == [0.0] * 4
+
+
+def test_where_a_rule_has_fixed_it_seeds_differ_in_what_is_lost() -> None:
+    rows, nothing = ring([3.09, 3.01, 2.81, 2.82]), [worth(row) for row in PEOPLE]
+    found = gain_by_seed(rows, PEOPLE, nothing)
+    assert found.mean() == pytest.approx(gain(rows, PEOPLE, nothing).mean)
+    assert found.max() == pytest.approx(found[0])  # who gains and who keeps what there is are alike

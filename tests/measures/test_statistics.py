@@ -13,6 +13,7 @@ from unjam.measures.metrics import METRICS
 from unjam.measures.statistics import (
     LEAST,
     Estimate,
+    around_ratio,
     crossed_estimate,
     digits_of,
     estimate,
@@ -41,6 +42,16 @@ def coverage(found: Sequence[Estimate], true: float) -> float:
 def test_intervals_of_normal_values_cover_what_they_say(count: int, trim: float) -> None:
     drawn = np.random.default_rng(count).normal(3.0, 2.0, (2 * REPEATS, count))
     assert 0.93 <= coverage([estimate(values, trim=trim) for values in drawn], 3.0) <= 0.97
+
+
+@pytest.mark.parametrize("count", COUNTS)
+def test_intervals_of_ratios_cover_what_they_say(count: int) -> None:
+    generator = np.random.default_rng(count)
+    scales = 48.0 + 14.0 * generator.standard_normal((2 * REPEATS, count))
+    values = 0.6 * scales + 9.0 * generator.standard_normal(scales.shape)
+    found = [estimate(around_ratio(*each).tolist()) for each in zip(values, scales, strict=True)]
+    assert 0.93 <= coverage(found, 0.6) <= 0.97
+    assert found[0].mean == pytest.approx(values[0].mean() / scales[0].mean())
 
 
 def returns_on_ring() -> dict[str, np.ndarray]:

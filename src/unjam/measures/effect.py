@@ -9,8 +9,18 @@ from dataclasses import dataclass
 from math import nan
 from typing import Any
 
+import numpy as np
+
 from unjam.measures.drivable import DRIVABLE, drivable_in_all
-from unjam.measures.statistics import CONFIDENCE, Estimate, estimate_of, paired_difference, signed
+from unjam.measures.statistics import (
+    CONFIDENCE,
+    Estimate,
+    around_ratio,
+    estimate,
+    estimate_of,
+    paired_difference,
+    signed,
+)
 
 FLOW_LOST = 0.01
 """share of people's flow that the interval must exclude as a loss"""
@@ -44,23 +54,18 @@ class Effect:
     """mean travel time of people alone on these seeds [s]"""
     people_flow: float
     """[veh/h]"""
-    people_delay: float
-    """their travel time beyond that of a free road [s]; NaN where that is not known"""
+    delay_cut: Estimate
+    """share of people's delay beyond a free road that is saved; NaN where it is not known, or none"""
     speed: Estimate
     """mean speed of all vehicles [m/s]"""
 
     @property
-    def delay_cut(self) -> Estimate:
-        """Share of people's delay that is saved; NaN where that is not known, or where they have none."""
-        time, whole = self.travel_time, -self.people_delay if self.people_delay > 0 else nan
-        return Estimate(time.mean / whole, time.high / whole, time.low / whole, time.count)
-
-    @property
     def words(self) -> str:
         """What everybody on the road gains, in a line: time, flow and fuel, or speed where nobody leaves."""
-        cut, time = self.delay_cut, f"travel time {signed(self.travel_time, 1)} s"
-        if cut.low > 0 or cut.high < 0:
-            time += f" ({100 * cut.mean:.0f} % less delay)" if cut.low > 0 else " (more delay)"
+        time = f"travel time {signed(self.travel_time, 1)} s"
+        if self.delay_cut.count and (self.travel_time.high < 0 or self.travel_time.low > 0):
+            less = f"{100 * self.delay_cut.mean:.0f} % less delay"
+            time += f" ({less if self.travel_time.high < 0 else 'more delay'})"
         first = time if self.travel_time.count else f"mean speed {signed(self.speed, 2)} m/s"
         lost = ": a loss, whatever the speed" if self.flow.high < 0 else ""
         return f"{first}, flow {signed(self.flow)} veh/h{lost}, fuel {signed(self.fuel, 1)} ml/km"
@@ -97,9 +102,20 @@ def effect_of(
         drivable=drivable_in_all([{**row, HARD: 0.0} for row in rows]),
         people_time=estimate_of(people, TIME).mean,
         people_flow=estimate_of(people, FLOW).mean,
-        people_delay=estimate_of(people, "delay").mean,
+        delay_cut=_delay_cut(rows, people, confidence),
         speed=paired_difference(rows, people, "mean_speed", confidence),
     )
+
+
+def _delay_cut(
+    rows: Sequence[dict[str, Any]], people: Sequence[dict[str, Any]], confidence: float
+) -> Estimate:
+    alone = {str(row["seed"]): (row[TIME], row["delay"]) for row in people}
+    both = [(*alone[str(row["seed"])], row[TIME]) for row in rows if str(row["seed"]) in alone]
+    before, delays, driven = np.array([each for each in both if np.isfinite(each).all()]).reshape(-1, 3).T
+    if not len(delays) or delays.mean() <= 0:
+        return Estimate(nan, nan, nan, 0)
+    return estimate(around_ratio(before - driven, delays).tolist(), confidence)
 
 
 def beside_people(rows_by_driver: dict[str, list[dict[str, Any]]]) -> dict[str, Effect]:

@@ -103,6 +103,18 @@ def paired_difference(
     return estimate(differences, confidence=confidence)
 
 
+def around_ratio(values: Any, scales: Any) -> Any:
+    """Return numbers whose mean is mean(values) / mean(scales), and whose interval is that of this ratio.
+
+    Each pair, of one seed, lies as far from the ratio as it moves it: the delta method, for a scale that is
+    measured on the same seeds errs with what is measured by it. Both have the shape (seeds,).
+
+    Source: Cochran 1977, Sampling Techniques, section 6.3.
+    """
+    ratio = np.mean(values) / np.mean(scales)
+    return ratio + (values - ratio * scales) / np.mean(scales)
+
+
 def signed(gain: Estimate, digits: int = 0) -> str:
     """Return a difference with its sign and its interval; where it has none, the range of several values."""
     if not gain.count:

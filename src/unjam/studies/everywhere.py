@@ -174,7 +174,7 @@ def gains_of(folder: Path) -> dict[str, dict[str, Any]]:
             label: [{key: np.nan if value is None else value for key, value in row.items()} for row in of]
             for label, of in found["rows"].items()
         }
-        best = float(np.mean([worth(row) for row in rows[found["best"]]]))
+        best = [worth(row) for row in rows[found["best"]]]
         people = rows.pop(PEOPLE)
         roads[found["road"]] = {
             **{key: found[key] for key in ("part", "best")},

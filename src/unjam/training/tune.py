@@ -275,7 +275,7 @@ def _score(found: Mapping[str, Rows], people: Mapping[str, Rows]) -> tuple[float
     """Return the score of what was driven, road by road, and the verdict."""
     if people:
         gains = {
-            road: gain(rows, people[road], float(np.mean([ceiling(row) for row in people[road]])))
+            road: gain(rows, people[road], [ceiling(row) for row in people[road]])
             for road, rows in found.items()
         }
         worst = min(gains, key=lambda road: gains[road].mean)
