@@ -74,7 +74,12 @@ def in_own_words(error: Exception) -> UnjamError:
     """Return any error as one of ours, to be told to another process."""
     if isinstance(error, OSError) and error.errno in DISK_ERRNOS:
         return disk_error(error, error.filename or "a temporary file")
-    return error if isinstance(error, UnjamError) else UnjamError(f"{type(error).__name__}: {error}")
+    if isinstance(error, UnjamError):
+        return error
+    line = " ".join(str(error).split())
+    if type(error).__module__.partition(".")[0] in ("libsumo", "traci"):
+        return EpisodeError(f"SUMO cannot go on: {line}")
+    return UnjamError(f"{type(error).__name__}: {line}")
 
 
 def wrong(field: str, value: object, allowed: str) -> InputError:

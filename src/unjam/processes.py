@@ -55,6 +55,19 @@ def end_with_parent(signum: int) -> None:
         os.kill(os.getpid(), signum)
 
 
+@contextmanager
+def printed_to(path: Path) -> Iterator[None]:
+    """Let a file have what this process, its libraries included, prints as errors meanwhile."""
+    before = os.dup(2)
+    with path.open("wb") as file:
+        os.dup2(file.fileno(), 2)
+    try:
+        yield
+    finally:
+        os.dup2(before, 2)
+        os.close(before)
+
+
 def go_on_limited(what: str, *writable: Path) -> None:
     """Go on in a child that reads `what` of others under limits; this process waits, and ends as that does.
 

@@ -47,6 +47,18 @@ def test_files_times_and_types_are_what_the_configuration_says(tmp_path: Path) -
     assert found.used_types == {"car"}
 
 
+def test_options_may_be_written_shortly_as_sumo_reads_them(tmp_path: Path) -> None:
+    path = configuration(tmp_path, '<step-length v="0.1"/>')
+    path.write_text(path.read_text().replace("net-file value", "net-file v"))
+    assert read_sumo_files(path).step == 0.1
+
+
+def test_a_simulation_without_single_vehicles_is_refused(tmp_path: Path) -> None:
+    assert read_sumo_files(configuration(tmp_path, '<mesosim value="false"/>')).dropped == ()
+    with pytest.raises(InputError, match=r"road\.sumocfg: mesosim: true is not allowed; allowed: false"):
+        read_sumo_files(configuration(tmp_path, '<mesosim value="true"/>'))
+
+
 def test_names_of_files_may_have_spaces(tmp_path: Path) -> None:
     path = configuration(tmp_path)
     (tmp_path / "road.rou.xml").rename(tmp_path / "my road.rou.xml")

@@ -44,6 +44,8 @@ IN_PARAMETERS = ("file", "output", "log", "ssm")
 """what is in the names of parameters of vehicles and signals that name files, or write one by themselves"""
 PLAIN_ENCODINGS = (None, "utf-8", "us-ascii", "ascii", "iso-8859-1")
 """in which SUMO's parser cannot see another element than the one here"""
+YES = ("true", "t", "yes", "on", "1", "x")
+"""what SUMO takes for yes"""
 UNREADABLE = (
     *(ElementTree.ParseError, expat.ExpatError, OSError, EOFError, zlib.error, LookupError, ValueError),
 )
@@ -66,12 +68,14 @@ def _configuration(path: Path) -> dict[str, Any]:
     if not path.is_file():
         raise Broken(f"{str(path)!r}: there is no such file")
     options = {
-        {**FILES, **OTHER_NAMES}.get(element.tag, element.tag): element.get("value", "")
+        {**FILES, **OTHER_NAMES}.get(element.tag, element.tag): value
         for element in _elements(path)
-        if element.get("value") is not None
+        if (value := element.get("value", element.get("v"))) is not None
     }
     if not options.get("net-file"):
         raise Broken(f"{path.name}: names no net-file")
+    if options.get("mesosim", "").lower() in YES:
+        raise Broken(f"{path.name}: mesosim: true is not allowed; allowed: false, for it obeys no commands")
     network = path.parent / options["net-file"]
     additional, routes = (
         [path.parent / name.strip() for name in options.get(files, "").split(",") if name.strip()]

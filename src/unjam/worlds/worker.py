@@ -37,7 +37,7 @@ def main() -> None:
     gc.freeze()  # what the imports made stays; searching it for garbage would cost every episode
     # Either error: the parent wants no more, or is gone.
     with ExitStack() as at_the_end, suppress(BrokenPipeError, EOFError):
-        simulation = cache(lambda: at_the_end.enter_context(Simulation()))
+        simulation = cache(lambda: at_the_end.enter_context(Simulation(alone=True)))
         while True:
             _answer(*read_message(sys.stdin.buffer), simulation, answers)
 

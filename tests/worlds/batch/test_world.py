@@ -93,6 +93,15 @@ RINGS: dict[str, tuple[Ring, str]] = {
         Ring(length=(400, 400), vehicles=12, horizon=300, humans=replace(SHORT.humans, desired_speed=3.0)),
         "human",
     ),
+    "people faster than they want who brake gently": (
+        Ring(
+            length=(400, 400),
+            vehicles=12,
+            horizon=300,
+            humans=replace(SHORT.humans, desired_speed=3.0, comfortable_deceleration=0.6),
+        ),
+        "human",
+    ),
     "calm people": (replace(SHORT, noise=0.0), "pi"),
     "people of another kind": (replace(SHORT, humans=QUICK_PEOPLE), "pi"),
 }

@@ -2,6 +2,7 @@
 
 import os
 import subprocess
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -123,6 +124,14 @@ def test_a_lost_process_is_an_error_in_one_line_and_leaves_nothing(road: Scenari
             simulation.step()
     assert soon(process.pid)
     assert not folder.exists()
+
+
+def test_it_outlives_the_thread_that_started_it(road: Scenario) -> None:
+    with ThreadPoolExecutor(1) as pool:
+        apart = pool.submit(SimulationApart).result()
+    with apart:
+        make_traffic(road, (0,), apart).start(controlled=False)  # pyright: ignore[reportArgumentType]
+        assert apart.type_of("1") == "car"
 
 
 def test_only_networks_of_others_run_apart(road: Scenario) -> None:

@@ -21,6 +21,7 @@ from unjam.scenarios import Scenario, make_scenario
 from unjam.scenarios.population import Population, write_population
 from unjam.worlds.episode import run_episode
 from unjam.worlds.sumo import make_traffic
+from unjam.worlds.sumo.files import files_of
 from unjam.worlds.sumo.own import OwnTraffic
 from unjam.worlds.sumo.simulation import Simulation
 from unjam.worlds.workers import EpisodeTask, Workers
@@ -234,6 +235,27 @@ def test_commands_are_carried_out_exactly_where_it_is_safe_and_allowed(
     assert not (trajectory.shield > 1e-9).any()
 
 
+def test_a_command_holds_for_its_step_whatever_the_configuration_says(
+    tmp_path: Path, simulation: Simulation
+) -> None:
+    one = '<vehicle id="v" type="car" route="along" depart="0" departPos="10" departSpeed="5"/>'
+    file = straight(tmp_path, one)
+    file.write_text(file.read_text().replace("<end ", '<default.action-step-length value="1"/><end '))
+    scenario = scenario_of(file, cav_share=1.0, horizon=100)
+    (trajectory,) = run_episode(scenario, Constant(0.7), (0,), simulation=simulation).trajectories
+    np.testing.assert_allclose(np.diff(trajectory.states.speed), 0.07, atol=1e-9)
+
+
+def test_a_heavy_vehicle_stays_so_as_a_cav(tmp_path: Path) -> None:
+    one = '<vehicle id="v" type="van" route="along" depart="0"/>'
+    file = straight(tmp_path, one)
+    demand = tmp_path / "demand.rou.xml"
+    demand.write_text(demand.read_text().replace('id="van"', 'id="van" mass="3000"'))
+    scenario = scenario_of(file, cav_share=1.0)
+    traffic = files_of(scenario, scenario.draw(np.random.default_rng(0))).traffic
+    assert 'mass="3000"' in traffic
+
+
 def test_an_episode_ends_when_the_last_vehicle_has_arrived(tmp_path: Path, simulation: Simulation) -> None:
     scenario = scenario_of(straight(tmp_path, COLUMN), cav_share=1.0, horizon=4000)
     episode = run_episode(scenario, IDM(), (0,), simulation=simulation)
@@ -360,6 +382,37 @@ def test_a_vehicle_that_sumo_refuses_later_is_told_in_one_line(tmp_path: Path) -
     assert episode.status == "failed"
     assert "ghost" in episode.reason
     assert "\n" not in episode.reason
+
+
+def test_what_sumo_refuses_on_the_way_fails_the_episode_in_one_line(tmp_path: Path) -> None:
+    flow = '<flow id="f" type="car" from="road" to="road" begin="0" end="690" period="9"/>'
+    late = flow + '<trip id="w" type="car" from="road" to="road" depart="690"/>'  # so far SUMO reads ahead
+    late += '<trip id="v" type="car" from="road" to="road" depart="700" departPos="nowhere"/>'
+    file = straight(tmp_path, late, end=1000.0)
+    file.write_text(file.read_text().replace('value="0.1"', 'value="1"'))
+    with Workers(1) as workers:
+        (episode,) = workers.run([EpisodeTask(scenario_of(file, cav_share=0.5, horizon=1000), IDM(), (0,))])
+    assert (episode.status, episode.error) == ("failed", "EpisodeError")
+    assert episode.reason.startswith("SUMO cannot go on: Invalid departPos definition for trip 'v'")
+    assert "\n" not in episode.reason
+
+
+def test_what_sumo_says_before_it_has_a_log_is_told(tmp_path: Path) -> None:
+    file = straight(tmp_path, COLUMN)
+    demand = tmp_path / "demand.rou.xml"
+    demand.write_text(demand.read_text().replace('id="van"', 'id="van" emissionClass="PHEMlight5/none"'))
+    with Workers(1) as workers:
+        (episode,) = workers.run([EpisodeTask(scenario_of(file, cav_share=1.0, horizon=5), IDM(), (0,))])
+    assert "emissionClass with name 'PHEMlight5/none' doesn't exist" in episode.reason
+
+
+def test_of_a_network_that_is_made_again_pictures_show_the_new_one(
+    tmp_path: Path, simulation: Simulation
+) -> None:
+    for length in (500.0, 800.0):
+        scenario = scenario_of(straight(tmp_path, COLUMN, length), cav_share=1.0, horizon=5)
+        episode = run_episode(scenario, IDM(), (0,), simulation=simulation, full=True)
+        assert np.nanmax(episode.lines) == length
 
 
 def test_nothing_is_written_into_the_users_folder(tmp_path: Path) -> None:

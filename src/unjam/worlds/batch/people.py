@@ -29,6 +29,10 @@ SMALLEST_GAP = 1e-3
 """gap below which `_v` takes this one, SUMO's NUMERICAL_EPS [m]"""
 EMERGENCY_BRAKING = 9.0
 """`emergencyDecel` of a passenger car, beyond which `finalizeSpeed` lets nobody brake [m/s2]"""
+LEAST_BRAKING = 1.5
+"""deceleration that `executeMove` allows at least to who is faster than he wants [m/s2]"""
+MORE_BRAKING = 1e-3
+"""what it allows beyond, SUMO's NUMERICAL_EPS [m/s]"""
 CREEPING = 1e-4
 """SUMO's NUMERICAL_EPS_SPEED over the time step: people no faster than that after a step stand [m/s2]"""
 
@@ -66,7 +70,7 @@ def speed_on_ring(
     if bool(beyond.any()):
         end = end_of_lane(speed, position, loop, people)
         slower = people_speed(speed, *end, without_gap(people), step)
-        slowest = speed - people.comfortable_deceleration * step
+        slowest = speed - at_least(people.comfortable_deceleration, LEAST_BRAKING) * step - MORE_BRAKING
         found = xp.where(beyond, xp.minimum(found, xp.maximum(slower, slowest)), found)
     return found
 

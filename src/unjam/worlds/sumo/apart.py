@@ -11,6 +11,7 @@ import sys
 import tempfile
 import warnings
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from functools import cache, partial
 from pathlib import Path
 from typing import Any, Self, get_type_hints
@@ -54,6 +55,12 @@ def give_up_rights() -> None:
     confine(Path(tempfile.gettempdir()))
 
 
+@cache
+def _starter(process: int) -> ThreadPoolExecutor:
+    """Return the thread that starts others' processes here: to the system it is who they must not outlive."""
+    return ThreadPoolExecutor(1)
+
+
 class SimulationApart:
     """A `Simulation` in a confined process; what it is asked for, that process does and answers."""
 
@@ -61,13 +68,15 @@ class SimulationApart:
         """Start the process."""
         sweep_private_folders()
         self._folder = PrivateFolder()
-        self._process = subprocess.Popen(
+        start = _starter(os.getpid()).submit(
+            subprocess.Popen[bytes],
             [sys.executable, "-m", "unjam.worlds.sumo.apart"],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             env=bound({**os.environ, "TMPDIR": self._folder.name}),
             start_new_session=True,  # an interrupt in the terminal is this process's to handle
         )
+        self._process = start.result()
 
     def __getattr__(self, name: str) -> Callable[..., Any]:
         if name.startswith("_"):
@@ -125,7 +134,7 @@ def main() -> None:
     answers = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # SUMO may print: not into the answers
     give_up_rights()
-    with Simulation() as simulation:
+    with Simulation(alone=True) as simulation:
         while True:
             try:
                 facts, _ = read_message(sys.stdin.buffer)

@@ -40,7 +40,7 @@ class ClosedTraffic(Traffic[ClosedRoad]):
         super().__init__(scenario, road, seed, simulation, full)
         vehicles = len(road.vehicle_ids)
         self.cavs, self.entered = road.cav_ids, len(road.cav_ids)
-        self.collisions = 0
+        self._touched: set[str] = set()
         """vehicles in contact with another when the episode ended"""
         self._places = [road.vehicle_ids.index(name) for name in road.cav_ids]
         """of the CAVs, in road order"""
@@ -161,9 +161,8 @@ class ClosedTraffic(Traffic[ClosedRoad]):
             simulation.replace_speeds(self._human_ids, compress(speeds, self._human_mask))
         self.speeds = speeds
         self._log_speeds.fromlist(speeds)
-        colliding = simulation.colliding_count()
-        if colliding:
-            self.collisions = max(self.collisions, colliding)  # SUMO tells of each only once
+        if simulation.colliding_count():
+            self._touched.update(simulation.colliding())
             self.crashed = True
 
     def _expect_all(self) -> None:
@@ -247,7 +246,7 @@ class ClosedTraffic(Traffic[ClosedRoad]):
     def record(self, driven: Driven) -> Episode:
         """Return what happened since the start."""
         log, rows = self._log(), None if self.single else np.arange(len(self.cavs))
-        facts = {**self._facts(), "collisions": self.collisions}
+        facts = {**self._facts(), "collisions": len(self._touched)}
         return log.episode(self._checked(log), facts, driven, rows)
 
     def _checked(self, log: ClosedLog) -> tuple[Floats, Floats]:

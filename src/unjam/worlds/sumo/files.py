@@ -17,7 +17,7 @@ CALIBRATED_TYPES = "{}_of_driver_{}"
 """the type of a car whose own type is `{}`, driven by a calibrated person of that number"""
 KEPT = (
     *("vClass", "length", "width", "height", "maxSpeed", "speedFactor", "guiShape", "emissionClass"),
-    "laneChangeModel",
+    *("laneChangeModel", "mass"),
 )
 """attributes of a vehicle type that a CAV takes over, beside those of changing lanes: `lc...`"""
 
@@ -214,5 +214,6 @@ def _obedient_layer(scenario: Scenario) -> Attributes:
         "accel": max(ACCELERATION, scenario.limits.highest) if scenario.safety.active else OBEDIENT,
         **dict.fromkeys(("decel", "emergencyDecel", "apparentDecel"), brakes),
         "tau": scenario.simulation_step,
+        "actionStepLength": scenario.simulation_step,  # whatever the user's types have
         "minGap": SMALLEST_CAV_GAP,
     }

@@ -10,8 +10,9 @@ import time
 from collections import Counter
 from collections.abc import Iterable
 from contextlib import suppress
-from functools import cache
+from functools import cache, lru_cache
 from importlib.metadata import PackageNotFoundError, version
+from itertools import dropwhile
 from pathlib import Path
 from typing import Any
 from xml.sax.saxutils import quoteattr
@@ -21,7 +22,7 @@ import platformdirs
 
 from unjam.errors import DISK_ERRNOS, EpisodeError, MissingPartError, disk_error, wrong
 from unjam.scenarios.road import Connection, Edge, Node, RoadNetwork
-from unjam.sumo_files import read_lanes, stamp_of
+from unjam.sumo_files import Lane, read_lanes, stamp_of
 from unjam.worlds.record import Floats
 
 LONG_AGO = 3600.0
@@ -65,6 +66,15 @@ def sumo_words(lines: Iterable[str]) -> str:
     return "; ".join(said for line in lines if (said := line.strip()) and said != "Quitting (on error).")
 
 
+def said_in(log: Path) -> str:
+    """Return SUMO's own words about its last error: they are in its log, behind warnings."""
+    try:
+        lines = log.read_text(errors="replace").splitlines()
+    except OSError:
+        return ""
+    return sumo_words(dropwhile(lambda line: not line.lstrip().startswith("Error"), lines))
+
+
 def network_file(network: RoadNetwork) -> Path:
     """Return SUMO's network file, made with netconvert if this content was never made before, or is damaged.
 
@@ -106,25 +116,28 @@ def network_file(network: RoadNetwork) -> Path:
     return target
 
 
-@cache
+@lru_cache(8)
+def _lanes_of(path: Path, stamp: tuple[int, int]) -> list[Lane]:
+    """Return all lanes of a network file; read again where another one has taken its place."""
+    return read_lanes(path)
+
+
 def network_lines(path: Path) -> Floats:
     """Return the centre lines of all lanes: rows (x, y) [m], a row of NaN between two lines."""
     rows: list[tuple[float, float]] = []
-    for _, _, points in read_lanes(path):
+    for _, _, points in _lanes_of(path, stamp_of(path)):
         rows += [*points, (float("nan"), float("nan"))]
     return np.array(rows, np.float64).reshape(-1, 2)
 
 
-@cache
 def edge_lengths(path: Path) -> dict[str, float]:
     """Return the length of each edge [m]."""
-    return {edge: length for edge, length, _ in read_lanes(path)}
+    return {edge: length for edge, length, _ in _lanes_of(path, stamp_of(path))}
 
 
-@cache
 def lane_counts(path: Path) -> dict[str, int]:
     """Return how many lanes each edge has."""
-    return dict(Counter(edge for edge, _, _ in read_lanes(path)))
+    return dict(Counter(edge for edge, _, _ in _lanes_of(path, stamp_of(path))))
 
 
 def _node(node: Node) -> Attributes:

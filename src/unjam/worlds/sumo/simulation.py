@@ -5,9 +5,9 @@ import weakref
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import redirect_stdout
+from contextlib import nullcontext, redirect_stdout
 from functools import partial
-from itertools import count, dropwhile, starmap
+from itertools import count, starmap
 from pathlib import Path
 from tempfile import gettempdir
 from typing import Any, NamedTuple, Self
@@ -16,13 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from unjam.errors import EpisodeError, UnjamError, wrong
-from unjam.processes import PrivateFolder
+from unjam.processes import PrivateFolder, printed_to
 from unjam.sandbox import keep_disk
 from unjam.scenarios.scenario import Actuation
 from unjam.sumo_files import copy_harmless, stamp_of
 from unjam.worlds.sumo.files import Files
 from unjam.worlds.sumo.library import Backend, close, function_of, library
-from unjam.worlds.sumo.networks import sumo_program, sumo_words
+from unjam.worlds.sumo.networks import said_in, sumo_program
 
 SPEED_MODES = {"shielded": 31, "raw": 30, "flow": 25, "cruise": 31}
 """SUMO's speed mode bits for each way of actuation: bit 0 is the check for a safe speed."""
@@ -66,15 +66,18 @@ class Simulation:
     refuses to open another while one is open. Over TraCI there may be several, each a process of its own.
     """
 
-    def __init__(self, backend: Backend = "libsumo", gui_options: Sequence[str] = ()) -> None:
-        """Open a simulation; nothing runs before `load`. `gui_options` go to SUMO's window."""
+    def __init__(
+        self, backend: Backend = "libsumo", gui_options: Sequence[str] = (), alone: bool = False
+    ) -> None:
+        """Open a simulation; nothing runs before `load`.
+
+        `gui_options` go to SUMO's window. `alone`: this process prints nothing else while SUMO starts.
+        """
         global _open
         if "," in (folder := gettempdir()):  # between the names of files that SUMO is given
             raise wrong("TMPDIR", folder, "a folder without , in its name")
-        if backend == "libsumo":
-            if _open is not None:
-                raise UnjamError("a simulation is already open in this process; close it, or use another")
-            _open = self
+        if backend == "libsumo" and _open is not None:
+            raise UnjamError("a simulation is already open in this process; close it, or use another")
         self.backend = backend
         self._gui_options = gui_options
         self._sumo: Any = library(backend)
@@ -83,8 +86,11 @@ class Simulation:
         self._copies: dict[Path, tuple[tuple[int, int] | None, Path]] = {}
         """of users' own files, with the stamps of those"""
         self._running = False
+        self._printed = Path(self._folder.name) / "printed.log" if alone else None
+        """what SUMO says before it has a log"""
         if backend == "libsumo":
             self._bind()
+            _open = self
 
     def _bind(self) -> None:
         """Look up the functions that are called often."""
@@ -143,16 +149,18 @@ class Simulation:
         inputs = [f"{option}={','.join(paths)}" for option, paths in named.items() if paths]
         options = [*inputs, *files.options, *self._options(step, seed)]
         try:
-            if self._running:
-                self._sumo.load(options)
-            else:
-                program = "sumo-gui" if self.backend == "gui" else "sumo"
-                self._start([sumo_program(program), *options, *self._gui_options])
-                self._running = True
-            self.step()  # the first step inserts the vehicles and moves none
+            with printed_to(self._printed) if self._printed else nullcontext():
+                if self._running:
+                    self._sumo.load(options)
+                else:
+                    program = "sumo-gui" if self.backend == "gui" else "sumo"
+                    self._start([sumo_program(program), *options, *self._gui_options])
+                    self._running = True
+                self.step()  # the first step inserts the vehicles and moves none
         except Exception as error:
             self._end()  # only then are SUMO's words in its log, and can the next episode start afresh
-            words = self._reason() or " ".join(str(error).split())
+            words = said_in(self._error_log) or (said_in(self._printed) if self._printed else "")
+            words = words or " ".join(str(error).split())
             raise EpisodeError(f"SUMO cannot start: {words}") from error
 
     def _readable(self, path: Path, files: Files) -> str:
@@ -194,14 +202,6 @@ class Simulation:
             *("--collision.action", "warn", "--collision.mingap-factor", "0"),
             *("--collision.check-junctions", "true"),
         ]
-
-    def _reason(self) -> str:
-        """Return SUMO's own words about its last error: they are in its log, behind warnings."""
-        try:
-            lines = self._error_log.read_text().splitlines()
-        except OSError:
-            return ""
-        return sumo_words(dropwhile(lambda line: not line.lstrip().startswith("Error"), lines))
 
     def speeds(self, ids: Sequence[str]) -> list[float]:
         """Return the speeds of `ids` [m/s]."""
