@@ -17,6 +17,7 @@ The texts under its fields are what `unjam drivers` and the documentation show.
 Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
 Count = Annotated[int, Field(ge=1)]
+Several = Annotated[int, Field(ge=2)]
 CountOrNone = Annotated[int, Field(ge=0)]
 
 

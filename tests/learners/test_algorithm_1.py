@@ -162,6 +162,15 @@ def test_a_parameter_that_is_not_finite_is_named_in_the_same_iteration(agent: st
     assert task.iterations == []
 
 
+@pytest.mark.parametrize("agent", ["trpo", "ppo"])
+def test_exploration_that_has_ended_is_told_in_one_line(agent: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    task = Toy(agent=agent)
+    spread = dict(task.learner.sb3.policy.named_parameters())["log_std"]
+    monkeypatch.setattr(task.learner, "learn", lambda update: spread.data.fill_(-200.0))
+    with pytest.raises(UnjamError, match="learner: exploration has ended in iteration 1: a smaller step"):
+        task.learn(1)
+
+
 # Nothing in the task has late consequences, so a small discount is enough.
 TO_LEARN: dict[str, LearnerSettings] = {
     "trpo": TRPOSettings(critic_epochs=3, gamma=0.8, gae_lambda=0.9),

@@ -34,6 +34,7 @@ from unjam.parameters import build
         (TRPOSettings, "critic_epochs", 0),
         (TRPOSettings, "value_l2", -1e-3),
         (TRPOSettings, "critic_batch", "many"),
+        (TRPOSettings, "critic_batch", 1),
         (PPOSettings, "batch_steps", 0),
         (PPOSettings, "clip", 0.0),
         (PPOSettings, "clip", 1.0),

@@ -119,10 +119,14 @@ class Learner:
         return {key.partition("/")[2]: float(value) for key, value in self.sb3.logger.name_to_value.items()}
 
     def check_parameters(self, iteration: int) -> None:
-        """Raise `UnjamError` where a parameter is not finite."""
+        """Raise `UnjamError` where a parameter is not finite, or so small that nothing is explored."""
         for name, parameter in self.sb3.policy.named_parameters():
             if not parameter.isfinite().all():
                 raise UnjamError(f"learner: {name} is not finite in iteration {iteration}")
+            if name == "log_std" and not parameter.exp().all():
+                raise UnjamError(
+                    f"learner: exploration has ended in iteration {iteration}: a smaller step helps"
+                )
 
     def state(self) -> tuple[dict[str, Any], Tensors]:
         """Return all that it must keep to go on exactly where it stopped, as plain numbers and tensors.

@@ -152,9 +152,8 @@ class MotorwayImagination(WholeRoads[MotorwayMoments]):
 
     def _note(self, kept: Sequence[MotorwayMoments], earned: Sequence[float], decisions: int) -> None:
         """Note what the policy that drove the newest actual episodes earned here and there."""
-        here = [value for value, each in zip(earned, kept, strict=True) if each.episode >= self._first]
-        whole = decisions >= self.scenario.horizon and here
-        self.facts |= {
-            "return_virtual": float(np.mean(here)) if whole else None,
-            "return_actual": float(np.mean([each.earned for each in self._newest])) if whole else None,
-        }
+        newest = zip(earned, kept, strict=True)
+        both = [(value, each.earned) for value, each in newest if each.episode >= self._first]
+        whole = decisions >= self.scenario.horizon and both
+        virtual, actual = np.mean(both, 0).tolist() if whole else (None, None)
+        self.facts |= {"return_virtual": virtual, "return_actual": actual}

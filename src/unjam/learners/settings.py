@@ -10,7 +10,7 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from unjam.drivers.observation import FeatureName
-from unjam.parameters import STRICT, Count, CountOrNone, NotNegative, Positive
+from unjam.parameters import STRICT, Count, CountOrNone, NotNegative, Positive, Several
 
 Discount = Annotated[float, Field(gt=0, lt=1)]
 Share = Annotated[float, Field(ge=0, le=1)]
@@ -97,7 +97,7 @@ class TRPOSettings(LearnerSettings):
     cg_damping: Positive = 0.1
     cg_steps: Count = 15
     critic_epochs: Count = 10
-    critic_batch: Count = 250
+    critic_batch: Several = 250
     critic_rate: Positive = 1e-3
     value_l2: NotNegative = 1e-3
 

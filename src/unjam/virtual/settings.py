@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 from pydantic.dataclasses import dataclass
 
-from unjam.parameters import STRICT, Count, CountOrNone, NotNegative, Positive
+from unjam.parameters import STRICT, Count, CountOrNone, NotNegative, Positive, Several
 
 BaseName = Literal["idm", "population", "acc", "ovm", "none"]
 Device = Literal["cpu", "cuda"]
@@ -35,7 +35,7 @@ class VirtualSettings:
     the holdout; the paper's begin as they are drawn, and are always added"""
     rows: Count = 100_000
     """actual decisions that are kept, the newest, rounded up to whole episodes"""
-    fit_rows: Count = 10_000
+    fit_rows: Several = 10_000
     """at most so many of them are drawn for each fit: neighbouring rows, 0.1 s apart, hardly differ"""
     holdout: Annotated[float, Field(gt=0, lt=1)] = 0.2
     """share of the episodes that no network learns from"""
