@@ -1,5 +1,6 @@
 import warnings
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -471,6 +472,14 @@ def test_throughput_of_a_road_with_ends_is_who_left_it_and_backlog_who_waits_at_
     assert metric("throughput_veh_per_h", episode) == pytest.approx(7 * 30.0)
     assert metric("backlog_veh", episode) == 120.0
     assert metric("backlog_veh", episode_of(steady(4.0))) == 0.0
+
+
+def test_a_collision_makes_nobody_quicker_who_is_still_under_way() -> None:
+    episode = open_episode(np.full((11, 2), 5.0), waiting=np.full(11, 3.0), planned=40.0)
+    assert metric("travel_time", episode) == pytest.approx(10.0)
+    assert metric("travel_time", replace(episode, status="collision")) == pytest.approx(40.0)
+    later = replace(episode, status="collision", planned=NAN)  # where no end was planned
+    assert metric("travel_time", later) == pytest.approx(10.0)
 
 
 @pytest.mark.parametrize(

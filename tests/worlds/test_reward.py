@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from unjam.errors import InputError
-from unjam.worlds.reward import REWARDS, Outcome, make_reward, released, time_headway
+from unjam.worlds.reward import AFTER_CRASH, REWARDS, Outcome, make_reward, released, time_headway
 
 
 @st.composite
@@ -161,7 +161,8 @@ def test_tensors_earn_what_arrays_earn(outcome: Outcome, name: str) -> None:
 def test_travel_time_counts_who_is_there_and_who_waits(outcome: Outcome) -> None:
     found = REWARDS["travel-time"](outcome)["travel"]
     for row, waiting in enumerate(outcome.waiting.tolist()):
-        assert found[row] == pytest.approx(-(len(there(outcome.speeds[row])) + waiting) / 100.0)
+        times = 1 + AFTER_CRASH * bool(outcome.crashed[row])  # to end an episode is to earn nothing
+        assert found[row] == pytest.approx(-times * (len(there(outcome.speeds[row])) + waiting) / 100.0)
 
 
 @given(outcomes())

@@ -194,11 +194,9 @@ def shield_max_braking(episode: Episode) -> float:
 
 
 def fuel_ml_per_km(episode: Episode) -> float:
-    """Fuel of all vehicles per kilometre [ml/km], by the scenario's emission class.
+    """Fuel of all vehicles per kilometre [ml/km], by the scenario's emission class; NaN if nobody drove.
 
-    NaN if it was not recorded, or nobody drove.
-
-    SUMO's emission model: https://sumo.dlr.de/docs/Models/Emissions.html
+    SUMO's emission model, where it was recorded: https://sumo.dlr.de/docs/Models/Emissions.html
     """
     driven = sum(float(np.nansum(part)) for part in _parts(episode.speeds[1:])) * episode.step
     if episode.fuel.size == 0 or driven == 0:
@@ -227,13 +225,14 @@ def travel_time(episode: Episode) -> float:
     """Mean time per vehicle that wanted to drive, waiting to enter included [s]; NaN on a closed road.
 
     The integral over time of who is on the road or waits to be, over how many wanted to enter: nobody gains
-    by keeping vehicles out. Who is still under way at the end counts with the time so far.
+    by keeping vehicles out. Who is under way at the end counts with the time so far, at a collision with all.
     """
     if not len(episode.waiting):
         return float("nan")
-    there = (~np.isnan(episode.speeds)).sum(axis=1)
+    under_way = (~np.isnan(episode.speeds)).sum(axis=1) + episode.waiting
     demanded = len(episode.vehicle_ids) + episode.waiting[-1] - episode.lifted
-    return float((there + episode.waiting)[1:].sum() * episode.step / demanded) if demanded else float("nan")
+    lost = max(0.0, episode.planned - episode.steps * episode.step) if episode.status == "collision" else 0.0
+    return float((under_way[1:].sum() * episode.step + under_way[-1] * lost) / (demanded or np.nan))
 
 
 def delay(episode: Episode) -> float:

@@ -19,6 +19,8 @@ MERGE_SPEED = 20.0
 """speed that the merge's reward wants, and the scale of speeds in power [m/s]"""
 MERGE_VEHICLES = 30.0
 """scale of how many are on the road in power: about as many as on the merge in free flow"""
+AFTER_CRASH = 2_400
+"""decisions for which a crash closes a road, to its reward: the whole of an on-ramp's episode"""
 STANDING = 1e-3
 """speed below which a time headway means nothing [m/s]"""
 
@@ -118,10 +120,11 @@ def travel_time(outcome: Outcome) -> dict[str, Array]:
     """Reward short travel times: minus how many are on the road or wait to be, in hundreds.
 
     Whoever wants to drive is given by the demand, so that the sum over an episode is, but for its scale, the
-    mean travel time with waiting: nothing is earned by keeping vehicles out.
+    mean travel time with waiting: nothing is earned by keeping vehicles out. Nor by a crash, which ends the
+    episode: who is there then waits for `AFTER_CRASH` decisions.
     """
     there = (~namespace(outcome.speeds).isnan(outcome.speeds)).sum(-1)
-    return {"travel": -(there + outcome.waiting) / 100.0}
+    return {"travel": -(there + outcome.waiting) / 100.0 * (1 + AFTER_CRASH * outcome.crashed)}
 
 
 def too_close(outcome: Outcome) -> Array:
