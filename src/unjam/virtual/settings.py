@@ -38,7 +38,7 @@ class VirtualSettings:
     fit_rows: Several = 10_000
     """at most so many of them are drawn for each fit: neighbouring rows, 0.1 s apart, hardly differ"""
     holdout: Annotated[float, Field(gt=0, lt=1)] = 0.2
-    """share of the episodes that no network learns from"""
+    """share of the episodes that no network learns from; while there is a single one, its last part"""
     epochs: Count = 6
     """most passes over the rows in a fit, which goes on from the fit before"""
     patience: Count = 3
@@ -58,7 +58,8 @@ class VirtualSettings:
     error: ErrorName = "unexplained"
     """estimator of the model error eps_m that sets the rollout length, see unjam.virtual.fitting"""
     virtual_ratio: NotNegative = 5.0
-    """virtual decisions for each actual one that the agent learns from; 0: model-free"""
+    """virtual decisions for each actual one that the agent learns from, at least one whole rollout in each
+    iteration; 0: model-free"""
     begin: Literal["newest", "all", "first"] = "newest"
     """at which actual decisions rollouts begin: those of the newest policy's episodes; of all episodes that
     are kept, whose roads are more various; or the first ones of all, so that what is imagined are episodes"""
