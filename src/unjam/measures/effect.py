@@ -18,6 +18,7 @@ from unjam.measures.statistics import (
     around_ratio,
     estimate,
     estimate_of,
+    paired,
     paired_difference,
     signed,
 )
@@ -110,12 +111,11 @@ def effect_of(
 def _delay_cut(
     rows: Sequence[dict[str, Any]], people: Sequence[dict[str, Any]], confidence: float
 ) -> Estimate:
-    alone = {str(row["seed"]): (row[TIME], row["delay"]) for row in people}
-    both = [(*alone[str(row["seed"])], row[TIME]) for row in rows if str(row["seed"]) in alone]
-    before, delays, driven = np.array([each for each in both if np.isfinite(each).all()]).reshape(-1, 3).T
+    both = [(alone[TIME] - row[TIME], alone["delay"]) for row, alone in paired(rows, people)]
+    saved, delays = np.array([each for each in both if np.isfinite(each).all()]).reshape(-1, 2).T
     if not len(delays) or delays.mean() <= 0:
         return Estimate(nan, nan, nan, 0)
-    return estimate(around_ratio(before - driven, delays).tolist(), confidence)
+    return estimate(around_ratio(saved, delays).tolist(), confidence)
 
 
 def beside_people(rows_by_driver: dict[str, list[dict[str, Any]]]) -> dict[str, Effect]:

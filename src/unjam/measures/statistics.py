@@ -91,6 +91,14 @@ def summarise(rows: Sequence[dict[str, Any]]) -> dict[str, Estimate]:
     return {name: estimate_of(rows, name) for name in METRICS}
 
 
+def paired(
+    rows: Sequence[dict[str, Any]], others: Sequence[dict[str, Any]]
+) -> list[tuple[dict[str, Any], dict[str, Any]]]:
+    """Return each row with the other of its seed, where there is one."""
+    other = {str(row["seed"]): row for row in others}
+    return [(row, other[str(row["seed"])]) for row in rows if str(row["seed"]) in other]
+
+
 def paired_difference(
     rows: Sequence[dict[str, Any]],
     others: Sequence[dict[str, Any]],
@@ -98,8 +106,7 @@ def paired_difference(
     confidence: float = CONFIDENCE,
 ) -> Estimate:
     """Return the estimate of the difference, same seeds paired, of a metric between two sets of rows."""
-    other = {str(row["seed"]): row[name] for row in others}
-    differences = [row[name] - other[str(row["seed"])] for row in rows if str(row["seed"]) in other]
+    differences = [row[name] - other[name] for row, other in paired(rows, others)]
     return estimate(differences, confidence=confidence)
 
 

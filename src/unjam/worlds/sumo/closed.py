@@ -41,7 +41,7 @@ class ClosedTraffic(Traffic[ClosedRoad]):
         vehicles = len(road.vehicle_ids)
         self.cavs, self.entered = road.cav_ids, len(road.cav_ids)
         self._touched: set[str] = set()
-        """vehicles in contact with another when the episode ended"""
+        """who was in contact with another"""
         self._places = [road.vehicle_ids.index(name) for name in road.cav_ids]
         """of the CAVs, in road order"""
         self._near = loop_neighbours(np.array(self._places), vehicles)

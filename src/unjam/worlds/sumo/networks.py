@@ -14,7 +14,7 @@ from functools import cache, lru_cache
 from importlib.metadata import PackageNotFoundError, version
 from itertools import dropwhile
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
@@ -22,7 +22,7 @@ import platformdirs
 
 from unjam.errors import DISK_ERRNOS, EpisodeError, MissingPartError, disk_error, wrong
 from unjam.scenarios.road import Connection, Edge, Node, RoadNetwork
-from unjam.sumo_files import Lane, read_lanes, stamp_of
+from unjam.sumo_files import read_lanes, stamp_of
 from unjam.worlds.record import Floats
 
 LONG_AGO = 3600.0
@@ -116,28 +116,39 @@ def network_file(network: RoadNetwork) -> Path:
     return target
 
 
+class _Shape(NamedTuple):
+    """What pictures and services want to know of a network file."""
+
+    lines: Floats
+    lengths: dict[str, float]
+    lanes: dict[str, int]
+
+
 @lru_cache(8)
-def _lanes_of(path: Path, stamp: tuple[int, int]) -> list[Lane]:
-    """Return all lanes of a network file; read again where another one has taken its place."""
-    return read_lanes(path)
+def _shape_of(path: Path, stamp: tuple[int, int]) -> _Shape:
+    """Return the shape of a network file; read again where another one has taken its place."""
+    lanes = read_lanes(path)
+    rows: list[tuple[float, float]] = []
+    for _, _, points in lanes:
+        rows += [*points, (float("nan"), float("nan"))]
+    lines = np.array(rows, np.float64).reshape(-1, 2)
+    lengths = {edge: length for edge, length, _ in lanes}
+    return _Shape(lines, lengths, dict(Counter(edge for edge, _, _ in lanes)))
 
 
 def network_lines(path: Path) -> Floats:
     """Return the centre lines of all lanes: rows (x, y) [m], a row of NaN between two lines."""
-    rows: list[tuple[float, float]] = []
-    for _, _, points in _lanes_of(path, stamp_of(path)):
-        rows += [*points, (float("nan"), float("nan"))]
-    return np.array(rows, np.float64).reshape(-1, 2)
+    return _shape_of(path, stamp_of(path)).lines
 
 
 def edge_lengths(path: Path) -> dict[str, float]:
     """Return the length of each edge [m]."""
-    return {edge: length for edge, length, _ in _lanes_of(path, stamp_of(path))}
+    return _shape_of(path, stamp_of(path)).lengths
 
 
 def lane_counts(path: Path) -> dict[str, int]:
     """Return how many lanes each edge has."""
-    return dict(Counter(edge for edge, _, _ in _lanes_of(path, stamp_of(path))))
+    return _shape_of(path, stamp_of(path)).lanes
 
 
 def _node(node: Node) -> Attributes:
