@@ -62,7 +62,7 @@ def leaders(
     braking, headway = people.comfortable_deceleration, people.time_headway
     farthest = sight(fastest, headway, braking, step)
     # A remainder takes longer than all else here; that of less than a loop is known.
-    beyond = place - xp.arange(EDGES)[:, None, None] * lane_length
+    beyond = xp.stack([place - edge * lane_length for edge in range(EDGES)])
     beyond = xp.where(beyond < 0.0, beyond + loop, beyond)
     last, columns = beyond.argmin(1), xp.arange(speed.shape[1])
     first, speeds = beyond[xp.arange(EDGES)[:, None], last, columns], speed[last, columns]
