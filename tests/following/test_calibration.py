@@ -82,3 +82,12 @@ def test_a_headway_beyond_what_is_searched_is_named() -> None:
     settings = CalibrationSettings(time_headway=(1.0, 3.0))
     (found,) = calibrate_each(groups()[:1], PAPER_IDM, ("time_headway",), settings)
     assert (found.parameters.time_headway, found.bounds) == (1.0, ("time_headway",))
+
+
+@pytest.mark.parametrize("every", ["trajectory", "moment"])
+def test_a_short_rest_of_a_long_trajectory_weighs_little(every: Literal["trajectory", "moment"]) -> None:
+    whole = idm_driver(DRIVER, seconds=20.0)
+    wrong = np.array([[30.0, 1.4, 1.4, 2.0, 2.5, 0.0]]).T
+    cut = [stretches_of([whole], seconds) for seconds in (20.0, 19.8)]
+    errors = [gap_objective(each, (-4.0, 2.0), every)(wrong)[0] for each in cut]
+    assert errors[1] == pytest.approx(errors[0], rel=0.02)

@@ -34,6 +34,18 @@ def test_every_driver_has_its_headway_and_what_suits_all(pairs: list[Pair]) -> N
     assert all(detail["gap_error"] < found.about["fit"]["together"]["gap_error"] for detail in found.details)
     assert found.residual is None
     assert told[-1] == (5, 5)
+    assert headways[0] < found.typical.time_headway < headways[-1]
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_the_typical_headway_is_one_that_suits_all(seed: int) -> None:
+    people = [
+        idm_driver(IDMParameters(time_headway=headway), f"{headway}", number, seconds=20.0)
+        for number, headway in enumerate((1.0, 1.4, 1.8))
+    ]
+    quick = CalibrationSettings(generations=25, candidates=3, seed=seed)
+    found = fit_drivers(people, FitDriversSettings(calibration=quick, turns=2))
+    assert 1.1 < found.typical.time_headway < 1.7
 
 
 def test_a_residual_is_kept_where_it_is_better(pairs: list[Pair]) -> None:
@@ -112,3 +124,15 @@ def test_wrong_input_is_one_line(data: Path, changes: dict, more: dict, words: s
 def test_nothing_is_calibrated_that_cannot_be_written(data: Path, tmp_path: Path) -> None:
     with pytest.raises(DiskError):
         fit_from_files([data], CHANGES, out=tmp_path / "gone" / "drivers.json")
+
+
+def test_files_of_the_same_name_have_different_people(data: Path, tmp_path: Path) -> None:
+    days = [tmp_path / day / data.name for day in ("monday", "tuesday")]
+    for day in days:
+        day.parent.mkdir()
+        day.write_bytes(data.read_bytes())
+    names = [each["name"] for each in fit_from_files(days, CHANGES).population.details]
+    assert len(set(names)) == len(names) == 2 * len(fit_from_files([data], CHANGES).population.details)
+    assert {name.partition("-")[0] for name in names} == {"1", "2"}
+    with pytest.raises(InputError, match=r"data: .* is not allowed; allowed: each file once"):
+        fit_from_files([days[0], days[0]], CHANGES)

@@ -236,3 +236,17 @@ def test_columns_may_name_the_driver(tmp_path: Path) -> None:
 def test_an_unknown_format(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="format: 'ind' is not allowed"):
         read_pairs(table(tmp_path / "t.csv"), "ind")
+
+
+def test_a_number_that_is_given_anew_later_is_another_driver(tmp_path: Path) -> None:
+    first = pd.read_csv(ngsim(tmp_path / "first.csv"))
+    later = first.assign(Global_Time=first["Global_Time"] + 15 * 60 * 1000)
+    pd.concat([later, first]).to_csv(tmp_path / "both.csv", index=False)
+    found = read_pairs(tmp_path / "both.csv", reading=SHORT).pairs
+    assert sorted(pair.driver for pair in found) == ["i-80-8", "i-80-8-2"]
+
+
+def test_who_has_no_name_is_by_himself(tmp_path: Path) -> None:
+    drivers = ["anna"] * MOMENTS + [None] * MOMENTS
+    found = read_pairs(table(tmp_path / "data.csv", driver=drivers, kind=None), reading=SHORT)
+    assert [(pair.driver, pair.kind) for pair in found.pairs] == [("anna", ""), ("two", "")]

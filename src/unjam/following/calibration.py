@@ -41,8 +41,8 @@ class CalibrationSettings:
     kept_headway: tuple[NotNegative, NotNegative] = (0.0, 0.0)
     """share of the headway with which a driver was found that it keeps, see `personal_idm`"""
     every: Literal["trajectory", "moment"] = "trajectory"
-    """what counts alike: `trajectory`: the mean of their root mean squared errors; `moment`: one root mean
-    square over all of them, in which the few who leave very large gaps decide"""
+    """what counts alike: `trajectory`: the mean of their root mean squared errors, of all stretches of each;
+    `moment`: one root mean square over all of them, in which the few who leave very large gaps decide"""
     limits: Bounds = (-4.0, 2.0)
     """within which the acceleration is kept [m/s2]: where a gap is nearly used up the IDM alone brakes beyond
     all bounds"""
@@ -147,14 +147,14 @@ def gap_objective(
 
     `headways` are factors on the time headway, of each stretch.
     """
-    moments = stretches.moments
+    moments, (first, weights) = stretches.moments, _in_trajectories(stretches)
 
     def objective(candidates: Floats) -> Floats:
         v0, headway, acceleration, deceleration, minimum_gap, kept = candidates.reshape(6, -1, 1)
         rows = IDMRows(v0, headway * headways, acceleration, deceleration, 4.0, minimum_gap)
         squares = gap_squares(stretches, personal_idm(rows, kept, limits), len(v0))
         if every == "trajectory":
-            return np.sqrt(squares).mean(1)
+            return np.sqrt(np.add.reduceat(squares * weights, first, axis=1)).mean(1)
         return np.sqrt((squares * moments).sum(1) / moments.sum())
 
     return objective
@@ -171,6 +171,13 @@ def gap_squares(stretches: Stretches, model: Model, candidates: int = 1) -> Floa
     for moment, (_, gap) in enumerate(driven, 1):
         total += np.square(gap - stretches.gap[moment]) * stretches.present[moment]
     return total / stretches.moments
+
+
+def _in_trajectories(stretches: Stretches) -> tuple[NDArray[np.intp], Floats]:
+    """Return the first stretch of each trajectory, and each one's share of its trajectory's moments."""
+    owner, moments = stretches.owner, stretches.moments
+    first = np.flatnonzero(np.diff(owner, prepend=-1))
+    return first, moments / np.bincount(owner, moments)[owner]
 
 
 def at_an_end(value: float, within: Range) -> bool:
@@ -266,7 +273,9 @@ def _least(errors: Callable[[Floats], Floats], grid: Floats, groups: int) -> Flo
 def _by_group(squares: Floats, stretches: Stretches, group: NDArray[np.int64], every: str) -> Floats:
     """Return the error of each group from the mean squared errors of its stretches, as settings say."""
     if every == "trajectory":
-        return np.bincount(group, np.sqrt(squares)) / np.bincount(group)
+        first, weights = _in_trajectories(stretches)
+        errors, group = np.sqrt(np.add.reduceat(squares * weights, first)), group[first]
+        return np.bincount(group, errors) / np.bincount(group)
     moments = stretches.moments
     return np.sqrt(np.bincount(group, squares * moments) / np.bincount(group, moments))
 

@@ -127,10 +127,10 @@ def fit_from_files(
     settings = build(FitDriversSettings, nested(changes), "")
     pairs: list[Pair] = []
     words = []
-    for file in files:
+    prefixes = _prefixes(files)
+    for file, prefix in zip(files, prefixes, strict=True):
         found = read_pairs(file, format, Reading(cut_bad=cut_bad, driver=driver))
         words += [f"{file.name}: {line}" for line in found.words()]
-        prefix = f"{file.stem}-" if len(files) > 1 else ""
         pairs += [replace(pair, name=prefix + pair.name, driver=prefix + pair.driver) for pair in found.pairs]
     for name, value in (only or {}).items():
         if name not in FILTERS:
@@ -148,6 +148,17 @@ def fit_from_files(
     made["command"] = [Path(word).name if "/" in word else word for word in made["command"]]
     about = {"data": [file.name for file in files], "only": only or {}, "manifest": made}
     return FittedDrivers(replace(population, about={**population.about, **about}), words)
+
+
+def _prefixes(files: Sequence[Path]) -> list[str]:
+    """Return what names of drivers begin with in each file: those of two files are different people."""
+    for number, file in enumerate(files):
+        if file.resolve() in [other.resolve() for other in files[:number]]:
+            raise wrong("data", str(file), "each file once")
+    stems = [file.stem for file in files]
+    if len(set(stems)) < len(stems):
+        stems = [f"{number}-{stem}" for number, stem in enumerate(stems, 1)]
+    return [f"{stem}-" for stem in stems] if len(files) > 1 else [""]
 
 
 def doubts_about_units(pairs: Sequence[Pair]) -> list[str]:
@@ -214,10 +225,12 @@ def _levels(
     """Return what drivers have in common, and each driver's own, each calibrated given the other in turn.
 
     One IDM for people who keep different distances is too soft: it must not react to gaps that are just the
-    driver's own. So what is common is calibrated with everybody's own headway.
+    driver's own. So what is common is calibrated with everybody's own headway, and only then the headway with
+    which one IDM suits all of them.
     """
     groups = [[pair for pair in pairs if pair.driver == name] for name in names]
-    shared = replace(settings.calibration, kept_headway=(0.0, 1.0))
+    each_its_own = "time_headway" in settings.own
+    shared = replace(settings.calibration, kept_headway=(0.0, 1.0)) if each_its_own else settings.calibration
     typical, found = calibrate(pairs, shared).parameters, {}
     for turn in range(settings.turns):
         if turn:
@@ -227,6 +240,9 @@ def _levels(
             groups, typical, settings.own, settings.calibration, lambda done: on_progress(done, len(names))
         )
         found = dict(zip(names, each, strict=True))
+    if each_its_own:  # so far it is a unit for the others': any would do
+        (one,) = calibrate_each([pairs], typical, ["time_headway"], settings.calibration)
+        typical = one.parameters
     return typical, found
 
 

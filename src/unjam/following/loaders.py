@@ -44,6 +44,8 @@ HIGHD = {
 """of those of the tracks of highD (Krajewski et al. 2018)"""
 HIGHD_RATE = 25.0
 """frames of highD per second"""
+GONE = 60.0
+"""who was not seen for longer is somebody else with the same number [s]"""
 FCD = {
     **{"timestep_time": "time", "vehicle_speed": "speed"},
     **{"vehicle_leaderSpeed": "leader_speed", "vehicle_leaderGap": "gap"},
@@ -143,7 +145,7 @@ def _behind_leaders(vehicles: pd.DataFrame, path: Path, reading: Reading) -> Rec
     vehicles = vehicles.loc[~alone]
     frame = vehicles.assign(
         pair=_joined(vehicles, ("place", "vehicle", "leader", "lane")),
-        driver=_joined(vehicles, ("place", "vehicle")),
+        driver=_joined(vehicles.assign(anew=_anew(vehicles)), ("place", "vehicle", "anew")).str.rstrip("-"),
         kind="human",
         leader_speed=vehicles["speed_ahead"],
         gap=vehicles["front_ahead"] - vehicles["length_ahead"] - vehicles["front"],
@@ -151,6 +153,15 @@ def _behind_leaders(vehicles: pd.DataFrame, path: Path, reading: Reading) -> Rec
     return _trajectories(
         frame, path, reading, {"nobody ahead, or not recorded": int(np.count_nonzero(alone))}
     )
+
+
+def _anew(vehicles: pd.DataFrame) -> pd.Series:
+    """Return "2" for the second with a number, and so on: NGSIM's begin anew every quarter of an hour."""
+    ordered = vehicles.sort_values(by="time", kind="stable")
+    who = [ordered["place"], ordered["vehicle"]]
+    longer = ordered["time"].groupby(who, dropna=False).diff() > GONE
+    before = longer.groupby(who, dropna=False).cumsum().to_numpy(int)
+    return pd.Series(np.where(before > 0, (before + 1).astype(str), ""), ordered.index)
 
 
 def _openacc(frame: pd.DataFrame, path: Path, reading: Reading) -> Recorded:
@@ -293,7 +304,8 @@ def _trajectories(
             continue
         pair = str(rows["pair"].iloc[0])
         speed, leader_speed, gap = (rows[name].to_numpy(np.float64) for name in COLUMNS[2:])
-        driver, kind, split = (str(rows[name].iloc[0]) if name in rows else "" for name in OPTIONAL)
+        said = {name: rows[name].head(1).dropna() for name in OPTIONAL if name in rows}
+        driver, kind, split = ("".join(map(str, said.get(name, ()))) for name in OPTIONAL)
         parts[pair] = parts.get(pair, 0) + 1
         name = pair if parts[pair] == 1 else f"{pair}/{parts[pair]}"
         pairs.append(Pair(name, driver or pair, step, speed, leader_speed, gap, kind, split))
