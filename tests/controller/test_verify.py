@@ -60,8 +60,10 @@ def test_a_whole_controller_is_verified(tmp_path: Path) -> None:
 def test_code_of_a_folder_runs_only_where_it_is_trusted(tmp_path: Path) -> None:
     code, ran = tmp_path / "code.py", tmp_path / "ran"
     code.write_text("def gentle(state):\n    return 0.1 * (state.leader_speed - state.speed)\n")
-    held = residual(FileDriver(code, "gentle"))
+    mine = FileDriver(code, "gentle")
     code.write_text(f"open({str(ran)!r}, 'w').close()\n" + code.read_text())
+    object.__setattr__(mine, "sha256", hash_of(code.read_bytes()))  # what a stranger would send
+    held = residual(mine)
     (tmp_path / "controller.unjam").write_bytes(controller_bytes(held, ABOUT))
     alone = refused(tmp_path / "controller.unjam")
     assert alone.endswith("Python code (code.py), which a file by itself may not run; use the run folder")

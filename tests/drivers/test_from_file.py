@@ -3,10 +3,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.conftest import random_network
 from unjam import check_driver
 from unjam.controller import make_driver
 from unjam.drivers.check import random_state
 from unjam.drivers.from_file import FileDriver
+from unjam.drivers.registry import driver_from_recipe, recipe_of
+from unjam.drivers.residual import ResidualDriver
 from unjam.errors import InputError
 from unjam.scenarios import Merge
 from unjam.worlds.episode import run_episode
@@ -82,3 +85,22 @@ def test_files_of_two_folders_have_neighbours_of_the_same_name(tmp_path: Path) -
         found.append(FileDriver(tmp_path / folder / "mine.py", "hold"))
     state = random_state(np.random.default_rng(0), 1)
     assert [driver.act(state, {})[0] for driver in found] == [-0.1, 0.3]
+
+
+def test_code_that_changes_under_way_is_another_driver(tmp_path: Path) -> None:
+    file = tmp_path / "mine.py"
+    file.write_text("def go(state):\n    return 0.5 + 0.0 * state.speed\n")
+    driver = make_driver(f"{file}:go", 0.1)
+    recipe, arrays = recipe_of(driver)
+    assert driver_from_recipe(recipe, arrays) == driver
+    file.write_text(file.read_text().replace("0.5", "0.1"))
+    assert recipe_of(driver)[0] == recipe  # that of what drives, not of what the file has become
+    with pytest.raises(InputError, match=r"mine\.py:go: its file has changed since"):
+        driver_from_recipe(recipe, arrays)
+
+
+def test_a_list_of_accelerations_will_do(tmp_path: Path) -> None:
+    (tmp_path / "lists.py").write_text("def d(state): return [0.25 for _ in state.speed]")
+    driver = ResidualDriver(make_driver(f"{tmp_path}/lists.py:d", 0.1), random_network(scale=0.0), 1.0)
+    state = random_state(np.random.default_rng(0), 3)
+    np.testing.assert_allclose(driver.act(state, driver.initial_memory(3))[0], 0.25)

@@ -284,3 +284,14 @@ def test_a_feature_of_ones_own_is_told_what_the_road_tells(tmp_path: Path) -> No
     with closing(RoadEnv("ring", observe=("local", f"{file}:share"))) as environment:
         observation, _ = environment.reset(seed=0)
     assert observation[-1] == np.float32(1 / 22)
+
+
+def test_a_reward_that_is_not_finite_is_refused_as_in_an_episode(tmp_path: Path) -> None:
+    (tmp_path / "mine.py").write_text(
+        "def nothing(seen): return {'mean': seen.speeds.mean(-1) * float('nan')}"
+    )
+    environment = RoadEnv("ring", reward=f"{tmp_path}/mine.py:nothing", horizon=40)
+    environment.reset(seed=0)
+    with pytest.raises(InputError, match=r"reward: step 0: term 'mean' is nan; allowed: finite"):
+        environment.step(np.zeros(1, np.float32))
+    environment.close()

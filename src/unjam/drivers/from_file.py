@@ -17,6 +17,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from unjam.drivers.command import as_rows
 from unjam.drivers.driver import Driver, Memory, Recipe, labelled
 from unjam.drivers.local_state import LocalState
 from unjam.errors import InputError
@@ -148,7 +149,10 @@ class Brought(Driver):
             raise InputError(
                 f"{self.describe()}: act() answers {found!r:.60}; allowed: (accelerations, memory)"
             )
-        return found
+        accelerations, memory = found
+        if type(accelerations) in (list, tuple):  # what is around it counts with arrays
+            accelerations = as_rows(accelerations, np.size(state.speed), self.describe())
+        return accelerations, memory
 
     def time_headways(self, state: LocalState, memory: Memory) -> Array | None:
         """Return what the user's driver asks of its cars' ACCs, if it asks for anything."""
@@ -167,12 +171,21 @@ class FileDriver(FileReference, Brought):
 
     parameters: dict[str, Any] = field(default_factory=dict)
     time_step: float = 0.1
+    sha256: str = field(default="", repr=False, compare=False)
+    """of the file; given: of what it must be"""
     held: Any = field(init=False, repr=False, compare=False)
     """what the file has, as a driver"""
 
     def __post_init__(self) -> None:
+        """Load it; raise `InputError` where the file is another than it must be."""
         object.__setattr__(self, "path", self.path.resolve())
         object.__setattr__(self, "held", self._build())
+        sha256 = super().recipe()["sha256"]
+        if self.sha256 and self.sha256 != sha256:
+            raise InputError(
+                f"{self}: its file has changed since; allowed: as it was when it was first loaded"
+            )
+        object.__setattr__(self, "sha256", sha256)
 
     def _build(self) -> Any:
         found = self.load()
@@ -194,7 +207,8 @@ class FileDriver(FileReference, Brought):
 
     def recipe(self) -> Recipe:
         """Return where the code is, and its hash."""
-        return {**super().recipe(), "parameters": self.parameters, "time_step": self.time_step}
+        made = {"parameters": self.parameters, "time_step": self.time_step}
+        return {**super().recipe(), "sha256": self.sha256, **made}
 
 
 @dataclass(frozen=True)

@@ -201,7 +201,7 @@ def _filtered(recipe: Recipe, arrays: Arrays, held: Held) -> Driver:
 RECIPES: dict[str, Callable[[Recipe, Arrays, Held], Driver]] = {
     "named": _named,
     "file": lambda recipe, arrays, held: FileDriver(
-        Path(recipe["path"]), recipe["name"], recipe["parameters"], recipe["time_step"]
+        Path(recipe["path"]), recipe["name"], recipe["parameters"], recipe["time_step"], recipe["sha256"]
     ),
     "residual": _residual,
     "mixed": lambda recipe, arrays, held: Mixed(

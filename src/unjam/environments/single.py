@@ -19,6 +19,7 @@ from unjam.errors import EpisodeError, InputError, MissingPartError, UnjamError,
 from unjam.processes import has_display
 from unjam.scenarios import make_scenario
 from unjam.worlds.drive import Drive
+from unjam.worlds.earned import checked_terms
 from unjam.worlds.episode import check_can_drive, check_can_see
 from unjam.worlds.reward import Outcome, make_reward, time_headway
 from unjam.worlds.sumo import make_traffic
@@ -165,7 +166,8 @@ class SteppedRoad:
         applied = traffic.last_applied()[kept]
         crashed, waiting = np.array([traffic.crashed]), np.array([float(traffic.waiting)])
         outcome = Outcome(speeds[None], applied[None], headways[None], crashed, waiting)
-        terms = {name: float(values[0]) for name, values in self._reward(outcome).items()}
+        decision = slice(traffic.decisions - 1, traffic.decisions)
+        terms = {name: float(one) for name, (one,) in checked_terms(self._reward(outcome), decision).items()}
         left = {name: seen[row] for row, name in enumerate(before) if row not in kept}
         terminated = traffic.crashed
         self._await_cav()  # a crash of people meanwhile ends the episode, but is nobody's doing

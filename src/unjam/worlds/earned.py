@@ -27,7 +27,9 @@ def earned(
     steps, rows = len(speeds) - 1, max(1, CELLS_AT_ONCE // max(1, speeds.shape[1]))
     parts = [slice(start, min(start + rows, steps)) for start in range(0, max(steps, 1), rows)]
     found = [
-        _checked(reward(_outcome(speeds, trajectories, crashed and part.stop == steps, waiting, part)), part)
+        checked_terms(
+            reward(_outcome(speeds, trajectories, crashed and part.stop == steps, waiting, part)), part
+        )
         for part in parts
     ]
     return {name: np.concatenate([terms[name] for terms in found]) for name in found[0]}
@@ -53,7 +55,7 @@ def _outcome(
     return Outcome(np.asfortranarray(speeds[1:][part]), accelerations, headways, collided, kept_out)
 
 
-def _checked(terms: dict[str, Floats], part: slice) -> dict[str, Floats]:
+def checked_terms(terms: dict[str, Floats], part: slice) -> dict[str, Floats]:
     """Return the reward's terms; raise `InputError` unless each is finite and has a value per decision."""
     rows = part.stop - part.start
     for name, values in terms.items():
