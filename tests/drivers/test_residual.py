@@ -3,12 +3,14 @@ import pytest
 import torch
 
 from tests.conftest import random_network
+from unjam.controller import make_driver
 from unjam.drivers import IDM, Driver, LocalState, PISaturation, ResidualDriver, check_driver
 from unjam.drivers.check import random_state
 from unjam.drivers.driver import single_row
 from unjam.drivers.network import Network
 from unjam.drivers.observation import observation_size
-from unjam.drivers.wrappers import Remembering
+from unjam.drivers.safety import SafetyFilter
+from unjam.drivers.wrappers import Filtered, Remembering
 from unjam.tree import mapped
 
 ALL_PARTS = ("local", "expert_acceleration", "expert_memory", "loop_length", "place", "route_position")
@@ -123,3 +125,24 @@ def test_observes_what_was_asked_for() -> None:
     assert abs(seen[5]) <= 1.0
     assert seen[6] == pytest.approx(0.4)  # mean own speed after one step is the own speed
     assert seen[8] == pytest.approx(1.0)
+
+
+def test_what_its_expert_asks_of_the_cars_own_accs_is_asked_however_deep_it_stands() -> None:
+    expert = make_driver("gap-maker", 1.0)
+    one = ResidualDriver(expert, random_network(), 1.0)
+    state = random_state(np.random.default_rng(3), 40, told=True)
+    asked = expert.time_headways(state, expert.initial_memory(40))
+    assert asked is not None
+    assert np.isfinite(asked).any()
+    for driver in (one, ResidualDriver(one, random_network(), 1.0), Filtered(one, 1.0, SafetyFilter(), 1.0)):
+        found = driver.time_headways(state, driver.initial_memory(40))
+        np.testing.assert_array_equal(np.array(found), asked)
+
+
+def test_what_its_expert_remembers_is_seen_through_a_filter_too() -> None:
+    expert = PISaturation()
+    around = Filtered(expert, 1.0, SafetyFilter(), 0.1)
+    parts = ("local", "expert_memory")
+    assert observation_size(parts, around) == observation_size(parts, expert) == 7
+    driver = ResidualDriver(around, random_network(7), 1.0, parts)
+    check_driver(driver)

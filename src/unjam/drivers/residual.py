@@ -92,8 +92,7 @@ class ResidualDriver(Wrapper):
         remembered = {EXPERT: after}
         if hold > 1:
             remembered = {EXPERT: after, RESIDUAL: residual, AGE: memory[AGE] + 1.0}
-        headways = self.expert.time_headways(state, memory[EXPERT])
-        command = Command(limits.keep(expert + residual), headways)
+        command = Command(limits.keep(expert + residual), self.time_headways(state, memory))
         return Decision(command, expert, residual, observation, remembered)
 
     def observation(self, state: LocalState, memory: Memory) -> Array:
@@ -105,6 +104,10 @@ class ResidualDriver(Wrapper):
         """Return the deterministic acceleration, clip(expert + residual), and the new memory."""
         decision = self.decide(state, memory)
         return decision.command.acceleration, decision.memory
+
+    def time_headways(self, state: LocalState, memory: Memory) -> Array | None:
+        """Return the expert's."""
+        return self.expert.time_headways(state, memory[EXPERT])
 
     def memory_features(self, memory: Memory) -> Array | None:
         """Return the expert's."""

@@ -65,9 +65,18 @@ class Around(Wrapper):
         """The other driver."""
         return {INNER: self.driver}
 
+    @property
+    def observed_memory(self) -> tuple[Observed, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """What the other driver's are."""
+        return self.driver.observed_memory
+
     def time_headways(self, state: LocalState, memory: Memory) -> Array | None:
         """Return those of the other driver."""
         return self.driver.time_headways(state, memory[INNER])
+
+    def memory_features(self, memory: Memory) -> Array | None:
+        """Return the other driver's."""
+        return self.driver.memory_features(memory[INNER])
 
 
 @dataclass(frozen=True)
