@@ -1,6 +1,7 @@
 import warnings
 from contextlib import closing
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,8 @@ from pettingzoo.test import parallel_api_test, parallel_seed_test
 import unjam
 from tests.worlds.sumo.own_roads import straight
 from unjam.drivers import Constant
+from unjam.environments.single import Step
+from unjam.errors import InputError
 from unjam.scenarios import make_scenario
 from unjam.worlds.episode import run_episode
 
@@ -156,3 +159,40 @@ def test_a_collision_terminates_everybody_who_is_there() -> None:
     assert len(terminated) > 3
     assert all(terminated.values())
     assert not any(truncated.values())
+
+
+def test_an_agent_whose_action_lacks_is_named() -> None:
+    environment = unjam.parallel_env("ring", **SHORT)
+    environment.reset(seed=1)
+    with pytest.raises(InputError, match=r"step: no action for cav_7, cav_15; allowed: one for each"):
+        environment.step({"cav_0": np.array([0.0])})
+    environment.close()
+
+
+def test_a_vehicle_that_comes_back_is_no_agent_again() -> None:
+    environment = unjam.parallel_env("ring", **SHORT)
+    there = [["a", "b"], ["a"], ["a", "b"]]
+    told: list[list[float]] = []
+
+    class Road:
+        """Its second CAV leaves in the first decision, and is back after the second."""
+
+        traffic = SimpleNamespace(cavs=there[0])
+
+        def step(self, actions: list[float]) -> Step:
+            before, now = there[len(told)], there[len(told) + 1]
+            told.append(actions)
+            left = {name: np.zeros(5, np.float32) for name in before if name not in now}
+            self.traffic.cavs = now
+            return Step(now, np.zeros((len(now), 5), np.float32), left, 1.0, {}, False, False)
+
+    environment._road = Road()  # pyright: ignore[reportAttributeAccessIssue]
+    environment.agents = environment._named(there[0])
+    first, second = environment.agents
+    there.append(["a", "b"])
+    *_, truncated, _ = environment.step({first: [0.1], second: [0.2]})
+    assert truncated == {first: False, second: True}
+    environment.step({first: [0.3]})
+    assert environment.agents == [first]
+    environment.step({first: [0.4]})
+    assert told == [[0.1, 0.2], [0.3], [0.4, 0.0]]

@@ -9,6 +9,7 @@ from pettingzoo import ParallelEnv
 
 from unjam.drivers.observation import FeatureName
 from unjam.environments.single import SteppedRoad
+from unjam.errors import InputError
 
 
 class ParallelRoad(ParallelEnv[str, Any, Any]):
@@ -35,6 +36,8 @@ class ParallelRoad(ParallelEnv[str, Any, Any]):
         self.agents: list[str] = []
         self._agents: dict[str, str] = {}
         """by vehicle"""
+        self._gone: set[str] = set()
+        """whose vehicle has left: where it comes back, only its expert drives it, as no agent does"""
         self.render_mode = None
         self.observation_spaces = dict.fromkeys(self.possible_agents, self._road.observation_space)
         self.action_spaces = dict.fromkeys(self.possible_agents, self._road.action_space)
@@ -53,6 +56,7 @@ class ParallelRoad(ParallelEnv[str, Any, Any]):
         """Start an episode: that of `seed`; without one, the next after the last seed's."""
         observations = self._road.reset(seed, np.random.default_rng())
         self._agents.clear()
+        self._gone.clear()
         self.agents = self._named(self._road.traffic.cavs)
         return dict(zip(self.agents, observations, strict=True)), {agent: {} for agent in self.agents}
 
@@ -61,11 +65,20 @@ class ParallelRoad(ParallelEnv[str, Any, Any]):
         if not self.agents:
             return {}, {}, {}, {}, {}
         acted = self.agents
-        done = self._road.step([float(np.asarray(actions[agent]).reshape(())) for agent in acted])
+        if missing := [agent for agent in acted if agent not in actions]:
+            raise InputError(f"step: no action for {', '.join(missing)}; allowed: one for each of the agents")
+        driven = [
+            0.0 if name in self._gone else actions[name] for name in self._named(self._road.traffic.cavs)
+        ]
+        done = self._road.step([float(np.asarray(each).reshape(())) for each in driven])
         ended = done.terminated or done.truncated
-        there = self._named(done.cavs)
         left = dict(zip(self._named(done.left), done.left.values(), strict=True))
-        seen = {**left, **dict(zip(there, done.observations, strict=True))}
+        now = dict(zip(self._named(done.cavs), done.observations, strict=True))
+        now, left = (
+            {name: seen for name, seen in each.items() if name not in self._gone} for each in (now, left)
+        )
+        self._gone |= left.keys()
+        there, seen = list(now), {**left, **now}
         # Who enters as the episode ends never was an agent.
         observations = {name: seen[name] for name in seen if name in acted or not ended}
         agents = list(observations)
