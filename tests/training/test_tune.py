@@ -3,6 +3,7 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from unjam.measures.gain import MEAN_GAIN, MOST, WORST
 from unjam.measures.metrics import measure
 from unjam.scenarios import FigureEight, Merge, Ring
 from unjam.scenarios.on_ramp import ON_RAMP
+from unjam.training import tune as tuning
 from unjam.training.search import Choice, Range, Space
 from unjam.training.seeds import TUNE, tuning_seeds
 from unjam.training.tried import TRIED
@@ -199,3 +201,22 @@ def test_a_reward_whose_file_has_changed_is_another_tuning(tmp_path: Path) -> No
         file.write_text(text.format(-1000))
         with pytest.raises(InputError, match="was made with other settings"):
             tune(*arguments)
+
+
+def test_finalists_are_different_settings_and_none_is_driven_twice(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    driven: list[str] = []
+    actual = tuning._driven
+
+    def noted(roads: Any, drivers: Any, *rest: Any) -> Any:
+        driven.extend(f"{rest[0]} {driver}" for driver in drivers)
+        return actual(roads, drivers, *rest)
+
+    monkeypatch.setattr(tuning, "_driven", noted)
+    two: Space = {"safe_gap_rule": Choice(("constant", "closing"))}
+    with Workers(1) as workers:
+        found = tune({"ring": SMALL}, "pi", two, STEPS, tmp_path, workers)
+    assert len(found.settings) == 4
+    assert len(driven) == len(set(driven)) <= 2 + 3
+    assert found.actual_steps == sum(60 * (EPISODES if each[0] == "0" else 2 * EPISODES) for each in driven)

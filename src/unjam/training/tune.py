@@ -178,7 +178,8 @@ def tune(
     ) -> list[Setting]:
         texts = [labelled(expert, values) for values in all_values]
         scores: dict[str, Verdict] = {text: (None, why) for text in texts if (why := _not_made(text))}
-        new = [text for text in texts if text not in scores and (first, text) not in tried.known]
+        unknown = [text for text in texts if text not in scores and (first, text) not in tried.known]
+        new = list(dict.fromkeys(unknown))
         for text, rows in zip(new, _driven(roads, new, first, count, reward, run), strict=True):
             tried.keep(first, text, _score(rows, alone(first, count)))
         scores |= {text: tried.known[first, text] for text in texts if text not in scores}
@@ -204,7 +205,8 @@ def tune(
             on_line(f"{len(settings)} of {trials}: {setting.driver}: {said}")
     able = [(one.score, one) for one in settings if one.score is not None]
     ranked = [one for _, one in sorted(able, key=lambda pair: pair[0], reverse=True)]
-    best_values = [one.values for one in ranked[:FINALISTS]]
+    different = {one.driver: one.values for one in ranked}
+    best_values = list(different.values())[:FINALISTS]
     *again, default = judged([*best_values, {}], episodes, 2 * episodes, in_sumo)
     finalists = [one for one in (*again, default) if one.score is not None]
     if not finalists:
