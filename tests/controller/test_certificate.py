@@ -142,6 +142,23 @@ def test_what_has_no_filter_has_no_certificate(driver: Driver, tmp_path: Path) -
         certificate_of(read_controller(written(tmp_path, driver)))
 
 
+def test_a_controller_that_names_no_road_is_not_certified(tmp_path: Path) -> None:
+    file = written(tmp_path)
+    parts = unpack_parts(file)
+    manifest = json.loads(parts.pop(MANIFEST))
+    del manifest["scenario"]
+    file.write_bytes(pack_parts({MANIFEST: json.dumps(manifest).encode(), **parts}))
+    with pytest.raises(InputError, match="a controller that names no road is not allowed"):
+        certificate_of(read_controller(file))
+
+
+def test_speeds_that_nobody_behind_would_drive_are_left_out_of_the_strings() -> None:
+    slow = IDMParameters(desired_speed=4.0)
+    found = certify(filtered(PISaturation()), visited(), slow)
+    assert found.strings
+    assert all(each.speed < 4.0 for each in found.strings)
+
+
 def test_a_controller_of_cars_that_obey_late_is_not_certified(tmp_path: Path) -> None:
     file = written(tmp_path)
     parts = unpack_parts(file)

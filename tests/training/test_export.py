@@ -7,7 +7,7 @@ import pytest
 
 from tests.pictures import empty_pictures
 from tests.training.test_run import small_config
-from unjam.controller import load_controller
+from unjam.controller import load_controller, shipped_file
 from unjam.controller.file import GRAPH, MANIFEST, SAMPLE, WEIGHTS, read_sample, unpack_parts
 from unjam.drivers import PISaturation, ResidualDriver
 from unjam.drivers.wrappers import Filtered
@@ -120,3 +120,12 @@ def test_a_car_that_obeys_late_gets_no_file_whose_filter_does_not_know_it(tmp_pa
         train(config, tmp_path / "late")
     with pytest.raises(InputError, match=r"export: actuator.delay 0, actuator.lag 0.5 is not allowed"):
         export_controller(tmp_path / "late", tmp_path / "late.unjam")
+
+
+def test_a_controllers_file_keeps_its_road_and_origin(tmp_path: Path) -> None:
+    shipped = manifest_of(shipped_file("figure-eight-tuned"))
+    again = manifest_of(export_controller("unjam:figure-eight-tuned", tmp_path / "again.unjam").file)
+    for name in ("scenario", "tuned", "expert", "versions"):
+        assert again[name] == shipped[name]
+    states, _ = read_sample(unpack_parts(tmp_path / "again.unjam")[SAMPLE])
+    assert len(states.speed) == SAMPLED

@@ -61,15 +61,20 @@ def make_driver(text: str, time_step: float) -> Driver:
     return named_driver(text, time_step)
 
 
-def hash_of_controller(text: str) -> str | None:
-    """Return the SHA-256 of the controller's file that a driver's name stands for; None where it is none."""
+def file_of(text: str) -> Path | None:
+    """Return the controller's file that a driver's name stands for; None where it is none."""
     path = Path(text)
     if text.startswith(SHIPPED):
         path = shipped_file(text.removeprefix(SHIPPED))
     elif os.path.isdir(text):
         path = path / f"controller{SUFFIX}"
-    is_one = path.suffix == SUFFIX and os.path.isfile(path)
-    return hash_of(path.read_bytes()) if is_one else None
+    return path if path.suffix == SUFFIX and os.path.isfile(path) else None
+
+
+def hash_of_controller(text: str) -> str | None:
+    """Return the SHA-256 of the controller's file that a driver's name stands for; None where it is none."""
+    path = file_of(text)
+    return None if path is None else hash_of(path.read_bytes())
 
 
 def shipped_names() -> list[str]:

@@ -125,13 +125,18 @@ def certificate_of(controller: Controller) -> dict[str, Any]:
     """Try a controller on what its sample says that it perceived; return what a certificate says, as JSON.
 
     Raises:
-        InputError: it has no filter or no sample: nothing can be certified.
+        InputError: it has no filter, no sample or no road: nothing can be certified.
     """
     driver = controller.driver
     if not isinstance(driver, Filtered) or not driver.safety.active or SAMPLE not in controller.parts:
         raise InputError(
             "certify: a controller without its safety filter and sample is not allowed; allowed: what "
             "`unjam export` writes of a road with a filter"
+        )
+    if "scenario" not in controller.manifest:
+        raise InputError(
+            "certify: a controller that names no road is not allowed; allowed: one that was exported with "
+            "--scenario"
         )
     with reading("certify"):
         states, _ = read_sample(controller.parts[SAMPLE])
@@ -162,7 +167,7 @@ def certify(driver: Filtered, visited: LocalState, humans: IDMParameters) -> Cer
     states = Ahead(*visited[:3])
     ranges = [(float(values.min()), float(values.max())) for values in states]
     speeds = [round(share * float(states.speed.max()), 1) for share in STRING_SHARES]
-    speeds = [speed for speed in speeds if speed > MOVING]
+    speeds = [speed for speed in speeds if MOVING < speed < humans.desired_speed]
     return Certificate(
         _worst_cases(pursue, states, driver, np.random.default_rng(0)),
         _comfort(states.speed, driver.time_step),

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from unjam.controller import SUFFIX, controller_bytes, make_driver
+from unjam.controller import SUFFIX, controller_bytes, file_of, make_driver
 from unjam.controller.file import GRAPH, SAMPLE, read_controller, sample_bytes
 from unjam.controller.verify import verify_controller
 from unjam.drivers.driver import Driver
@@ -18,7 +18,7 @@ from unjam.files import check_folder, make_folder, write_whole
 from unjam.measures.metrics import measure
 from unjam.measures.statistics import summarise
 from unjam.reports.results import EVALUATION_FILE, read_about
-from unjam.scenarios import example_of
+from unjam.scenarios import example_of, scenario_from_recipe
 from unjam.scenarios.scenario import Scenario
 from unjam.training.evaluate import TRAINED, raise_failure
 from unjam.training.folder import origin, read_config
@@ -31,6 +31,11 @@ if TYPE_CHECKING:
 Kind = Literal["best", "kept"]
 SAMPLED = 1000
 """most decisions of the recorded sample"""
+KNOWN = (
+    *("about", "scenario", "time_step", "action_limit", "expert", "versions"),
+    *("run", "iteration", "actual_steps", "metrics", "tuned"),
+)
+"""what a controller's manifest says of where it comes from"""
 
 
 class KeptControllers:
@@ -99,7 +104,7 @@ def export_controller(source: str | Path, to: str | Path, onnx: bool = False, sc
         source: a run folder, or any driver as `unjam.drive` takes it.
         to: the file, ending in `.unjam`; the graph goes beside it, with `.onnx`.
         onnx: whether to draw the graph of the whole controller.
-        scenario: whose time step and bounds a driver gets; a run has its own.
+        scenario: whose time step and bounds a driver gets; a run and a controller's file have their own.
 
     Raises:
         InputError: there is no such controller, or it is Python code, or, with `onnx`, cannot be drawn.
@@ -155,7 +160,13 @@ def _of_run(folder: Path, scenario: str) -> tuple[Scenario, Driver, dict[str, An
 
 
 def _of_driver(text: str, scenario: str) -> tuple[Scenario, Driver, dict[str, Any]]:
-    """Return the road, driver and origin of a driver by itself."""
+    """Return the road, driver and origin of a driver by itself; those of a controller's file are kept."""
+    file = None if scenario else file_of(text)
+    if file is not None:
+        found = read_controller(file)
+        about = {name: found.manifest[name] for name in KNOWN if name in found.manifest}
+        road = scenario_from_recipe(about["scenario"]) if "scenario" in about else example_of("ring")
+        return road, found.driver, about
     road = example_of(scenario or "ring")
     driver = make_driver(text, road.decision_step)
     expert = driver.expert if isinstance(driver, ResidualDriver) else driver
