@@ -103,10 +103,10 @@ class Controller:
         for name, part in parts.items():
             if hashlib.sha256(part).hexdigest() != self.manifest["sha256"][name]:
                 raise ValueError(f"{path}: {name} is damaged")
-        self.sample = arrays(parts["sample.safetensors"])
+        self.driver = Driver(self.manifest["driver"], arrays(parts["weights.safetensors"]))
+        self.sample = arrays(parts["sample.safetensors"]) if "sample.safetensors" in parts else {}
         self.time_step, action = self.manifest["time_step"], self.manifest["action"]
         self.limit = max(-action["low"], action["high"])
-        self.driver = Driver(self.manifest["driver"], arrays(parts["weights.safetensors"]))
 
     def act(self, *perceived: Any, **named: Any) -> float:
         """The acceleration to drive with [m/s2], for the fields of `State`."""
@@ -115,6 +115,10 @@ class Controller:
 
 if __name__ == "__main__":
     controller = Controller(sys.argv[1])
+    if not controller.sample:
+        sys.exit(
+            f"{sys.argv[1]}: it can drive, but has no sample to compare with; `unjam export` records one"
+        )
     names = [name for name in State._fields if name in controller.sample]
     recorded = zip(*(controller.sample[name].tolist() for name in (*names, "acceleration")), strict=True)
     off = [abs(controller.act(**dict(zip(names, seen, strict=True))) - told) for *seen, told in recorded]

@@ -1,10 +1,12 @@
 """Drives a vehicle of a running SUMO by a .unjam controller, over TraCI; needs traci and run_controller.py.
 
-    sumo -c my.sumocfg --remote-port 8813 &
+    sumo -c my.sumocfg --step-length 0.1 --remote-port 8813 &
     python examples/traci_client.py ring.unjam 8813 VEHICLE
 
-The vehicle's type should have the car-following model Krauss: SUMO then carries out each command exactly
-until it is unsafe. Whoever can reach that port can steer SUMO: do not open it to a network.
+A controller decides at times of its own, so SUMO's step must divide them: with its step of 1 s a controller
+of 0.1 s would drive on for ten times as long as its filter allows for. The vehicle's type should have the
+car-following model Krauss: SUMO then carries out each command exactly until it is unsafe. Whoever can reach
+that port can steer SUMO: do not open it to a network.
 """
 
 import sys
@@ -34,7 +36,12 @@ def perceive(vehicles: Any, name: str) -> State:
 def drive(sumo: Any, controller: Controller, name: str) -> int:
     """Drive the vehicle from its entry to its exit; return the number of decisions."""
     step, decisions = sumo.simulation.getDeltaT(), 0
-    vehicles, held = sumo.vehicle, max(1, round(controller.time_step / step))
+    vehicles, held = sumo.vehicle, round(controller.time_step / step)
+    if abs(held * step - controller.time_step) > 1e-9:
+        asked = f"it decides every {controller.time_step:g} s: start SUMO with --step-length"
+        raise SystemExit(
+            f"SUMO's step of {step:g} s does not fit the controller; {asked} {controller.time_step:g}"
+        )
     while name not in vehicles.getIDList():
         if not sumo.simulation.getMinExpectedNumber():
             raise SystemExit(f"no vehicle {name!r} has entered")

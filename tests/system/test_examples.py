@@ -13,7 +13,7 @@ from tests.controller.test_file import residual
 from tests.controller.test_sample import perceived
 from tests.drivers.test_experts import EXPERTS
 from tests.worlds.sumo.own_roads import straight
-from unjam.controller import controller_bytes
+from unjam.controller import controller_bytes, shipped_file
 from unjam.controller.file import SAMPLE, replay, sample_bytes
 from unjam.drivers import LACC, Driver, FollowerStopper, LocalState, Pacer, PISaturation
 from unjam.drivers.local_state import LARGEST_GAP
@@ -106,13 +106,44 @@ def test_the_plain_reader_says_what_it_cannot_read(tmp_path: Path) -> None:
     )
 
 
+def test_the_plain_reader_drives_by_what_has_no_sample_and_says_so() -> None:
+    command = [
+        sys.executable,
+        "-E",
+        "-s",
+        str(EXAMPLES / "run_controller.py"),
+        str(shipped_file("ring-tuned")),
+    ]
+    ran = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert ran.returncode == 1
+    assert "it can drive, but has no sample to compare with" in ran.stderr
+    assert "Traceback" not in ran.stderr
+
+
+STEP_OF_A_SECOND = """
+import sys
+from types import SimpleNamespace
+sys.path.insert(0, sys.argv[1])
+from traci_client import Controller, drive
+sumo = SimpleNamespace(simulation=SimpleNamespace(getDeltaT=lambda: 1.0), vehicle=None)
+drive(sumo, Controller(sys.argv[2]), "me")
+"""
+
+
+def test_a_controller_is_not_driven_in_longer_steps_than_its_filter_allows_for() -> None:
+    command = [sys.executable, "-c", STEP_OF_A_SECOND, str(EXAMPLES), str(shipped_file("ring-tuned"))]
+    ran = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert ran.returncode == 1
+    assert ran.stderr.endswith("it decides every 0.1 s: start SUMO with --step-length 0.1\n")
+
+
 def test_the_plain_reader_is_short() -> None:
     lines = [
         len((EXAMPLES / name).read_text().splitlines())
         for name in ("run_controller.py", "plain_experts.py", "plain_safety.py")
     ]
     assert max(lines) < 215
-    assert lines[0] < 125
+    assert lines[0] < 130
 
 
 def free_port() -> int:
