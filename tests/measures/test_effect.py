@@ -54,7 +54,7 @@ GOOD = Effect(
 def test_words_say_what_everybody_gains() -> None:
     known = replace(GOOD, delay_cut=between(0.06, 0.14))
     assert known.words == (
-        "travel time -4.0 [-6.0, -2.0] s (10 % less delay), flow +10 [-10, +30] veh/h, "
+        "travel time -4.0 [-6.0, -2.0] s (10 % [6, 14] less delay), flow +10 [-10, +30] veh/h, "
         "fuel +0.0 [+0.0, +0.0] ml/km"
     )
     assert "delay" not in GOOD.words

@@ -100,7 +100,8 @@ def drive(
     elif any(row["status"] != "failed" for rows in result.rows.values() for row in rows):
         print_metrics(result.rows)
         for label, effect in beside_people(result.rows).items():
-            count = effect.flow.count
+            if (count := effect.flow.count) == 0:
+                continue
             seeds = f"{count} paired seed{'' if count == 1 else 's'}"
             words = f"{label} beside people alone, {seeds}: {effect.words}"
             console.print(words, soft_wrap=True)

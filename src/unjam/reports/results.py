@@ -124,12 +124,13 @@ def read_results(folder: Path) -> Results:
     Raises:
         InputError: it is not such a folder, or not finished.
     """
-    path = folder / EVALUATION_FILE
-    if not path.is_file():
-        hint = "; go on with: unjam train --resume" if (folder / "config.toml").exists() else ""
-        raise InputError(f"report: {str(folder)!r} has no {EVALUATION_FILE}{hint}")
+    path, recorded = (folder / name for name in (EVALUATION_FILE, "shown.safetensors"))
+    for file in (path, recorded):
+        if not file.is_file():
+            hint = "; go on with: unjam train --resume" if (folder / "config.toml").exists() else ""
+            raise InputError(f"report: {str(folder)!r} has no {file.name}{hint}")
     try:
-        about, arrays = json.loads(path.read_text()), load_file(folder / "shown.safetensors")
+        about, arrays = json.loads(path.read_text()), load_file(recorded)
         rows, shown = rows_by_driver(about.pop("rows")), {}
         for number, entry in enumerate(about.pop("shown")):
             pictured = unpacked(

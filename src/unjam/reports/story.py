@@ -137,7 +137,10 @@ def _lead_of_drives(result: Results) -> str:
     if effects:
         count, found = len(result.rows["human"]), verdicts(result.rows)
         said = "; ".join(f"{label}: {_words_of(effect, found[label])}" for label, effect in effects.items())
-        return f"Beside people alone on {scenario}, {count} episodes with the same seeds paired: {said}."
+        seeds = (
+            f"{count} episodes with the same seeds paired" if count > 1 else "one seed, which proves nothing"
+        )
+        return f"Beside people alone on {scenario}, {seeds}: {said}."
     ratios = {label: estimate_of(rows, "speed_limit_ratio_steady") for label, rows in result.rows.items()}
     if len(ratios) > 1:
         words = ", ".join(
