@@ -230,7 +230,7 @@ def percent_over_ppo() -> Claim:
     rows = table("table-2", "ring")
     best = max(of(rows, name) for name in rows)
     numbers = "PPO's 1,057 times 5.83 is 6,162; nobody can earn more than 2,481; "
-    numbers += f"the most here, a tuned PI, {best:,.0f}"
+    numbers += f"the most of these rows, a tuned PI, {best:,.0f}"
     return "483 % more return than PPO, 34 % more than SAC", "impossible", numbers
 
 

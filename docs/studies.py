@@ -14,7 +14,7 @@ from unjam.measures.table import unbroken
 from unjam.studies import STUDIES
 from unjam.studies.comparison import HONEST, entries, estimates, interval, number
 from unjam.studies.references import REFERENCES, TUNED
-from unjam.studies.study import VARIANTS
+from unjam.studies.study import ROADS, VARIANTS
 
 FREE = 15.0
 """mean speed of an episode on the merge in which no jam stayed [m/s]"""
@@ -166,15 +166,19 @@ def closing_absorber() -> pd.DataFrame:
 
 
 def commands() -> pd.DataFrame:
-    """Return the command that repeats the training of a row, on the ring and with the first seed."""
-    table = []
-    for variant in VARIANTS.values():
-        words = ["unjam", "train", "ring", "--preset", variant.preset, "--seed", "0"]
-        words += ["--steps", str(variant.steps)] if variant.steps else []
-        for key, value in variant.changes.items():
-            words += ["--set", f"{key}={value}"]
-        table.append({"row": variant.label, "command": shlex.join(words)})
-    return pd.DataFrame(table)
+    """Return the command that repeats the training of a row with the first seed, by study and road."""
+    table = {}
+    for name, study in STUDIES.items():
+        for run in study.runs(1):
+            variant, road = VARIANTS[run.variant], ROADS[run.road]
+            words = ["unjam", "train", str(road["scenario"]), "--preset", variant.preset, "--seed", "0"]
+            words += ["--steps", str(variant.steps)] if variant.steps else []
+            changes = {key: value for key, value in road.items() if key != "scenario"} | dict(variant.changes)
+            for key, value in changes.items():
+                words += ["--set", f"{key}={value}"]
+            said = {"study": name, "road": run.road, "row": variant.label, "command": shlex.join(words)}
+            table.setdefault(run.name, said)
+    return pd.DataFrame(table.values())
 
 
 def drivers() -> pd.DataFrame:

@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 from IPython.display import HTML
 
+from unjam.measures.drivable import drivable_in_all
 from unjam.measures.metrics import METRICS
 from unjam.measures.statistics import Estimate, estimate_of, paired_difference
 from unjam.measures.table import baseline_of, cell_of, unbroken
@@ -42,6 +43,8 @@ def metrics_of(name: str, metrics: Sequence[str], compared: bool = True) -> pd.D
             heading = f"{about.label} [{about.unit}]" if about.unit else about.label
             cells[heading] = str(cell_of(found, about.digits, len(rows))) if found.count else "never"
         first = METRICS[metrics[0]]
+        if "human" in by_driver and len(by_driver) > 1:
+            cells["could a car drive so?"] = drivable_in_all(rows)
         if baseline:
             beyond = paired_difference(rows, by_driver[baseline], metrics[0])
             shown = "" if driver == baseline else str(cell_of(beyond, first.digits, sign="+"))
