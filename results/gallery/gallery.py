@@ -1,7 +1,7 @@
 """Drives each shipped controller on its road beside people alone: what docs/gallery.md shows, and a film.
 
-Ten held-out seeds, four on the on-ramp; ten minutes on two cores. `python results/gallery/gallery.py`, or
-with the names of those that are to be driven anew.
+Ten held-out seeds, twenty on the on-ramp; a quarter of an hour on two cores. `python
+results/gallery/gallery.py`, or with the names of those that are to be driven anew.
 """
 
 import json
@@ -77,7 +77,7 @@ def main(names: Sequence[str]) -> None:
     for name in names or ROADS:
         road, changes = ROADS[name]
         label = f"unjam:{name}"
-        count = 4 if road == "on-ramp" else 10
+        count = 20 if road == "on-ramp" else 10
         result = unjam.drive(road, ["human", label], episodes=count, road=changes, workers=2, held_out=True)
         named = (("human", "people alone"), (label, label))
         figure = space_time_of([shown_of(title, result.shown[driver]) for driver, title in named])
