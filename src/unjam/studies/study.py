@@ -4,7 +4,7 @@ import json
 import multiprocessing
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import product
 from math import ceil
@@ -152,6 +152,9 @@ LEFT_TO_LEARN = {
     **{"world": "sumo", "evaluation.every": 3, "evaluation.validation_episodes": 32},
 }
 """the on-ramp's best method on a law that gains nothing there: on the tuned one nothing is left to learn"""
+RAMP = few_steps("ramp", 9_600, 144_000, horizon=2400, **LEFT_TO_LEARN, **{"virtual.kappa": 10_000.0})
+IN_TURN = {**RAMP["ramp-imagined"].changes, "virtual.update": "sequential"}
+"""first an update on actual roads, then five on imagined ones, each of the policy as it is by then"""
 ALONE = {"expert": "none", "virtual.virtual_ratio": 0.0}
 TO_THE_END = {"evaluation.converged": 0}
 TWO_EACH = {"evaluation.episodes": 2}
@@ -195,7 +198,8 @@ VARIANTS: dict[str, Variant] = {
     **few_steps("best", 12_000, 756_000),
     **few_steps("jammed", 24_000, 768_000),
     **few_steps("eight", 6_000, 612_000, horizon=1500),
-    **few_steps("ramp", 9_600, 144_000, horizon=2400, **LEFT_TO_LEARN, **{"virtual.kappa": 10_000.0}),
+    **RAMP,
+    "ramp-imagined": replace(RAMP["ramp-imagined"], changes=IN_TURN, steps=48_000),
     "best-in-batches": Variant("ours, all its steps", "best", {"world": "batch"}, None),
     "by-150-seconds": Variant("residual", "best", BY_150_SECONDS, None),
     "rings": Variant("residual", "rings", TWO_EACH, None),
