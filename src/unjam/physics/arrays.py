@@ -53,6 +53,8 @@ def at_least(array: Array, floor: Array) -> Array:
     """Return the larger of each entry and `floor`; NaN stays NaN."""
     if type(array) is float:
         return floor if array < floor else array
+    if isinstance(array, (np.ndarray, np.generic)):
+        return np.maximum(array, floor)  # what `clip` does in the end, in a third of the time on few rows
     return array.clip(floor, None)
 
 
@@ -60,6 +62,8 @@ def at_most(array: Array, ceiling: Array) -> Array:
     """Return the smaller of each entry and `ceiling`."""
     if type(array) is float:
         return ceiling if array > ceiling else array
+    if isinstance(array, (np.ndarray, np.generic)):
+        return np.minimum(array, ceiling)
     return array.clip(None, ceiling)
 
 
