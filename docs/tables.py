@@ -43,7 +43,7 @@ def metrics_of(name: str, metrics: Sequence[str], compared: bool = True) -> pd.D
             heading = f"{about.label} [{about.unit}]" if about.unit else about.label
             cells[heading] = str(cell_of(found, about.digits, len(rows))) if found.count else "never"
         first = METRICS[metrics[0]]
-        if "human" in by_driver and len(by_driver) > 1:
+        if "human" in by_driver and len(by_driver) > 1 and "cav_max_braking" in rows[0]:
             cells["could a car drive so?"] = drivable_in_all(rows)
         if baseline:
             beyond = paired_difference(rows, by_driver[baseline], metrics[0])
