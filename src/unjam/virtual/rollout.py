@@ -201,7 +201,8 @@ class ImaginedWorld:
         )
         for name in ("observations", "actions", "rewards"):
             if not getattr(rollouts, name).isfinite().all():
-                raise UnjamError(f"virtual environment: {name} of a rollout are not finite")
+                why = "; speeds of who is not seen are NaN there, too" if name == "rewards" else ""
+                raise UnjamError(f"virtual environment: {name} of a rollout are not finite{why}")
         return rollouts
 
 
