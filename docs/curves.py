@@ -74,6 +74,35 @@ def draw(
     return Image(content.getvalue(), width=900)
 
 
+def on_ramps_so_far() -> pd.DataFrame:
+    """Return what first trainings of the on-ramp earn in validation after so many actual steps."""
+    labels = {
+        "on-ramp-in-turn": "imagined, learned from in turn",
+        "on-ramp-union": "imagined, one update",
+        "on-ramp-few": "without",
+    }
+    table = []
+    for folder, label in labels.items():
+        lines = [
+            line for path in sorted((RESULTS / "tried" / folder).glob("*.jsonl")) for line in path.open()
+        ]
+        found: dict[int, list[float]] = {}
+        for row in map(json.loads, lines):
+            if row["return_validation"] is not None:
+                found.setdefault(row["actual_steps"], []).append(row["return_validation"])
+        table += [
+            {
+                "": label,
+                "actual steps": f"{steps:,}",
+                "trainings": len(values),
+                "return in validation": f"{np.mean(values):,.0f}"
+                + (f" ({min(values):,.0f} to {max(values):,.0f})" if len(values) > 1 else ""),
+            }
+            for steps, values in sorted(found.items())
+        ]
+    return pd.DataFrame(table)
+
+
 def judged() -> pd.DataFrame:
     """Return what the trainings gain, each, and after how many steps they first reach a level.
 
