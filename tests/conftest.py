@@ -13,7 +13,9 @@ import pytest
 from hypothesis import settings
 
 from tests.pictures import empty_pictures
+from unjam.controller.file import hash_of
 from unjam.drivers import LocalState
+from unjam.drivers.from_file import FileDriver
 from unjam.drivers.network import Network
 from unjam.worlds.sumo.simulation import Simulation
 
@@ -124,3 +126,11 @@ def random_network(
         for rows, columns in itertools.pairwise(sizes)
     )
     return Network(layers, authority=1.0, exploration_std=0.2)
+
+
+def strangers_driver(code: Path, first: str) -> FileDriver:
+    """The driver `gentle` of a file that does something `first`, as a stranger has it: none of it has run."""
+    driver = FileDriver(code, "gentle")
+    code.write_text(first + code.read_text())
+    object.__setattr__(driver, "sha256", hash_of(code.read_bytes()))
+    return driver

@@ -10,14 +10,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.conftest import random_network
+from tests.conftest import random_network, strangers_driver
 from tests.controller.test_file import ABOUT, residual, written
 from tests.controller.test_sample import perceived
 from unjam.controller import controller_bytes, load_controller
 from unjam.controller.file import GRAPH, MANIFEST, SAMPLE, hash_of, pack_parts, sample_bytes, unpack_parts
 from unjam.controller.verify import verify_controller
 from unjam.drivers import Constant, Driver, PISaturation, ResidualDriver
-from unjam.drivers.from_file import FileDriver
 from unjam.errors import InputError
 from unjam.trust import trusting_code
 
@@ -60,10 +59,7 @@ def test_a_whole_controller_is_verified(tmp_path: Path) -> None:
 def test_code_of_a_folder_runs_only_where_it_is_trusted(tmp_path: Path) -> None:
     code, ran = tmp_path / "code.py", tmp_path / "ran"
     code.write_text("def gentle(state):\n    return 0.1 * (state.leader_speed - state.speed)\n")
-    mine = FileDriver(code, "gentle")
-    code.write_text(f"open({str(ran)!r}, 'w').close()\n" + code.read_text())
-    object.__setattr__(mine, "sha256", hash_of(code.read_bytes()))  # what a stranger would send
-    held = residual(mine)
+    held = residual(strangers_driver(code, f"open({str(ran)!r}, 'w').close()\n"))
     (tmp_path / "controller.unjam").write_bytes(controller_bytes(held, ABOUT))
     alone = refused(tmp_path / "controller.unjam")
     assert alone.endswith("Python code (code.py), which a file by itself may not run; use the run folder")

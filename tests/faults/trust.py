@@ -14,6 +14,7 @@ import numpy as np
 import psutil
 import pytest
 
+from tests.conftest import strangers_driver
 from tests.controller.test_file import residual
 from tests.faults.outcome import Outcome, one_line
 from tests.system.test_code_of_others import VERBS
@@ -32,7 +33,6 @@ from unjam.cli import app
 from unjam.controller import controller_bytes
 from unjam.controller.verify import verify_controller
 from unjam.drivers import Driver, LocalState, PISaturation
-from unjam.drivers.from_file import FileDriver
 from unjam.drivers.wrappers import Mixed, Remembering
 from unjam.errors import EpisodeError, InputError
 from unjam.processes import owned
@@ -230,8 +230,8 @@ def codes(count: int, folder: Path, generator: np.random.Generator) -> Outcome:
         (run / "best.toml").write_text((run / "config.toml").read_text())
         straight(place, CARS)
         code.write_text(f"{GENTLE}seen = gentle\n")
-        driver, where = _hidden(code, generator)
-        code.write_text(f"open({str(ran)!r}, 'w').close()\n" + code.read_text())
+        mine = strangers_driver(code, f"open({str(ran)!r}, 'w').close()\n")
+        driver, where = _hidden(mine, generator)
         (run / "controller.unjam").write_bytes(controller_bytes(driver, {}))
         before = sorted(place.rglob("*"))
         verb = list(TRIED)[number % len(TRIED)]
@@ -256,9 +256,8 @@ TRIED: dict[str, Callable[[], object]] = {
 """what a folder is given to, in this process; `verify` and `model` go on in a limited child"""
 
 
-def _hidden(code: Path, generator: np.random.Generator) -> tuple[Driver, str]:
+def _hidden(mine: Driver, generator: np.random.Generator) -> tuple[Driver, str]:
     """Return a driver that holds Python code, and where."""
-    mine = FileDriver(code, "gentle")
     choices: Sequence[tuple[Driver, str]] = (
         (mine, "a driver"),
         (residual(mine), "an expert"),

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.conftest import strangers_driver
 from tests.controller.test_file import residual
 from tests.system.conftest import Run
 from tests.system.test_wrong_inputs import one_line
@@ -11,7 +12,6 @@ from tests.training.test_run import small_config
 from tests.worlds.sumo.own_roads import straight
 from unjam.cli import MAY_RUN_CODE
 from unjam.controller import controller_bytes
-from unjam.drivers.from_file import FileDriver
 from unjam.training.config import to_toml
 from unjam.training.folder import start_folder
 from unjam.training.train import train
@@ -47,8 +47,7 @@ def ran(tmp_path: Path) -> Path:
     start_folder(run, small_config(expert=f"{code}:gentle", road__horizon=20))
     (run / "best.toml").write_text((run / "config.toml").read_text())
     code.write_text(DRIVER)
-    driver = residual(FileDriver(code, "gentle"))
-    code.write_text(f"open({str(ran)!r}, 'w').close()\n{DRIVER}")
+    driver = residual(strangers_driver(code, f"open({str(ran)!r}, 'w').close()\n"))
     (run / "controller.unjam").write_bytes(controller_bytes(driver, {}))
     return ran
 
