@@ -18,6 +18,7 @@ from unjam.measures.statistics import (
     around_ratio,
     estimate,
     estimate_of,
+    in_percent,
     paired,
     paired_difference,
     signed,
@@ -65,9 +66,7 @@ class Effect:
         """What everybody on the road gains, in a line: time, flow and fuel, or speed where nobody leaves."""
         time = f"travel time {signed(self.travel_time, 1)} s"
         if self.delay_cut.count and (self.travel_time.high < 0 or self.travel_time.low > 0):
-            cut = self.delay_cut
-            between = f" [{100 * cut.low:.0f}, {100 * cut.high:.0f}]" if cut.count > 1 else ""
-            less = f"{100 * cut.mean:.0f} %{between} less delay"
+            less = f"{in_percent(self.delay_cut)} less delay"
             time += f" ({less if self.travel_time.high < 0 else 'more delay'})"
         first = time if self.travel_time.count else f"mean speed {signed(self.speed, 2)} m/s"
         lost = ": a loss, whatever the speed" if self.flow.high < 0 else ""

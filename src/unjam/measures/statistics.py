@@ -130,6 +130,12 @@ def signed(gain: Estimate, digits: int = 0) -> str:
     return f"{gain.mean:+.{digits}f}{' ' if interval else ''}{interval}"
 
 
+def in_percent(share: Estimate) -> str:
+    """Return a share in per cent, with its interval, where it has one."""
+    interval = "" if isnan(share.low) else f" [{100 * share.low:.0f}, {100 * share.high:.0f}]"
+    return f"{100 * share.mean:.0f} %{interval}"
+
+
 def interval_of(found: Estimate, digits: str) -> str:
     """Return the interval in words, where there is none the range; empty of a single value."""
     if not isnan(found.low):
