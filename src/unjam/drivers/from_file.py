@@ -49,9 +49,15 @@ class FileReference:
     def __str__(self) -> str:
         return f"{self.path.name}:{self.name}"
 
+    def hash_now(self) -> str:
+        """Return the SHA-256 of the file as it is now."""
+        return hashlib.sha256(self.path.read_bytes()).hexdigest()
+
     def recipe(self) -> Recipe:
         """Return where the code is, and its hash."""
-        sha256 = hashlib.sha256(self.path.read_bytes()).hexdigest()
+        return self._recipe_of(self.hash_now())
+
+    def _recipe_of(self, sha256: str) -> Recipe:
         return {"kind": "file", "path": str(self.path), "name": self.name, "sha256": sha256}
 
     def load(self) -> Any:
@@ -179,13 +185,12 @@ class FileDriver(FileReference, Brought):
     def __post_init__(self) -> None:
         """Load it; raise `InputError` where the file is another than it must be."""
         object.__setattr__(self, "path", self.path.resolve())
-        object.__setattr__(self, "held", self._build())
-        sha256 = super().recipe()["sha256"]
-        if self.sha256 and self.sha256 != sha256:
+        if self.sha256 and self.path.is_file() and self.sha256 != self.hash_now():
             raise InputError(
                 f"{self}: its file has changed since; allowed: as it was when it was first loaded"
             )
-        object.__setattr__(self, "sha256", sha256)
+        object.__setattr__(self, "held", self._build())
+        object.__setattr__(self, "sha256", self.sha256 or self.hash_now())
 
     def _build(self) -> Any:
         found = self.load()
@@ -206,9 +211,9 @@ class FileDriver(FileReference, Brought):
         return labelled(str(self), self.parameters)
 
     def recipe(self) -> Recipe:
-        """Return where the code is, and its hash."""
+        """Return where the code is, and the hash of what was loaded."""
         made = {"parameters": self.parameters, "time_step": self.time_step}
-        return {**super().recipe(), "sha256": self.sha256, **made}
+        return {**self._recipe_of(self.sha256), **made}
 
 
 @dataclass(frozen=True)
