@@ -116,9 +116,7 @@ class Controller:
 if __name__ == "__main__":
     controller = Controller(sys.argv[1])
     if not controller.sample:
-        sys.exit(
-            f"{sys.argv[1]}: it can drive, but has no sample to compare with; `unjam export` records one"
-        )
+        sys.exit("it can drive, but has no sample to compare with; `unjam export` records one")
     names = [name for name in State._fields if name in controller.sample]
     recorded = zip(*(controller.sample[name].tolist() for name in (*names, "acceleration")), strict=True)
     off = [abs(controller.act(**dict(zip(names, seen, strict=True))) - told) for *seen, told in recorded]
