@@ -81,25 +81,22 @@ def on_ramps_so_far() -> pd.DataFrame:
         "on-ramp-union": "imagined, one update",
         "on-ramp-few": "without",
     }
+    files = [
+        (label, path) for folder, label in labels.items() for path in RESULTS.glob(f"tried/{folder}/*.jsonl")
+    ]
+    rows = pd.concat([pd.read_json(path, lines=True).assign(which=label) for label, path in files])
     table = []
-    for folder, label in labels.items():
-        lines = [
-            line for path in sorted((RESULTS / "tried" / folder).glob("*.jsonl")) for line in path.open()
-        ]
-        found: dict[int, list[float]] = {}
-        for row in map(json.loads, lines):
-            if row["return_validation"] is not None:
-                found.setdefault(row["actual_steps"], []).append(row["return_validation"])
-        table += [
-            {
+    for (label, steps), found in rows.groupby(["which", "actual_steps"])["return_validation"]:
+        if count := found.count():
+            between = f" ({found.min():,.0f} to {found.max():,.0f})" if count > 1 else ""
+            earned = f"{found.mean():,.0f}{between}"
+            row = {
                 "": label,
                 "actual steps": f"{steps:,}",
-                "trainings": len(values),
-                "return in validation": f"{np.mean(values):,.0f}"
-                + (f" ({min(values):,.0f} to {max(values):,.0f})" if len(values) > 1 else ""),
+                "trainings": count,
+                "return in validation": earned,
             }
-            for steps, values in sorted(found.items())
-        ]
+            table.append(row)
     return pd.DataFrame(table)
 
 
