@@ -20,8 +20,8 @@ from unjam.worlds.record import Floats
 
 LOOKS = (190_000, 380_000, 750_000, 1_500_000, 3_000_000, 6_000_000)
 """actual steps after which trainings are looked at"""
-LOOKS_ON_RAMPS = (28_800, 48_000)
-"""the same where an iteration has fewer"""
+LOOKS_ON_RAMPS = (28_800,)
+"""the same on the on-ramp, whose trainings with the model are as long"""
 TIMES = (1, 2, 3)
 """how many times the actual steps the method may take without the model"""
 WITHOUT = {

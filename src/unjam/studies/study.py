@@ -149,10 +149,10 @@ def few_steps(prefix: str, batch: int, steps: int, horizon: int = 3000, **same: 
 
 LEFT_TO_LEARN = {
     "expert": "jam-ahead:margin=2,margin_by_share=0",
-    **{"world": "sumo", "evaluation.every": 3, "evaluation.validation_episodes": 32},
+    **{"world": "sumo", "evaluation.every": 3, "evaluation.validation_episodes": 16},
 }
 """the on-ramp's best method on a law that gains nothing there: on the tuned one nothing is left to learn"""
-RAMP = few_steps("ramp", 9_600, 144_000, horizon=2400, **LEFT_TO_LEARN, **{"virtual.kappa": 10_000.0})
+RAMP = few_steps("ramp", 9_600, 86_400, horizon=2400, **LEFT_TO_LEARN, **{"virtual.kappa": 10_000.0})
 IN_TURN = {**RAMP["ramp-imagined"].changes, "virtual.update": "sequential"}
 """first an update on actual roads, then five on imagined ones, each of the policy as it is by then"""
 ALONE = {"expert": "none", "virtual.virtual_ratio": 0.0}
@@ -199,7 +199,7 @@ VARIANTS: dict[str, Variant] = {
     **few_steps("jammed", 24_000, 768_000),
     **few_steps("eight", 6_000, 612_000, horizon=1500),
     **RAMP,
-    "ramp-imagined": replace(RAMP["ramp-imagined"], changes=IN_TURN, steps=48_000),
+    "ramp-imagined": replace(RAMP["ramp-imagined"], changes=IN_TURN, steps=28_800),
     "best-in-batches": Variant("ours, all its steps", "best", {"world": "batch"}, None),
     "by-150-seconds": Variant("residual", "best", BY_150_SECONDS, None),
     "rings": Variant("residual", "rings", TWO_EACH, None),
