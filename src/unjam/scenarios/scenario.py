@@ -15,7 +15,8 @@ from unjam.drivers.safety import Actuator, SafetyFilter
 from unjam.drivers.sensors import Sensors
 from unjam.parameters import STRICT, Count, CountOrNone, NotNegative, Positive
 from unjam.physics.arrays import Array, at_least, namespace
-from unjam.physics.idm import IDMParameters, desired_speed_for
+from unjam.physics.idm import IDMParameters, desired_speed_for, free_acceleration
+from unjam.physics.kinematics import next_speed
 from unjam.scenarios.population import Population, read_population
 from unjam.scenarios.road import Road
 
@@ -29,6 +30,8 @@ SMALLEST_CAV_GAP = 0.5
 """gap that SUMO keeps for a CAV [m]"""
 SLOWEST = 0.1
 """set speed below which SUMO has none [m/s]"""
+THINKING = 0.25
+"""about how long the steps are that SUMO's IDM makes within one of the simulation [s]"""
 
 Actuation = Literal["shielded", "raw", "flow", "cruise"]
 """How SUMO carries out a CAV's command.
@@ -82,7 +85,14 @@ class CruiseControl:
         held = asked < min(highest, self.acceleration) - 1e-6
         acc = IDMParameters(max_acceleration=self.acceleration)
         faster = desired_speed_for(xp.where(held, asked, 0.0 * asked), speed, acc)
-        found = at_least(xp.where(asked <= 0.0, wanted, xp.maximum(wanted, faster)), SLOWEST)
+        rising = at_least(xp.maximum(wanted, faster), SLOWEST)
+        # SUMO's IDM overshoots low set speeds within a step, brakes for it, and may stand for ever.
+        parts = max(1, int(step / THINKING + 0.5))
+        reached, steady = speed, 2.0 * self.acceleration * step / parts
+        for _ in range(parts):
+            reached = next_speed(reached, free_acceleration(reached, rising, acc), step / parts)
+        rising = xp.where(reached <= speed, at_least(rising, steady), rising)
+        found = at_least(xp.where(asked <= 0.0, wanted, rising), SLOWEST)
         return xp.where(held, found, 0.0 * found + inf)
 
 

@@ -13,6 +13,7 @@ from unjam.drivers.local_state import LARGEST_GAP
 from unjam.drivers.road_experts import Cruise, JamAhead
 from unjam.measures.metrics import measure
 from unjam.scenarios import OnRamp
+from unjam.worlds.batch.motorway_world import MotorwayBatch
 from unjam.worlds.episode import run_episode
 from unjam.worlds.record import Episode
 from unjam.worlds.sumo import make_traffic
@@ -160,6 +161,21 @@ def test_who_is_not_held_back_drives_as_its_own_acc_does(simulation: Simulation)
     assert 1.5 < fastest <= 2.5
 
 
+@pytest.mark.parametrize("asked", [0.2, 0.5, 1.0])
+def test_who_stands_and_is_asked_to_go_does_so_however_gently_in_sumo_and_in_a_batch(
+    asked: float, simulation: Simulation
+) -> None:
+    """SUMO's IDM stands for ever at set speeds below half a metre a second."""
+    for world in (make_traffic(BUSY, (3,), simulation), MotorwayBatch(BUSY, [(3,)])):
+        world.start(controlled=True)
+        for _ in range(36):
+            world.advance(Command(np.full(world.rows, -3.0)))
+        assert world.perceive().speed.max() <= 0.1
+        for _ in range(10):
+            world.advance(Command(np.full(world.rows, asked)))
+        assert 0.8 * asked * 10.0 < world.perceive().speed[0] < 1.3 + asked * 10.0
+
+
 def test_cavs_want_to_drive_as_fast_as_those_whom_they_replace(simulation: Simulation) -> None:
     traffic = motorway(simulation)
     for _ in range(60):
@@ -227,6 +243,7 @@ def test_where_each_came_from_and_the_peak_are_recorded(capped: Episode) -> None
     assert all((np.diff(stay.states.to_merge) <= 1e-9).all() for stay in stays)
 
 
+@pytest.mark.long
 def test_a_cav_that_is_held_back_still_brakes_as_hard_as_its_own_acc_must(simulation: Simulation) -> None:
     """SUMO keeps who is told a speed to comfortable braking: told on, this one ran into a jam's tail."""
     road = OnRamp(cav_share=0.3, horizon=800)
