@@ -1,6 +1,6 @@
 # make demo   sets everything up, trains a residual in a jam, and drives a motorway beside people alone: a minute
 #             or two after the installation
-# make test   the tests that take minutes; make test-all adds the slow ones
+# make test   nineteen tests of twenty, in minutes; .ci/run adds the long ones, make test-all the slow ones, too
 # make check  lint, format, types; make docs builds the site; make bench measures speed
 #
 # On a machine where pip would fetch a CUDA build of torch, the CPU build is a tenth of the size:
@@ -24,17 +24,19 @@ demo: $(VENV)/.installed
 
 # The tests of a file share what they have made
 SPREAD := -n 2 --dist loadfile --no-loadscope-reorder
+# With TESTS="" also those that are long or slow
+TESTS ?= -m "not slow and not long"
 
 # Two processes share two cores: threads of more than one would wait for each other
 test: export OMP_NUM_THREADS = 1
 test: $(VENV)/.installed-dev
-	$(BIN)/python -m pytest $(SPREAD) -m "not slow"
+	$(BIN)/python -m pytest $(SPREAD) $(TESTS)
 
 test-all: $(VENV)/.installed-dev
 	$(BIN)/python -m pytest -n 2 --hypothesis-profile=thorough
 
-# Which lines no test runs; with TESTS="" also those of the slow ones
-TESTS ?= -m "not slow"
+# Which lines no test runs
+coverage: TESTS = -m "not slow"
 coverage: $(VENV)/.installed-dev
 	$(BIN)/python -m pytest $(SPREAD) $(TESTS) --cov --cov-report=term
 

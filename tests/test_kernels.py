@@ -66,11 +66,13 @@ OPERATIONS = (
 STATE = "import {first}, json; import unjam; from unjam.kernels import kernels; print(json.dumps(kernels()))"
 
 
+@pytest.mark.long
 @needs_avx2
 def test_whatever_the_shell_says_the_bits_are_the_committed_ones() -> None:
     assert run(OPERATIONS, **UNPINNED) == GOLDEN["operations"]
 
 
+@pytest.mark.long
 @needs_avx2
 @pytest.mark.parametrize("variable", UNPINNED)
 def test_each_variable_matters_and_changes_nothing_else(variable: str) -> None:
@@ -94,6 +96,7 @@ def test_trainings_of_all_learners_end_with_the_committed_bits() -> None:
     assert run(program, **UNPINNED) == GOLDEN["trainings"]
 
 
+@pytest.mark.long
 @needs_avx2
 def test_says_what_is_in_force() -> None:
     found = run(STATE.format(first="unjam, torch"))
@@ -157,6 +160,7 @@ except InputError as error:
 """
 
 
+@pytest.mark.long
 @needs_avx2
 def test_what_is_wrong_is_told_by_the_other_process_too(tmp_path: Path) -> None:
     (tmp_path / "something").touch()

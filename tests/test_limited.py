@@ -35,6 +35,7 @@ def test_code_that_a_folder_names_runs_where_it_is_trusted_alone(
     assert unjam.verify_controller(tmp_path, trust_code=True)[-1].name == "manifest"
 
 
+@pytest.mark.long
 def test_who_signed_a_controller_is_checked_in_a_limited_process(tmp_path: Path) -> None:
     path, made = tmp_path / "it.unjam", make_keys(tmp_path / "maker")
     path.write_bytes(content_of())
@@ -46,6 +47,7 @@ def test_who_signed_a_controller_is_checked_in_a_limited_process(tmp_path: Path)
         unjam.verify_controller(path, signer="--none")
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("without_pictures")
 def test_a_report_is_written_in_a_limited_process(tmp_path: Path) -> None:
     run = tmp_path / "run"

@@ -121,6 +121,7 @@ def test_nobody_else_is_bound(monkeypatch: pytest.MonkeyPatch) -> None:
     assert bound({"A": "b"}) == {"A": "b", PARENT: str(os.getpid())}
 
 
+@pytest.mark.long
 @linux
 def test_a_training_that_was_started_for_another_ends_with_it(tmp_path: Path) -> None:
     code = (

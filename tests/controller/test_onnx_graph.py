@@ -68,6 +68,7 @@ def agree(driver: Driver, stay: Trajectory) -> None:
     np.testing.assert_allclose(run_graph(part, driver, states), stay.applied, rtol=0, atol=PARITY)
 
 
+@pytest.mark.long
 def test_policy_driver_and_graph_agree_on_a_whole_episode_of_the_ring(simulation: Simulation) -> None:
     expert = PISaturation()
     policy = make_policy(ResidualPolicy, inputs=observation_size(PARTS, expert))

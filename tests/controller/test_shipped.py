@@ -28,6 +28,7 @@ from unjam.worlds.sumo.simulation import Simulation
 EVERYWHERE = Path(__file__).parents[2] / "results/everywhere"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", shipped_names())
 def test_each_is_whole_and_says_what_it_was_trained_on(name: str) -> None:
     verify_controller(shipped_file(name))
@@ -58,6 +59,7 @@ def test_the_rings_earns_more_than_its_expert_on_every_seed() -> None:
     assert {found.document()["drivers"][number]["drivable"] for number in (0, 1)} == {DRIVABLE}
 
 
+@pytest.mark.long
 def test_the_tuned_expert_earns_more_than_the_papers_on_ring_and_jammed_ring() -> None:
     for road in ("ring", "ring-jammed"):
         found = unjam.drive(road, ["pi", "unjam:ring-jammed-tuned"], episodes=2, workers=1)
@@ -65,6 +67,7 @@ def test_the_tuned_expert_earns_more_than_the_papers_on_ring_and_jammed_ring() -
         assert gain.smallest > 50
 
 
+@pytest.mark.long
 def test_the_jammed_rings_earns_more_than_its_expert_and_ends_the_wave_sooner_than_pi() -> None:
     expert, trained = "unjam:ring-jammed-tuned", "unjam:ring-jammed-best"
     found = unjam.drive("ring-jammed", ["pi", expert, trained], episodes=2, workers=1)
@@ -102,6 +105,7 @@ def row_of(name: str, road: Ring | FigureEight, simulation: Simulation) -> dict[
     return measure(run_episode(road, make_driver(name, 0.1), (11,), simulation=simulation))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", shipped_names())
 def test_none_is_undrivable_on_roads_it_was_never_trained_on(name: str, simulation: Simulation) -> None:
     for road in [*RINGS, *EIGHTS]:

@@ -15,6 +15,7 @@ NEEDED = {"sandbox": kept}
 SOAK = Path(__file__).parents[2] / "results" / "soak" / "soak.json"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "name",
     [

@@ -126,6 +126,7 @@ def test_nothing_is_calibrated_that_cannot_be_written(data: Path, tmp_path: Path
         fit_from_files([data], CHANGES, out=tmp_path / "gone" / "drivers.json")
 
 
+@pytest.mark.long
 def test_files_of_the_same_name_have_different_people(data: Path, tmp_path: Path) -> None:
     days = [tmp_path / day / data.name for day in ("monday", "tuesday")]
     for day in days:

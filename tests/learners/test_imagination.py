@@ -94,6 +94,7 @@ def shared() -> Iterator[Simulation]:
         yield opened
 
 
+@pytest.mark.long
 @every_learner
 def test_virtual_rows_change_what_is_learned_and_cost_no_actual_step(agent: str, shared: Simulation) -> None:
     alone, imagined = (Trained(shared, agent, virtual).learn(2) for virtual in (None, VIRTUAL))

@@ -64,6 +64,7 @@ def again(errs: bool, beyond: float = 0.0, seed: int = 9) -> Episode:
     return episode
 
 
+@pytest.mark.long
 def test_the_same_people_come_at_the_same_times_and_err_anew(actual: list[Episode]) -> None:
     one, other = again(True), again(True, seed=10)
     for episode in (one, other):
@@ -75,6 +76,7 @@ def test_the_same_people_come_at_the_same_times_and_err_anew(actual: list[Episod
     np.testing.assert_array_equal(again(False).speeds, again(False, seed=10).speeds)
 
 
+@pytest.mark.long
 def test_what_is_learned_moves_people_by_so_much_in_a_decision() -> None:
     calm, pushed = again(False), again(False, beyond=-0.05)
     assert np.nanmean(pushed.speeds[40:]) < np.nanmean(calm.speeds[40:]) - 0.2
@@ -100,6 +102,7 @@ def test_people_who_err_in_nothing_are_foreseen_but_for_what_they_remember() -> 
     assert float(np.quantile(wrong, 0.9)) < 0.2
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("often")
 def test_it_imagines_as_many_episodes_as_are_asked_for_in_mirrored_pairs(actual: list[Episode]) -> None:
     task = Task(ROAD, EXPERT)
@@ -143,6 +146,7 @@ def test_who_knows_nothing_of_following_takes_people_to_go_on_as_fast_as_they_ar
     assert per_step.std() * ROAD.steps_per_decision**0.5 == pytest.approx(0.3, rel=0.05)
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("often")
 def test_networks_count_beside_wrong_people_and_not_beside_those_who_are_known(actual: list[Episode]) -> None:
     others = {"time_headways": (1.6, 1.6), "accelerations": (0.73, 0.73), "decelerations": (1.67, 1.67)}

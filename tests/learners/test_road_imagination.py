@@ -104,6 +104,7 @@ def test_the_policy_goes_on_with_what_it_remembered() -> None:
     assert same > 0.5 * len(found.starts)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "road", [RING, WRONG, EIGHT], ids=["exact sensors", "wrong sensors", "a figure eight"]
 )

@@ -296,6 +296,7 @@ FIGURES: Sequence[Callable[[], Figure]] = (
 )
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("draw", FIGURES)
 def test_the_same_figure_gives_the_same_bytes(draw: Callable[[], Figure]) -> None:
     assert data_uri(draw()) == data_uri(draw())

@@ -198,6 +198,7 @@ def drawn(axes: Axes) -> dict[str, np.ndarray]:
     return {str(line.get_label()): np.asarray(line.get_ydata(), float) for line in axes.lines}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", PICTURES)
 def test_every_panel_has_a_title_and_lines_and_a_picture_can_be_made(name: str) -> None:
     draw, panels = PICTURES[name]

@@ -63,6 +63,7 @@ def test_the_paper_settings_cost_what_their_budget_says() -> None:
     assert long == pytest.approx(short * 4_000_000 / 300_000)
 
 
+@pytest.mark.long
 def test_a_study_leaves_its_trainings_numbers_picture_and_manifest(reproduced: Made) -> None:
     folder, told = reproduced
     for variant in ("plain", "virtual"):
@@ -156,6 +157,7 @@ def test_a_training_with_other_settings_is_not_taken_for_ours(reproduced: Made) 
         write_whole(config, before)
 
 
+@pytest.mark.long
 def test_a_stopped_training_goes_on(reproduced: Made, monkeypatch: pytest.MonkeyPatch) -> None:
     """What a stop leaves: no judgement yet, and fewer steps than planned."""
     folder, _ = reproduced

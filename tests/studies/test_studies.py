@@ -36,6 +36,7 @@ def test_training_time_is_measured_in_turns_for_all_variants(
     assert longest < axes.get_xlim()[1] < 1.2 * longest
 
 
+@pytest.mark.long
 def test_controllers_are_carried_over_to_other_traffic(
     monkeypatch: pytest.MonkeyPatch, reproduced: Made
 ) -> None:

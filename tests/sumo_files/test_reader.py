@@ -43,6 +43,7 @@ def test_the_word_in_a_comment_or_a_text_is_harmless(tmp_path: Path) -> None:
     assert read_sumo_files(path).used_types == {"car"}
 
 
+@pytest.mark.long
 def test_what_unpacks_to_too_much_is_refused_and_takes_no_memory_here(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

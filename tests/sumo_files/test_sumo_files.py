@@ -225,6 +225,7 @@ SNIPPETS = [*PIECES.replace("\n", "/").replace("_", " ").split("/"), "/>", "/"]
 """of XML, to be put together at random"""
 
 
+@pytest.mark.long
 @settings(max_examples=50, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     name=st.sampled_from(["road.net.xml", "road.rou.xml", "road.sumocfg", "road.rou.xml.gz"]),

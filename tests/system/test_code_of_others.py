@@ -52,6 +52,7 @@ def ran(tmp_path: Path) -> Path:
     return ran
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("verb", VERBS)
 def test_code_that_a_folder_names_does_not_run(verb: str, unjam: Run, tmp_path: Path, ran: Path) -> None:
     straight(tmp_path, '<vehicle id="a" type="car" route="along" depart="0"/>')
@@ -63,6 +64,7 @@ def test_code_that_a_folder_names_does_not_run(verb: str, unjam: Run, tmp_path: 
     assert not ran.exists()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("verb", ["drive", "watch", "go on", "evaluate"])
 def test_code_that_its_user_trusts_runs(verb: str, unjam: Run, ran: Path) -> None:
     done = unjam(*VERBS[verb], "--trust-code", pictures=False)
@@ -112,6 +114,7 @@ def test_folders_are_listed_and_reported_without_their_code(unjam: Run, ran: Pat
     assert not ran.exists()
 
 
+@pytest.mark.long
 def test_who_names_his_own_code_is_asked_for_nothing(unjam: Run, tmp_path: Path) -> None:
     (tmp_path / "mine.py").write_text(DRIVER)
     (tmp_path / "small.toml").write_text(to_toml(small_config(road__horizon=20)))

@@ -25,6 +25,7 @@ from unjam.worlds.sumo.networks import sumo_program
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("name", "argument", "words"),
     [
@@ -64,6 +65,7 @@ def shipped(driver: Driver, path: Path, states: LocalState) -> Path:
     return path
 
 
+@pytest.mark.long
 def test_the_plain_reader_drives_as_unjam_without_it(tmp_path: Path) -> None:
     drivers = [named_driver(name, 0.1) for name in EXPERTS if name != "human"]
     drivers += [

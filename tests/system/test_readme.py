@@ -59,6 +59,7 @@ def files(tmp_path: Path) -> None:
     (tmp_path / "detectors.csv").write_text("\n".join(measured))
 
 
+@pytest.mark.long
 def test_every_unjam_command_of_the_readme_runs_in_its_order(
     unjam: Run, files: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -162,6 +162,7 @@ def test_drive_on_your_own_network(unjam: Run, tmp_path: Path) -> None:
 QUESTION = ["assess", "straight.sumocfg", "--shares", "0,0.5", "-d", "acc", "--set", "horizon=120"]
 
 
+@pytest.mark.long
 def test_assess_answers_in_words_in_json_and_on_a_page(unjam: Run, tmp_path: Path) -> None:
     straight(tmp_path, '<flow id="f" type="car" route="along" begin="0" end="20" period="2"/>', length=100.0)
     ran = unjam(*QUESTION, "-n", 36, "--out", "said")
@@ -184,6 +185,7 @@ def test_assess_answers_in_words_in_json_and_on_a_page(unjam: Run, tmp_path: Pat
     assert unjam("report", "said", pictures=False).returncode == 0, "the rows are those of drive"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("question", "first_words"),
     [
@@ -250,6 +252,7 @@ def test_doctor_finds_everything_here(unjam: Run) -> None:
     assert {"netconvert", "an episode in a worker"} <= {check["name"] for check in found["checks"]}
 
 
+@pytest.mark.long
 def test_train_go_on_drive_and_export(unjam: Run, tmp_path: Path) -> None:
     trained = document(unjam(*TINY_RUN, "--steps", 320, "--out", "run", "--json", pictures=False))
     run = tmp_path / "run"

@@ -70,6 +70,7 @@ def test_without_a_display_one_line_names_the_way_out(unjam: Run) -> None:
     assert "--video" in line
 
 
+@pytest.mark.long
 def test_a_film_needs_no_display(unjam: Run, tmp_path: Path) -> None:
     done = unjam(*WATCH, "--video", "out.gif", environment={"DISPLAY": ""})
     assert done.returncode == 0, done.stderr

@@ -41,6 +41,7 @@ def unjam(core: dict[str, str], folder: Path, command: str) -> "subprocess.Compl
     )
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "command",
     [
@@ -57,6 +58,7 @@ def test_what_does_not_learn_runs_without_torch(core: dict[str, str], tmp_path: 
     assert ran.returncode == 0, ran.stderr
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("command", ["train ring --preset demo", "reproduce table-2 --dry-run"])
 def test_what_learns_says_in_a_line_what_to_install(
     core: dict[str, str], tmp_path: Path, command: str

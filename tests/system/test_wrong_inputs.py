@@ -296,6 +296,7 @@ def test_doctor_names_what_is_missing(unjam: Run, tmp_path: Path) -> None:
     assert "missing an episode in a worker: libsumo cannot be imported (gone)" in ran.stdout
 
 
+@pytest.mark.long
 def test_disk_that_fills_up_is_code_74(unjam: Run, tmp_path: Path) -> None:
     def little_space() -> None:
         resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))

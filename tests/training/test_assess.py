@@ -79,6 +79,7 @@ def test_a_road_of_the_package_is_refused() -> None:
         question("ring", [0.1], 400, 0.02)
 
 
+@pytest.mark.long
 def test_all_rows_are_kept_those_that_chose_apart(asked: Question, answer: Assessment) -> None:
     folder = answer.page.parent
     chose, judged = read_rows(folder / CHOOSING), read_rows(folder)
@@ -104,6 +105,7 @@ def test_the_document_is_that_of_the_folder_and_says_what_is_judged(answer: Asse
     assert written["manifest"]["packages"]["libsumo"]
 
 
+@pytest.mark.long
 def test_the_answer_does_not_depend_on_the_number_of_workers(
     asked: Question, answer: Assessment, tmp_path: Path
 ) -> None:

@@ -77,6 +77,7 @@ def done(asked: Corridor, tmp_path_factory: pytest.TempPathFactory) -> tuple[Pat
         return folder, calibrate(asked, folder, counting, SPACE, TRIALS, seeds=1)
 
 
+@pytest.mark.long
 def test_a_calibrated_road_comes_nearer_to_its_detectors(
     asked: Corridor, done: tuple[Path, Calibrated]
 ) -> None:
@@ -94,6 +95,7 @@ def test_a_calibrated_road_comes_nearer_to_its_detectors(
     assert read_sumo_files(asked.files.path) == asked.files  # nobody's files have changed
 
 
+@pytest.mark.long
 def test_what_is_written_is_a_network_that_measures_as_it_was_judged(
     asked: Corridor, done: tuple[Path, Calibrated]
 ) -> None:

@@ -131,6 +131,7 @@ def crash(folder: Path, at: int, moment: Moment, kill: bool) -> Disk:
         return disk
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("every", [5, pytest.param(1, marks=pytest.mark.slow)])
 def test_wherever_it_ends_it_goes_on_to_the_same_files(every: int, tmp_path: Path) -> None:
     wanted_in, trial = tmp_path / "wanted", 0

@@ -82,6 +82,7 @@ def test_a_driver_by_itself_gets_step_and_bounds_of_its_road(tmp_path: Path) -> 
     assert load_controller(again.file) == load_controller(done.file)
 
 
+@pytest.mark.long
 def test_with_a_graph_it_is_in_the_file_and_beside_it(run: Path, tmp_path: Path) -> None:
     pytest.importorskip("onnxscript")
     pytest.importorskip("onnxruntime")

@@ -169,6 +169,7 @@ RAMP: dict[str, Any] = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("world", ["batch", "sumo"])
 def test_a_run_that_imagines_an_on_ramp_shows_its_waves_lane_by_lane(world: str, tmp_path: Path) -> None:
     changes = {"virtual__virtual_ratio": 1.0, "virtual__model": "road", "virtual__members": 2, **RAMP}
@@ -189,6 +190,7 @@ def test_a_run_that_imagines_an_on_ramp_shows_its_waves_lane_by_lane(world: str,
     assert all("nan" not in cell for _, row in wave_rows(found) for cell in row)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("road", [{}, RAMP])
 def test_a_run_that_imagines_whole_roads_goes_on_as_if_it_had_not_been_stopped(
     road: dict[str, Any], tmp_path: Path

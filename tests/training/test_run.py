@@ -154,6 +154,7 @@ def test_steps_are_rounded_up_to_whole_episodes_and_whole_iterations(tmp_path: P
     assert run.training.actual_steps == 400
 
 
+@pytest.mark.long
 def test_the_same_configuration_repeats_to_the_last_bit(
     uninterrupted: Path, tmp_path: Path, learn: Learn
 ) -> None:
@@ -166,6 +167,7 @@ def test_another_seed_is_another_run(uninterrupted: Path, tmp_path: Path, learn:
     assert progress(tmp_path / "other")[0]["return_mean"] != progress(uninterrupted)[0]["return_mean"]
 
 
+@pytest.mark.long
 def test_the_number_of_workers_changes_nothing(uninterrupted: Path, tmp_path: Path) -> None:
     with Workers(2) as two:
         learn_with(two, tmp_path / "two", small_config(steps=4 * STEPS, workers=2))
@@ -222,6 +224,7 @@ def test_a_run_that_is_stopped_again_and_again_ends_as_if_it_had_not_been(
     assert outcome(folder) == outcome(uninterrupted)
 
 
+@pytest.mark.long
 def test_a_run_that_goes_on_with_a_larger_budget_ends_as_one_in_one_go(
     uninterrupted: Path, tmp_path: Path, learn: Learn
 ) -> None:
@@ -250,6 +253,7 @@ def test_validating_at_the_end_of_a_smaller_budget_does_not_change_what_is_learn
     assert controller == other
 
 
+@pytest.mark.long
 def test_a_run_killed_before_its_first_checkpoint_starts_again(
     uninterrupted: Path, tmp_path: Path, learn: Learn
 ) -> None:
@@ -270,6 +274,7 @@ DAMAGE: dict[str, Callable[[Path], object]] = {
 KILLED, *OTHERS = DAMAGE
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", [KILLED, *(pytest.param(name, marks=pytest.mark.slow) for name in OTHERS)])
 def test_what_a_crash_left_behind_does_not_show_in_the_end(
     uninterrupted: Path, tmp_path: Path, name: str, learn: Learn

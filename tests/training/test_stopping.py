@@ -114,6 +114,7 @@ def test_without_tensorboard_a_line_says_so_before_anything_is_trained(
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.long
 def test_who_has_converged_or_given_up_stays_so_when_it_is_resumed(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:

@@ -82,6 +82,7 @@ def test_roads_that_do_not_go_together_are_refused_in_one_line(task: dict[str, A
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "agent", [pytest.param(name, marks=pytest.mark.slow) if name != "td3" else name for name in AGENTS]
 )
@@ -170,6 +171,7 @@ def test_each_road_is_judged_in_a_folder_of_its_own(tmp_path: Path) -> None:
     assert "2 results compared" in page
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("agent", "exploration"), [("trpo", "anew"), ("trpo", "mirrored"), ("ppo", "mirrored")]
 )
@@ -205,6 +207,7 @@ def test_roads_that_cannot_be_batched_are_driven_in_sumo_beside_those_that_can(t
             np.testing.assert_allclose(found.speeds, actual.speeds, atol=1e-9)
 
 
+@pytest.mark.long
 def test_more_is_driven_where_a_validation_shows_that_the_policy_falls_short(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -51,6 +51,7 @@ def test_a_tuned_expert_is_written_and_no_worse_than_it_was(tmp_path: Path) -> N
     assert len(written["settings"]) == 4
 
 
+@pytest.mark.long
 def test_the_same_seed_tries_the_same_settings_whoever_drives(tmp_path: Path) -> None:
     tried = []
     for count in (1, 2):
@@ -60,6 +61,7 @@ def test_the_same_seed_tries_the_same_settings_whoever_drives(tmp_path: Path) ->
     assert tried[0] == tried[1]
 
 
+@pytest.mark.long
 def test_a_tuning_that_was_stopped_goes_on_where_it_was(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

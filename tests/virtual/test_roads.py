@@ -48,6 +48,7 @@ def test_where_people_are_known_only_their_noise_is_left(episodes: list[Episode]
     assert float(model.noise) == pytest.approx(RING.noise_per_step * RING.simulation_step, rel=0.05)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("base", ["none", "ovm"])
 def test_what_a_base_does_not_know_the_networks_learn(episodes: list[Episode], base: str) -> None:
     _, found = fitted(episodes, base=base, epochs=20)

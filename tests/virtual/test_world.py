@@ -231,6 +231,7 @@ def test_a_users_reward_is_asked_through_numpy(my_drivers: Path) -> None:
     assert_close(found["push"], torch.tensor([-1.0, -0.5]))
 
 
+@pytest.mark.long
 def test_the_virtual_environment_knows_no_simulator() -> None:
     folder = Path(unjam.virtual.__path__[0])
     names = [f"unjam.virtual.{path.stem}" for path in folder.glob("*.py") if path.stem != "__init__"]

@@ -186,6 +186,7 @@ def test_progress_is_told_for_each_task() -> None:
     assert any(task == 0 and 0 < steps < 15_000 for task, steps in told)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "how",
     [

@@ -45,6 +45,7 @@ EIGHTS: dict[str, tuple[FigureEight, str, int]] = {
 """by what is special: road, driver, and for how many decisions it is to be SUMO's"""
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", EIGHTS)
 def test_it_begins_as_sumos_of_the_same_seed(name: str, simulation: Simulation) -> None:
     eight, expert, until = EIGHTS[name]
@@ -61,6 +62,7 @@ def test_it_begins_as_sumos_of_the_same_seed(name: str, simulation: Simulation) 
         assert states.to_crossing[:until] == pytest.approx(expected.to_crossing[:until], abs=1e-2)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("expert", ["human", "pi"])
 def test_from_each_of_sumos_moments_a_step_is_sumos(expert: str, simulation: Simulation) -> None:
     eight = replace(SHORT, horizon=900)
@@ -71,6 +73,7 @@ def test_from_each_of_sumos_moments_a_step_is_sumos(expert: str, simulation: Sim
     assert (found > 1e-4).sum() <= 1
 
 
+@pytest.mark.long
 def test_whole_episodes_are_alike(simulation: Simulation) -> None:
     eight, seeds = FigureEight(), range(3)
     found = run_batch(tasks(eight, "idm", seeds), statistical=True)

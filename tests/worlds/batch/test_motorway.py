@@ -224,6 +224,7 @@ def about(episode: Episode) -> list[float]:
     ]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["human", "jam-ahead"])
 def test_episodes_are_sumos_in_the_mean(
     name: str, driven: dict[str, list[Episode]], simulation: Simulation
@@ -256,6 +257,7 @@ def test_nobody_touches_anybody_or_is_lost(driven: dict[str, list[Episode]]) -> 
         assert episode.audit.people.hardest <= 9.0 + 1e-9
 
 
+@pytest.mark.long
 def test_each_road_has_its_own_driver_and_exploration() -> None:
     road = replace(SHORT, horizon=150, cav_share=0.3)
     drivers = [driver_of("jam-ahead"), driver_of("cruise"), driver_of("gap-maker")]
@@ -306,6 +308,7 @@ def test_what_a_cav_perceived_is_what_was_there(driven: dict[str, list[Episode]]
         assert np.isfinite(each.reward).all()
 
 
+@pytest.mark.long
 def test_cavs_that_hold_back_are_slower_upstream_than_those_that_never_do() -> None:
     crowded = replace(SHORT, cav_share=0.5, horizon=200)
 

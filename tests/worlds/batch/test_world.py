@@ -174,6 +174,7 @@ def test_rings_are_warmed_up_once_and_the_newest_kept(monkeypatch: pytest.Monkey
     assert list(kept) == ["b", "c", "e", "f"]
 
 
+@pytest.mark.long
 def test_it_stays_so_for_five_minutes(simulation: Simulation) -> None:
     ring, driver = Ring(cavs=2), named_driver("pi", 0.1)
     for found, seed in zip(run_batch(tasks(ring, driver, (7, 8))), (7, 8), strict=True):

@@ -85,6 +85,7 @@ def human_rings(request: pytest.FixtureRequest, workers: Workers) -> tuple[int, 
     return request.param, run(workers, ring_warm(request.param), Human(), range(20))
 
 
+@pytest.mark.long
 def test_human_rings_are_those_of_the_papers_equations(human_rings: tuple[int, list[Episode]]) -> None:
     length, episodes = human_rings
     found, spread = measured(episodes)

@@ -208,6 +208,7 @@ def test_a_collision_ends_the_decision_in_which_it_happens(held: int, simulation
     assert episode.collisions == 2
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("length", [160, 220, 270])
 @pytest.mark.parametrize("held", [1, 5])
 def test_the_same_driver_shielded_never_collides_and_every_override_is_counted(

@@ -76,6 +76,7 @@ def test_on_the_figure_eight_sumo_makes_cars_yield_and_that_is_told_apart(simula
     assert followed.yielded == pytest.approx((found.trajectories[0].shield > 1e-5).mean())
 
 
+@pytest.mark.long
 def test_people_on_a_published_merge_brake_as_no_car_can_and_elsewhere_they_do_not(
     simulation: Simulation,
 ) -> None:

@@ -220,6 +220,7 @@ def human() -> list[Episode]:
     return episodes_of(Human(), range(2))
 
 
+@pytest.mark.long
 def test_from_a_standing_start_people_stay_in_a_jam_and_pi_makes_it_worse(human: list[Episode]) -> None:
     pi = episodes_of(PISaturation(), range(2))
     assert 8.5 < fleet_mean(human) < 13.5

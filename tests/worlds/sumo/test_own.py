@@ -50,6 +50,7 @@ def own(simulation: Simulation, file: Path, seed: int = 0, **changes: Any) -> Ow
     return traffic
 
 
+@pytest.mark.long
 def test_the_same_seed_gives_the_same_bytes_in_process_and_in_workers(
     file: Path, simulation: Simulation
 ) -> None:
@@ -82,6 +83,7 @@ def stayed(episode: Any, name: str) -> int:
     return int((~np.isnan(episode.speeds[:, column])).sum())
 
 
+@pytest.mark.long
 def test_a_share_is_about_that_share_and_types_are_all_of_theirs(tmp_path: Path) -> None:
     file = game(tmp_path, "ramp")
     episode = run_episode(scenario_of(file, cav_share=0.3, horizon=600), Human(), (0,))
@@ -100,6 +102,7 @@ def test_a_share_is_about_that_share_and_types_are_all_of_theirs(tmp_path: Path)
         assert driven == {name for name in there if "truck" in kinds.get(name, "")} != set()
 
 
+@pytest.mark.long
 def test_calibrated_people_drive_the_cars_and_the_same_vehicles_stay_cavs(tmp_path: Path) -> None:
     file, people = game(tmp_path, "ramp"), tmp_path / "drivers.json"
     near, far = IDMParameters(time_headway=0.8), IDMParameters(time_headway=3.0, minimum_gap=6.0)
