@@ -1,6 +1,6 @@
 # make demo   sets everything up, trains a residual in a jam, and drives a motorway beside people alone: a minute
 #             or two after the installation
-# make test   nineteen tests of twenty, in minutes; .ci/run adds the long ones, make test-all the slow ones, too
+# make test   fifteen tests of sixteen, in minutes; .ci/run adds the long ones, make test-all the slow ones, too
 # make check  lint, format, types; make docs builds the site; make bench measures speed
 #
 # On a machine where pip would fetch a CUDA build of torch, the CPU build is a tenth of the size:

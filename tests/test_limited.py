@@ -14,6 +14,7 @@ from unjam.drivers.from_file import FileDriver
 from unjam.errors import DiskError, InputError
 
 
+@pytest.mark.long
 def test_a_controller_is_verified_in_a_limited_process(tmp_path: Path) -> None:
     path = tmp_path / "it.unjam"
     path.write_bytes(content_of())
@@ -23,6 +24,7 @@ def test_a_controller_is_verified_in_a_limited_process(tmp_path: Path) -> None:
         unjam.verify_controller(path)
 
 
+@pytest.mark.long
 def test_code_that_a_folder_names_runs_where_it_is_trusted_alone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -52,6 +52,7 @@ def test_passes_the_checks_of_gymnasium_and_stable_baselines3_without_warnings(
         check_env_of_sb3(environment.unwrapped)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("warmup", [0, 50])
 def test_steps_the_very_episode_that_run_episode_runs(name: str, warmup: int) -> None:
@@ -185,6 +186,7 @@ def test_environments_of_one_process_do_not_disturb_each_other() -> None:
     np.testing.assert_array_equal([second for _, second in seen], expected)
 
 
+@pytest.mark.long
 def test_nothing_is_said_as_a_process_ends_with_environments_open() -> None:
     code = "import gymnasium, unjam\n" + "gymnasium.make('unjam/Ring-v0', horizon=60).reset(seed=0)\n"
     code += "left = [gymnasium.make('unjam/Ring-v0', horizon=60) for _ in range(2)]\n"

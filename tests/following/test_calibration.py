@@ -62,6 +62,7 @@ def test_each_driver_gets_its_own_headway_and_what_is_typical(every: Literal["tr
     assert told == [3]
 
 
+@pytest.mark.long
 def test_who_drives_beside_whom_does_not_matter() -> None:
     together = calibrate_each(groups(), PAPER_IDM, ("time_headway",))
     alone = [calibrate_each([group], PAPER_IDM, ("time_headway",))[0] for group in groups()]

@@ -24,6 +24,7 @@ def pairs() -> list[Pair]:
     ]
 
 
+@pytest.mark.long
 def test_every_driver_has_its_headway_and_what_suits_all(pairs: list[Pair]) -> None:
     told: list[tuple[int, int]] = []
     found = fit_drivers(pairs, FitDriversSettings(calibration=QUICK), lambda *done: told.append(done))
@@ -37,6 +38,7 @@ def test_every_driver_has_its_headway_and_what_suits_all(pairs: list[Pair]) -> N
     assert headways[0] < found.typical.time_headway < headways[-1]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", [0, 1])
 def test_the_typical_headway_is_one_that_suits_all(seed: int) -> None:
     people = [

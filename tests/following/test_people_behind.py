@@ -22,6 +22,7 @@ def data() -> ActualData:
     return kept
 
 
+@pytest.mark.long
 def test_finds_how_people_on_the_road_drive(data: ActualData) -> None:
     believed = replace(RING, humans=IDMParameters())
     found = calibrated_people(states_of(data), believed)

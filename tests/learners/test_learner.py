@@ -127,6 +127,7 @@ def of(mean: float, std: float) -> Normal:
     return Normal(torch.tensor([mean]), torch.tensor([std]))
 
 
+@pytest.mark.long
 @given(means, stds, means, stds)
 def test_is_half_the_integral_of_the_difference_of_the_densities(
     m: float, s: float, n: float, t: float

@@ -157,6 +157,7 @@ def test_networks_count_beside_wrong_people_and_not_beside_those_who_are_known(a
         assert imagination.facts["learned"] == learned
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("often")
 def test_networks_alone_learn_how_people_follow(actual: list[Episode]) -> None:
     settings = replace(VIRTUAL, base="none", epochs=60)
@@ -181,6 +182,7 @@ def test_what_cannot_be_imagined_is_refused(settings: VirtualSettings, words: st
         MotorwayImagination(settings, Task(ROAD, EXPERT), POLICY, 0)
 
 
+@pytest.mark.long
 def test_the_base_expects_of_people_in_sumo_what_it_expects_of_those_in_the_batch(
     actual: list[Episode], in_sumo: list[Episode], often: None
 ) -> None:

@@ -90,6 +90,7 @@ def test_intervals_of_real_returns_cover_what_they_say(count: int) -> None:
     assert 0.93 <= np.mean(list(coverage_by_kind(beyond, count).values())) <= 0.97
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("count", COUNTS)
 def test_intervals_of_what_residuals_earn_alone_cover_a_little_less(count: int) -> None:
     """On each length they earn all but the same, and now and then less: few values of such are too sure."""

@@ -54,6 +54,7 @@ def reddish(frame: np.ndarray) -> int:
     return int(((red - green > 40) & (red - blue > 30)).sum())
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("suffix", [".gif", ".webp"])
 def test_a_film_has_frames_that_differ(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"wave{suffix}"
@@ -79,6 +80,7 @@ def test_a_film_can_be_an_mp4(tmp_path: Path) -> None:
     assert near(frames[0], CAV_COLOUR) > 50
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "pace", [1.0, 10.0, *(pytest.param(pace, marks=pytest.mark.slow) for pace in (3.0, 5.0))]
 )
@@ -171,6 +173,7 @@ def test_lines_are_split_where_there_is_none() -> None:
     assert [part.tolist() for part in split_lines(lines)] == [[[0, 0], [1, 0]], [[2, 2], [3, 3], [4, 4]]]
 
 
+@pytest.mark.long
 def test_a_moment_of_a_road_with_ends_shows_its_lanes_and_those_who_are_there(episode: Episode) -> None:
     (scene,) = scenes(episode, [episode.steps])
     there = ~np.isnan(scene.speeds)

@@ -56,6 +56,7 @@ def test_vehicles_that_share_a_column_are_never_there_together(
             assert max(first[one], first[other]) - min(last[one], last[other]) > apart
 
 
+@pytest.mark.long
 def test_all_that_were_there_are_in_the_replay_where_they_were_and_as_fast(shown: Shown) -> None:
     data = replay_data([shown])
     (driver,) = data["drivers"]

@@ -30,6 +30,7 @@ def test_where_sumo_does_not_keep_cars_apart_only_the_filter_does() -> None:
             assert road.safety.active
 
 
+@pytest.mark.long
 def test_every_table_of_its_page_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     one = "unjam:ring-gap-tuned"
     monkeypatch.setattr(envelope, "ROADS", {one: "ring"})

@@ -124,6 +124,7 @@ def test_who_names_his_own_code_is_asked_for_nothing(unjam: Run, tmp_path: Path)
         assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("without_pictures")
 def test_own_code_runs_to_the_end_where_nothing_can_be_remembered(
     my_drivers: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -93,6 +93,7 @@ def test_what_the_readme_makes_and_installs_is_there() -> None:
             assert named[1] is None or named[1] in extras
 
 
+@pytest.mark.long
 def test_python_of_the_readme_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     snippets = re.findall(r"```python\n(.*?)```", README, re.DOTALL)

@@ -65,6 +65,7 @@ def document(ran: subprocess.CompletedProcess[str]) -> Any:
     return json.loads(ran.stdout)
 
 
+@pytest.mark.long
 def test_train_learns_on_several_roads_and_prints_a_table_for_each(unjam: Run, tmp_path: Path) -> None:
     mixture = tmp_path / "mixture.toml"
     mixture.write_text('[[tasks]]\nroad = {length = [70, 70]}\n[[tasks]]\nname = "short"\n')
@@ -135,6 +136,7 @@ def test_drive_on_the_merge_tells_of_flow_and_backlog(unjam: Run, tmp_path: Path
     assert "Speed, waves and queues over time" in (tmp_path / found["drivers"][0]["report"]).read_text()
 
 
+@pytest.mark.long
 def test_drive_without_a_name_compares_people_and_the_best_controller(unjam: Run, tmp_path: Path) -> None:
     common = [game(tmp_path, "ramp").name, "--cav-share", "0.3", "-n", 1, "--no-report"]
     common += ["--set", "horizon=60"]
@@ -146,6 +148,7 @@ def test_drive_without_a_name_compares_people_and_the_best_controller(unjam: Run
     assert "note: unjam:best holds back a car's own ACC" in " ".join(without.stderr.split())
 
 
+@pytest.mark.long
 def test_drive_on_your_own_network(unjam: Run, tmp_path: Path) -> None:
     file = game(tmp_path, "ramp").name
     common = ["-n", 1, "--set", "horizon=150", "--json"]

@@ -144,6 +144,7 @@ def test_where_all_are_damaged_it_says_so(tmp_path: Path, name: str) -> None:
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.long
 @settings(max_examples=60)
 @given(
     part=st.sampled_from([STATE, TENSORS]), place=st.floats(0, 1, exclude_max=True), bits=st.integers(1, 255)

@@ -150,6 +150,7 @@ def test_wherever_it_ends_it_goes_on_to_the_same_files(every: int, tmp_path: Pat
                 assert content_of(folder) == wanted, (kill, moment, at)
 
 
+@pytest.mark.long
 def test_twice_in_a_row_too(tmp_path: Path) -> None:
     crash(tmp_path / "wanted", 0, "before", False)
     wanted = content_of(tmp_path / "wanted")

@@ -33,6 +33,7 @@ def exported(run: Path) -> Path:
     return export_controller(run, run.parent / "ring.unjam").file
 
 
+@pytest.mark.long
 def test_it_is_the_runs_controller_that_is_exported(run: Path, exported: Path) -> None:
     made, kept = load_controller(exported), load_controller(run)
     assert isinstance(made, Filtered)

@@ -174,6 +174,7 @@ def test_the_number_of_workers_changes_nothing(uninterrupted: Path, tmp_path: Pa
     assert outcome(tmp_path / "two") == outcome(uninterrupted)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("iterations", [pytest.param(1, marks=pytest.mark.slow), 3])
 def test_a_run_that_was_stopped_ends_as_if_it_had_not_been(
     uninterrupted: Path, tmp_path: Path, iterations: int, learn: Learn
@@ -200,6 +201,7 @@ def test_a_run_of_any_learner_ends_as_if_it_had_not_been_stopped(
     assert outcome(tmp_path / "run") == outcome(tmp_path / "one go")
 
 
+@pytest.mark.long
 def test_each_learner_learns_its_own_way(uninterrupted: Path, tmp_path: Path, learn: Learn) -> None:
     for agent, key in {"ppo": "clip_fraction", "sac": "critic_loss", "td3": "critic_loss"}.items():
         learn(tmp_path / agent, small_config(agent=agent))
@@ -341,6 +343,7 @@ def test_without_validation_the_last_policy_is_the_controller(tmp_path: Path, le
     assert controller_manifest(tmp_path / "run")["iteration"] == 2
 
 
+@pytest.mark.long
 def test_validates_now_and_then_and_at_the_end(tmp_path: Path, learn: Learn) -> None:
     learn(tmp_path / "run", small_config(evaluation__every=2, steps=3 * STEPS))
     validated = [row["return_validation"] is not None for row in progress(tmp_path / "run")]

@@ -62,6 +62,7 @@ def test_the_policy_that_has_converged_is_the_controller(tmp_path: Path) -> None
     assert controller_manifest(tmp_path / "run")["iteration"] == len(returns) < 20
 
 
+@pytest.mark.long
 def test_training_ends_where_patience_is_over(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     returns = iter([5.0, 6.0, 5.5, 5.8, 9.0])
     monkeypatch.setattr(Trainer, "returns_of", lambda *given: [next(returns)])
@@ -72,6 +73,7 @@ def test_training_ends_where_patience_is_over(monkeypatch: pytest.MonkeyPatch, t
     assert found == [6.0, 5.5, 5.8]
 
 
+@pytest.mark.long
 def test_a_callback_that_returns_false_ends_the_training_as_its_steps_would(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
@@ -84,6 +86,7 @@ def test_a_callback_that_returns_false_ends_the_training_as_its_steps_would(
     assert controller_manifest(tmp_path / "run")["iteration"] == 3
 
 
+@pytest.mark.long
 def test_what_a_callback_ended_goes_on_as_if_it_never_had(tmp_path: Path) -> None:
     config = small_config(steps=2 * STEPS, evaluation__every=2)
     with Workers(1) as workers:

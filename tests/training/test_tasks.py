@@ -149,6 +149,7 @@ def test_the_critic_sees_which_road_it_is_and_what_that_has_drawn(tmp_path: Path
     assert (rows.last_observations[:2, -2:] == [1.0, 0.0]).all()
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("without_pictures")
 def test_each_road_is_judged_in_a_folder_of_its_own(tmp_path: Path) -> None:
     result = train(mixture(), tmp_path / "run")

@@ -34,6 +34,7 @@ RAMP_SPACE: Space = {"margin": Range(-4.0, 4.0)}
 SPACE = {"catch_up_speed": Range(0.5, 3.0), "safe_gap_rule": Choice(("constant", "closing"))}
 
 
+@pytest.mark.long
 def test_a_tuned_expert_is_written_and_no_worse_than_it_was(tmp_path: Path) -> None:
     with Workers(1) as workers:
         lines: list[str] = []
@@ -91,6 +92,7 @@ def test_a_tuning_that_was_stopped_goes_on_where_it_was(
     assert tune({"ring": SMALL}, "pi", SPACE, STEPS, folder, workers).best == whole.best  # nobody drives
 
 
+@pytest.mark.long
 def test_screened_settings_are_judged_as_sumo_judges_them(tmp_path: Path, simulation: Simulation) -> None:
     steps = FINAL + 10 * EPISODES * 60
     with Workers(1) as workers:
@@ -114,6 +116,7 @@ def test_roads_that_cannot_be_stepped_in_a_batch_are_not_screened(tmp_path: Path
         tune({"merge": Merge()}, "pi", SPACE, 10**9, tmp_path, workers, screen=True)
 
 
+@pytest.mark.long
 def test_on_ramps_are_screened_in_batches_where_each_setting_has_roads_of_its_own(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -158,6 +161,7 @@ def test_finalists_meet_seeds_that_no_setting_was_tried_on() -> None:
     assert {first for first, _ in tuning_seeds(3)} == {TUNE}
 
 
+@pytest.mark.long
 def test_on_several_roads_the_mean_gain_is_maximised_and_the_worst_road_named(tmp_path: Path) -> None:
     roads = {"short": SMALL, "full": Ring(horizon=80, length=(200, 210))}
     each = OF_EACH * (60 + 80)
@@ -173,6 +177,7 @@ def test_on_several_roads_the_mean_gain_is_maximised_and_the_worst_road_named(tm
     assert set(written["scenario"]) == set(roads)
 
 
+@pytest.mark.long
 def test_of_roads_of_all_kinds_those_are_screened_that_a_batch_can_step(tmp_path: Path) -> None:
     roads = {"ring": SMALL, "eight": FigureEight(horizon=80)}
     each = OF_EACH * (60 + 80)
@@ -193,6 +198,7 @@ def test_what_is_no_parameter_of_the_expert_is_not_varied(tmp_path: Path) -> Non
         tune({"ring": SMALL}, "pi", {"catch_up": Range(0.5, 3.0)}, STEPS, tmp_path, workers)
 
 
+@pytest.mark.long
 def test_a_reward_whose_file_has_changed_is_another_tuning(tmp_path: Path) -> None:
     file = tmp_path / "mine.py"
     text = "import numpy as np\ndef calm(outcome): return {{'speed': {} * outcome.speeds.mean(-1)}}\n"

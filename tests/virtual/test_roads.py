@@ -58,6 +58,7 @@ def test_what_a_base_does_not_know_the_networks_learn(episodes: list[Episode], b
     assert found.errors["unexplained"] == pytest.approx((step.model / step.change) ** 2)
 
 
+@pytest.mark.long
 def test_on_a_figure_eight_the_right_of_way_is_known_and_noise_no_ignorance(eights: list[Episode]) -> None:
     model, found = fitted(eights, EIGHT)
     sigma = EIGHT.noise_per_step * EIGHT.simulation_step
@@ -66,6 +67,7 @@ def test_on_a_figure_eight_the_right_of_way_is_known_and_noise_no_ignorance(eigh
     assert float(model.noise) == sigma
 
 
+@pytest.mark.long
 def test_on_a_figure_eight_the_networks_learn_what_a_base_does_not_know(eights: list[Episode]) -> None:
     _, found = fitted(eights, EIGHT, base="none", epochs=20)
     sigma, step = EIGHT.noise_per_step * EIGHT.simulation_step, found.one_step["speed"]

@@ -204,6 +204,7 @@ def test_a_residual_drivers_record_adds_up(
         assert np.abs(trajectory.residual).max() > 0.01
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("cavs", [1, 2])
 @pytest.mark.parametrize("hold", [1, 5])
 def test_exploration_adds_noise_of_the_networks_spread(cavs: int, hold: int, simulation: Simulation) -> None:

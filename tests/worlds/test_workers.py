@@ -130,6 +130,7 @@ def tasks_of_all_kinds(my_drivers: Path) -> list[EpisodeTask]:
     ]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("count", [1, 2, pytest.param(4, marks=pytest.mark.slow)])
 def test_any_number_of_workers_gives_the_bytes_of_this_process(count: int, my_drivers: Path) -> None:
     tasks = tasks_of_all_kinds(my_drivers)

@@ -239,6 +239,7 @@ def test_episodes_are_sumos_in_the_mean(
     assert ours.mean(0) == pytest.approx(theirs.mean(0), rel=0.08)
 
 
+@pytest.mark.long
 def test_a_road_is_the_same_alone_and_among_others(driven: dict[str, list[Episode]]) -> None:
     (alone,) = run_batch([EpisodeTask(SHORT, driver_of("jam-ahead"), seeds_of(4)[2])], statistical=True)
     among = driven["jam-ahead"][2]

@@ -138,6 +138,7 @@ def test_a_ring_of_the_batch_is_sumos_of_the_same_seed(name: str, simulation: Si
         assert_alike(found, run_episode(ring, driver, seed, simulation=simulation))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["people alone after a warm-up", "a CAV after a warm-up", "wrong sensors"])
 def test_a_ring_that_was_warmed_up_with_others_goes_on_to_the_same_bits(name: str) -> None:
     ring, expert = RINGS[name]

@@ -80,6 +80,7 @@ def test_a_function_of_the_program_drives_where_it_is(road: Scenario, tmp_path: 
     assert set(seen) == {os.getpid()}
 
 
+@pytest.mark.long
 @kept
 @pytest.mark.parametrize("option", WRITING)
 def test_what_sumo_might_be_brought_to_do_the_kernel_refuses(

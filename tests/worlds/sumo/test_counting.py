@@ -31,6 +31,7 @@ def test_loops_tell_when_and_how_fast_everybody_passed(tmp_path: Path) -> None:
     assert [one.speed for one in passed] == pytest.approx([10.0] * 9)
 
 
+@pytest.mark.long
 def test_the_count_does_not_depend_on_how_many_count(tmp_path: Path) -> None:
     random = STEADY.replace('period="6"', 'probability="0.3"')
     seeds = [(1,), (2,), (1,)]

@@ -141,6 +141,7 @@ def test_a_collision_ends_the_last_part_alone(whole: Episode, small: None) -> No
     assert np.flatnonzero(found).tolist() == [whole.steps - 1]
 
 
+@pytest.mark.long
 def test_a_network_of_ones_own_is_thinned_as_well(tmp_path: Path, small: None) -> None:
     episode = own_episode(tmp_path)
     shown = shown_of("", episode)

@@ -236,6 +236,7 @@ def test_from_an_empty_start_people_flow_freely(human: list[Episode]) -> None:
     assert min(episode.arrived for episode in free) > max(episode.arrived for episode in human)
 
 
+@pytest.mark.long
 def test_nobody_collides_whoever_drives() -> None:
     for driver in (Constant(1.0), Constant(-0.1)):
         episodes_of(driver, range(2), horizon=200, cav_share=0.3)

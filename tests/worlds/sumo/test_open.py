@@ -111,6 +111,7 @@ def test_commands_are_carried_out_unless_the_shield_brakes(counted: Episode) -> 
         assert (speed[1:] <= expected + 1e-9).all()
 
 
+@pytest.mark.long
 def test_the_same_seed_gives_the_same_bytes_in_process_and_in_workers(simulation: Simulation) -> None:
     residual = ResidualDriver(PISaturation(), random_network(), 1.0, hold=3)
     tasks = [

@@ -108,6 +108,7 @@ BROKEN_TRAFFIC = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("loaded_before", [False, True])
 @pytest.mark.parametrize(("traffic", "words"), BROKEN_TRAFFIC.items())
 def test_sumos_own_words_about_broken_traffic_reach_the_user_in_one_line(
