@@ -118,18 +118,10 @@ def idm_acceleration(
     return p.max_acceleration * (1.0 - free_road - interaction)
 
 
-def free_acceleration(speed: Array, desired_speed: Array, parameters: IDMParameters = PAPER_IDM) -> Array:
-    """Return the acceleration of a driver whom nobody is ahead of: Eq. 5 without its interaction [m/s2].
-
-    Speeds in m/s, any shape; `desired_speed` instead of that of the parameters.
-    """
-    return parameters.max_acceleration * (1.0 - (speed / desired_speed) ** parameters.exponent)
-
-
 def desired_speed_for(acceleration: Array, speed: Array, parameters: IDMParameters = PAPER_IDM) -> Array:
     """Return the desired speed v0 with which a driver accelerates so where nobody is ahead [m/s].
 
-    The inverse of `free_acceleration`; `acceleration` below the largest, `speed` in m/s, any shape.
+    Closed form of Eq. 5 without its interaction; `acceleration` below the largest, `speed` in m/s, any shape.
     """
     return speed / (1.0 - acceleration / parameters.max_acceleration) ** (1.0 / parameters.exponent)
 

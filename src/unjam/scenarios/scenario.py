@@ -15,7 +15,7 @@ from unjam.drivers.safety import Actuator, SafetyFilter
 from unjam.drivers.sensors import Sensors
 from unjam.parameters import STRICT, Count, CountOrNone, NotNegative, Positive
 from unjam.physics.arrays import Array, at_least, namespace
-from unjam.physics.idm import IDMParameters, desired_speed_for, free_acceleration
+from unjam.physics.idm import IDMParameters, IDMRows, desired_speed_for, idm_acceleration
 from unjam.physics.kinematics import next_speed
 from unjam.scenarios.population import Population, read_population
 from unjam.scenarios.road import Road
@@ -89,8 +89,11 @@ class CruiseControl:
         # SUMO's IDM overshoots low set speeds within a step, brakes for it, and may stand for ever.
         parts = max(1, int(step / THINKING + 0.5))
         reached, steady = speed, 2.0 * self.acceleration * step / parts
+        told = IDMRows(
+            rising, self.time_headway, self.acceleration, self.deceleration, acc.exponent, self.gap
+        )
         for _ in range(parts):
-            reached = next_speed(reached, free_acceleration(reached, rising, acc), step / parts)
+            reached = next_speed(reached, idm_acceleration(reached, reached, inf, told), step / parts)
         rising = xp.where(reached <= speed, at_least(rising, steady), rising)
         found = at_least(xp.where(asked <= 0.0, wanted, rising), SLOWEST)
         return xp.where(held, found, 0.0 * found + inf)
