@@ -53,6 +53,10 @@ class EpisodeError(UnjamError):
     """An episode failed again and again: the message holds what is needed to repeat it."""
 
 
+class LostError(EpisodeError):
+    """The process that ran an episode was lost, for whatever reason: the same may well run again."""
+
+
 DISK_ERRNOS = (
     *(errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS),
     *(errno.EACCES, errno.EPERM, errno.EIO, errno.ENOTDIR),
@@ -66,7 +70,8 @@ def disk_error(error: OSError, path: object) -> DiskError:
 
 def error_named(name: str, words: str) -> UnjamError:
     """Return the error that another process told of; of a kind that is not ours, it is an `UnjamError`."""
-    kinds = {each.__name__: each for kind in (UnjamError, InputError) for each in kind.__subclasses__()}
+    known = UnjamError, InputError, EpisodeError
+    kinds = {each.__name__: each for kind in known for each in kind.__subclasses__()}
     return kinds.get(name, UnjamError)(words)
 
 

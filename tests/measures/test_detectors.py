@@ -129,3 +129,12 @@ def test_who_changes_lanes_over_the_loops_of_an_edge_is_counted_once() -> None:
     flows, speeds = detected(rows, [(0, 1)], passed)
     assert flows[0] == 2 * 6  # a lap later it passes once more
     assert speeds[0] == 12.0
+
+
+def test_a_passage_without_a_speed_counts_in_the_flow_alone() -> None:
+    rows = [Measurement("a", 0, 0, 60, 0, 0), Measurement("a", 0, 60, 120, 0, 0)]
+    passed = [Passage(0, "x", 1.0, nan), Passage(1, "x", 1.4, 12.0), Passage(0, "y", 5.0, nan)]
+    flows, speeds = detected(rows, [(0, 1)] * 2, [*passed, Passage(0, "z", 70.0, nan)])
+    assert list(flows) == [120.0, 60.0]
+    assert speeds[0] == 12.0
+    assert isnan(speeds[1])

@@ -26,7 +26,7 @@ def test_calibrate_writes_a_network_that_other_verbs_drive(unjam: Run, tmp_path:
     assert ran.returncode == 0, ran.stderr
     for words in ("mean GEH", "error of speed (RMSE)", "original", "calibrated", "tau x "):
         assert words in ran.stdout
-    assert "assess it: unjam assess found/calibrated.sumocfg" in ran.stdout
+    assert "assess it: unjam assess found/calibrated.sumocfg" in ran.stderr
     assert {"calibrated.sumocfg", "0.rou.xml", "calibration.json"} <= {
         path.name for path in (tmp_path / "found").iterdir()
     }

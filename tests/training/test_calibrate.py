@@ -1,6 +1,7 @@
 """Does calibration find people and flows with which detectors measure what they did?"""
 
 import json
+from dataclasses import replace
 from math import isnan
 from pathlib import Path
 from typing import Any
@@ -9,7 +10,7 @@ import pytest
 
 from tests.worlds.sumo.own_roads import straight
 from unjam.drivers import PISaturation
-from unjam.errors import InputError, UnjamError
+from unjam.errors import InputError, LostError, UnjamError
 from unjam.measures.detectors import COLUMNS, agreement, detected
 from unjam.scenarios.own_network import OwnNetwork, own_network
 from unjam.sumo_files import read_sumo_files
@@ -230,3 +231,34 @@ def test_what_is_varied_are_factors_by_known_names() -> None:
     ):
         with pytest.raises(InputError, match=words):
             varied([text])
+
+
+def test_an_end_that_is_asked_for_counts_where_it_begins_behind_that_of_the_file(tmp_path: Path) -> None:
+    file = tmp_path / "detectors.csv"
+    file.write_text(f"edge,{','.join(COLUMNS)}\nroad,5,{END + 60},{END + 120},1,1\n")
+    found = corridor(str(road(tmp_path / "road")), file, END + 30, END + 150)
+    assert (found.begin, found.end) == (END + 30, END + 120)
+
+
+def test_a_share_lies_between_none_and_all_and_errors_are_not_below_none(
+    done: tuple[Path, Calibrated],
+) -> None:
+    rows = [
+        replace(done[1].original[0], geh_below_5=share, geh=9.0 * share) for share in (1.0, 1.0, 0.9, 0.0)
+    ]
+    found = replace(done[1], original=rows, calibrated=rows[::-1]).estimates()
+    assert found["geh_below_5"]["original"].high == 1.0
+    assert found["geh"]["original"].low == 0.0
+    assert found["geh"]["difference"].low < 0.0
+
+
+def test_a_process_that_was_lost_says_nothing_of_the_factors(
+    asked: Corridor, done: tuple[Path, Calibrated], tmp_path: Path
+) -> None:
+    class Lost(Counting):
+        def run(self, scenario: OwnNetwork, seeds: Any, loops: Any) -> list[list[Passage]]:
+            raise LostError("SUMO was lost: its process ended with code -9")
+
+    with Lost(1) as counting, pytest.raises(LostError):
+        calibrate(asked, tmp_path / "out", counting, SPACE, TRIALS, seeds=1)
+    assert not (tmp_path / "out" / TRIED).exists()

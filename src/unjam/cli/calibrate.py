@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from unjam.cli.options import DEFAULT_WORKERS, JsonOption, OutOption, SeedOption, WorkersOption, new_folder
-from unjam.cli.output import aside, console, new_table, print_json
+from unjam.cli.output import aside, console, new_table, print_json, say_next
 from unjam.cli.tune import SEEDS_BELOW
 from unjam.errors import wrong
 
@@ -86,4 +86,6 @@ def calibrate(
         table.add_row(label, unit, *cells)
     console.print(table)
     console.print(", ".join(f"{name} x {factor:g}" for name, factor in found.factors.items()), soft_wrap=True)
-    console.print(f"assess it: unjam assess {found.file}", soft_wrap=True)
+    times = {"--begin": begin, "--end": end}
+    given = [word for name, time in times.items() if time is not None for word in (name, f"{time:g}")]
+    say_next("assess it", "assess", found.file, *given)

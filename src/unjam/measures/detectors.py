@@ -4,7 +4,7 @@ import csv
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import isfinite, nan
+from math import isfinite, isnan, nan
 from pathlib import Path
 
 import numpy as np
@@ -115,7 +115,7 @@ def detected(
         passed: who passed them.
 
     Returns:
-        Two arrays in the order of `measured`; the speed is NaN where nobody passed.
+        Two arrays in the order of `measured`; the speed is NaN where nobody passed who tells one.
     """
     by_loop: defaultdict[int, list[Passage]] = defaultdict(list)
     for passage in passed:
@@ -128,19 +128,27 @@ def detected(
         times, found = known[places]
         first, last = np.searchsorted(times, (row.begin, row.end))
         flows[number] = (last - first) * 3600 / (row.end - row.begin)
-        if last > first:
-            speeds[number] = found[first:last].mean()
+        told = found[first:last][np.isfinite(found[first:last])]
+        if told.size:
+            speeds[number] = told.mean()
     return flows, speeds
 
 
 def _once(passed: Sequence[Passage]) -> Floats:
-    """Return times and speeds of passages in the order of time, each vehicle's once, shape (2, n)."""
-    before: dict[str, float] = {}
+    """Return times and speeds of passages in the order of time, each vehicle's once, shape (2, n).
+
+    Of passages that are one the first counts, with the speed of the first that tells one.
+    """
+    before: dict[str, tuple[float, int]] = {}
     kept: list[tuple[float, float]] = []
     for passage in sorted(passed, key=lambda one: one.time):
-        if passage.time - before.get(passage.vehicle, -np.inf) > SAME_PASSAGE:
+        last, row = before.get(passage.vehicle, (-np.inf, len(kept)))
+        if passage.time - last > SAME_PASSAGE:
+            row = len(kept)
             kept.append((passage.time, passage.speed))
-        before[passage.vehicle] = passage.time
+        elif isnan(kept[row][1]):
+            kept[row] = kept[row][0], passage.speed
+        before[passage.vehicle] = passage.time, row
     return np.array(kept, np.float64).reshape(-1, 2).T
 
 

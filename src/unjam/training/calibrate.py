@@ -12,10 +12,11 @@ from typing import Any
 
 import numpy as np
 
-from unjam.errors import EpisodeError, UnjamError
+from unjam.errors import EpisodeError, LostError, UnjamError
 from unjam.files import to_json, write_whole
 from unjam.manifest import manifest
 from unjam.measures.detectors import Agreement, agreement, detected
+from unjam.measures.metrics import SIGNED
 from unjam.measures.statistics import Estimate, estimate
 from unjam.processes import PrivateFolder
 from unjam.sumo_files.changed import write_changed
@@ -65,7 +66,11 @@ class Calibrated:
                 np.array([getattr(one, name) for one in rows]) for rows in (self.original, self.calibrated)
             )
             columns = {"original": before, "calibrated": after, "difference": after - before}
-            found[name] = {column: estimate(values.tolist()) for column, values in columns.items()}
+            most = 1.0 if name == "geh_below_5" else inf
+            found[name] = {
+                column: estimate(values.tolist(), bounds=SIGNED if column == "difference" else (0.0, most))
+                for column, values in columns.items()
+            }
         return found
 
 
@@ -96,7 +101,7 @@ def calibrate(
 
     Raises:
         InputError: the folder holds something else.
-        UnjamError: SUMO cannot drive the network as it is.
+        UnjamError: SUMO cannot drive the network as it is, or was lost again and again.
     """
     original = dict.fromkeys(space, 1.0)
     tried = Tried(folder, asked.about() | {"space": repr(space), "seeds": seeds, "seed": seed})
@@ -113,6 +118,8 @@ def calibrate(
             try:
                 rows = driven(factors, tuning_seeds(count, first))
                 tried.keep(first, text, (float(np.mean([row.score for row in rows])), ""))
+            except LostError:  # says nothing of these factors
+                raise
             except EpisodeError as error:
                 if factors == original:
                     raise UnjamError(f"{asked.files.path.name}: as it is: {error}") from None

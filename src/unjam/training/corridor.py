@@ -89,7 +89,8 @@ def corridor(file: str, detectors: Path, begin: float | None = None, end: float 
         raise wrong("scenario", file, "your own .sumocfg file")
     kind, rows = read_detectors(detectors)
     # People alone: the share is so small that nobody has it.
-    checked = own_network(file, {"cav_share": NOBODY, **({} if begin is None else {"begin": begin})})
+    times = {name: time for name, time in (("begin", begin), ("end", end)) if time is not None}
+    checked = own_network(file, {"cav_share": NOBODY, **times})
     files = read_sumo_files(Path(checked.file))
     first = files.begin if begin is None else begin
     last = next((limit for limit in (end, files.end) if limit is not None), inf)

@@ -1,14 +1,17 @@
 """Detectors on a road in SUMO: the same whoever counts, and other simulations go on after one that failed."""
 
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 
-from tests.worlds.sumo.own_roads import straight
-from unjam.errors import EpisodeError
+from tests.worlds.sumo.own_roads import game, straight
+from unjam.errors import EpisodeError, LostError
 from unjam.scenarios.own_network import OwnNetwork, own_network
-from unjam.worlds.sumo.counting import Counting
-from unjam.worlds.sumo.detectors import Loop
+from unjam.worlds.sumo.counting import ATTEMPTS, Counting
+from unjam.worlds.sumo.detectors import Loop, Passage, load_with_loops, loop_name, passages
+from unjam.worlds.sumo.simulation import Simulation
 
 STEADY = (
     '<vType id="steady" speedFactor="0.5" speedDev="0" sigma="0"/>'
@@ -48,3 +51,36 @@ def test_after_one_that_failed_others_go_on(tmp_path: Path) -> None:
         with pytest.raises(EpisodeError, match="SUMO cannot start"):
             counting.run(road(tmp_path), [(1,), (2,)], [Loop("nowhere_0", 5.0)])
         assert counting.run(road(tmp_path), [(1,)], [Loop("road_0", 5.0)]) != [[]]
+
+
+def test_who_leaves_a_loop_sideways_tells_no_speed_as_with_sumos_own_detectors(tmp_path: Path) -> None:
+    loops = [Loop(f"{edge}_{lane}", at) for edge, at in (("gneE2", 50.0), ("gneE7", 60.0)) for lane in (0, 1)]
+    ramp = own_network(str(game(tmp_path, "ramp")), {"cav_share": 1e-12})
+    with Simulation() as simulation:
+        load_with_loops(simulation, ramp, (1,), loops)
+        passed = passages(simulation, loops, 250)
+        told = simulation._sumo.inductionloop
+        own = [told.getIntervalMeanSpeed(loop_name(number)) for number in range(len(loops))]
+    speeds = [np.array([one.speed for one in passed if one.loop == number]) for number in range(len(loops))]
+    assert [np.nanmean(each) for each in speeds] == pytest.approx(own, rel=1e-9)
+    assert sum(int(np.isnan(each).sum()) for each in speeds) == 3
+
+
+def test_a_simulation_that_was_lost_runs_again_and_one_that_is_lost_again_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run, left = Counting._run_one, [0]
+
+    def lost(self: Counting, *arguments: Any) -> list[Passage]:
+        if left[0] > 0:
+            left[0] -= 1
+            raise LostError("SUMO was lost: its process ended with code -9")
+        return run(self, *arguments)
+
+    monkeypatch.setattr(Counting, "_run_one", lost)
+    with Counting(1) as counting:
+        left[0] = ATTEMPTS - 1
+        assert len(counting.run(road(tmp_path), [(1,)], [Loop("road_0", 105.0)])[0]) == 9
+        left[0] = ATTEMPTS
+        with pytest.raises(LostError, match="-9"):
+            counting.run(road(tmp_path), [(1,)], [Loop("road_0", 105.0)])

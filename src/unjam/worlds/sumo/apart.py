@@ -16,14 +16,14 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Any, Self, get_type_hints
 
-from unjam.errors import EpisodeError, error_named, in_own_words
+from unjam.errors import LostError, error_named, in_own_words
 from unjam.processes import PrivateFolder, bound, end_with_parent, sweep_private_folders
 from unjam.sandbox import confine, limit
 from unjam.scenarios.own_network import OwnNetwork
 from unjam.scenarios.scenario import Scenario
 from unjam.tree import pack, unpack
 from unjam.worlds.messages import read_message, write_message
-from unjam.worlds.sumo.detectors import passages
+from unjam.worlds.sumo.detectors import Loop, passages
 from unjam.worlds.sumo.files import Files
 from unjam.worlds.sumo.simulation import Simulation, is_open
 
@@ -98,7 +98,7 @@ class SimulationApart:
             write_message(self._process.stdin, {"call": name, "arguments": plain})
             facts, arrays = read_message(self._process.stdout)
         except (BrokenPipeError, EOFError):
-            raise EpisodeError(f"SUMO was lost: its process ended with code {self._process.wait()}") from None
+            raise LostError(f"SUMO was lost: its process ended with code {self._process.wait()}") from None
         if "error" in facts:
             raise error_named(*facts["error"])
         return unpack(_answer_of(name), facts["answer"], arrays)
@@ -150,7 +150,8 @@ def main() -> None:
 
 def _do(simulation: Simulation, name: str, arguments: list[Any]) -> Any:
     if name == passages.__name__:  # a message for each step would cost as much as the steps
-        return passages(simulation, *arguments)
+        loops, steps = arguments
+        return passages(simulation, [Loop(*each) for each in loops], steps)
     if name == "load":
         files = arguments[0]
         named = {option: tuple(map(Path, paths)) for option, paths in files["named"].items()}

@@ -3,12 +3,17 @@
 import queue
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from typing import Self
 
-from unjam.errors import EpisodeError
+from unjam.errors import EpisodeError, LostError
 from unjam.scenarios.own_network import OwnNetwork
+from unjam.tree import unpack
 from unjam.worlds.sumo.apart import SimulationApart
 from unjam.worlds.sumo.detectors import Loop, Passage, load_with_loops
+
+ATTEMPTS = 3
+"""processes that may be lost on the same simulation"""
 
 
 class Counting:
@@ -32,14 +37,22 @@ class Counting:
 
         Raises:
             EpisodeError: SUMO cannot run the scenario.
+            LostError: its process was lost, again and again.
         """
-        futures = [self._threads.submit(self._run_one, scenario, seed, loops) for seed in seeds]
+        futures = [self._threads.submit(self._run_again, scenario, seed, loops) for seed in seeds]
         try:
             return [future.result() for future in futures]
         except BaseException:
             for future in futures:
                 future.cancel()
             raise
+
+    def _run_again(self, scenario: OwnNetwork, seed: tuple[int, ...], loops: Sequence[Loop]) -> list[Passage]:
+        """Return who passed, in another process where one was lost."""
+        for _ in range(ATTEMPTS - 1):
+            with suppress(LostError):
+                return self._run_one(scenario, seed, loops)
+        return self._run_one(scenario, seed, loops)
 
     def _run_one(self, scenario: OwnNetwork, seed: tuple[int, ...], loops: Sequence[Loop]) -> list[Passage]:
         simulation = self._idle.get()
@@ -49,7 +62,7 @@ class Counting:
                 self._open.add(simulation)
             load_with_loops(simulation, scenario, seed, loops)  # pyright: ignore[reportArgumentType]
             steps = scenario.horizon * scenario.steps_per_decision
-            return [Passage(*row.values()) for row in simulation.passages(len(loops), steps)]
+            return unpack(list[Passage], simulation.passages(loops, steps), {})
         except EpisodeError:
             if simulation is not None:  # it may be lost: another one goes on
                 simulation.close()

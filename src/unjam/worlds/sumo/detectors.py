@@ -1,6 +1,7 @@
 """Detectors on a road: who passed which induction loop, when, and how fast."""
 
 from collections.abc import Sequence
+from math import nan
 from typing import NamedTuple
 
 from unjam.scenarios.own_network import OwnNetwork
@@ -26,7 +27,7 @@ class Passage(NamedTuple):
     time: float
     """when its front bumper came [s]"""
     speed: float
-    """its mean while it was above the loop [m/s]"""
+    """its mean while it was above the loop [m/s]; NaN where it left sideways, before its end had passed"""
 
 
 def load_with_loops(
@@ -51,19 +52,32 @@ def loop_name(number: int) -> str:
     return f"unjam_loop_{number}"
 
 
-def passages(simulation: Simulation, loops: int, steps: int) -> list[Passage]:
+def passages(simulation: Simulation, loops: Sequence[Loop], steps: int) -> list[Passage]:
     """Simulate so many steps, or until nobody is expected any more, and return who passed the loops.
 
-    Who leaves a loop by changing lanes has passed it too.
+    Who leaves a loop by changing lanes has passed it too, but tells no speed, as with SUMO's own detectors
+    (https://sumo.dlr.de/docs/Simulation/Output/Induction_Loops_Detectors_(E1).html).
     """
     found: dict[tuple[int, str, float], Passage] = {}
-    names = [(number, loop_name(number)) for number in range(loops)]
     for _ in range(steps):
         simulation.step()
-        for number, name in names:
-            for vehicle, length, came, left, _ in simulation.on_loop(name):
-                if left > came:  # it is -1 while the vehicle is still there
-                    found[number, vehicle, came] = Passage(number, vehicle, came, length / (left - came))
+        for number, loop in enumerate(loops):
+            for vehicle, length, came, left, _ in simulation.on_loop(loop_name(number)):
+                if left > came and (number, vehicle, came) not in found:  # it is -1 while it is still there
+                    whole = _has_passed(simulation, vehicle, length, loop)
+                    speed = length / (left - came) if whole else nan
+                    found[number, vehicle, came] = Passage(number, vehicle, came, speed)
         if not simulation.more_expected():
             break
     return list(found.values())
+
+
+def _has_passed(simulation: Simulation, vehicle: str, length: float, loop: Loop) -> bool:
+    """Return whether a vehicle that has just left a loop did so with its end, not sideways."""
+    if vehicle in simulation.arrived():
+        return True
+    if vehicle in simulation.lifted():
+        return False
+    ((lane, along),) = simulation.lane_places([vehicle])
+    same_edge = lane.rpartition("_")[0] == loop.lane.rpartition("_")[0]
+    return not same_edge or along - length >= loop.position
