@@ -511,3 +511,12 @@ def test_an_episode_in_which_nobody_came_is_measured_without_complaint() -> None
             ):
                 assert np.isnan(row[name])
             assert row["throughput_veh_per_h"] == row["backlog_veh"] == 0.0
+
+
+@pytest.mark.parametrize(
+    ("peak", "flow"), [((60.0, 90.0), 3600.0), ((0.0, 90.0), 1200.0), ((150.0, 200.0), 1440.0)]
+)
+def test_flow_of_a_peak_is_of_the_peak_alone(peak: tuple[float, float], flow: float) -> None:
+    # Somebody leaves every second from the sixtieth on; where the peak never comes all of it counts.
+    speeds = np.where(np.arange(101)[:, None] <= np.arange(60, 160), 10.0, np.nan)
+    assert metric("throughput_veh_per_h", open_episode(speeds, peak=peak)) == pytest.approx(flow)

@@ -21,7 +21,7 @@ from unjam.training import tune as tuning
 from unjam.training.search import Choice, Range, Space
 from unjam.training.seeds import TUNE, tuning_seeds
 from unjam.training.tried import TRIED
-from unjam.training.tune import EPISODES, FINALISTS, OF_EACH, TUNED, space_around, tune
+from unjam.training.tune import EPISODES, FINALISTS, OF_EACH, TUNED, space_around, space_asked, tune
 from unjam.worlds.batch.run import run_batches
 from unjam.worlds.episode import run_episode
 from unjam.worlds.sumo.simulation import Simulation
@@ -154,6 +154,19 @@ def test_the_space_around_an_expert_has_its_numbers_words_and_truths() -> None:
     for name in ("human", "nobody"):
         with pytest.raises(InputError):
             space_around(name, 0.1)
+
+
+def test_whole_ends_of_a_parameter_that_is_none_are_no_integers() -> None:
+    asked = ["gathering_speed=1..3", "varying=true,false"]
+    space = space_asked(asked, space_around("pacer", 0.1))
+    assert space == {"gathering_speed": Range(1.0, 3.0), "varying": Choice((True, False))}
+    first, speed = (
+        space_asked(["first=1..3"], space_around("jam-ahead", 1.0))["first"],
+        space["gathering_speed"],
+    )
+    assert isinstance(first, Range)
+    assert isinstance(speed, Range)
+    assert (first.whole, speed.whole) == (True, False)
 
 
 def test_finalists_meet_seeds_that_no_setting_was_tried_on() -> None:

@@ -163,15 +163,15 @@ def after_drive(scenario: str, drivers: Sequence[str], changes: Mapping[str, Any
         say_next("compare with people", *_command_without_out(), "-d", "human")
     elif experts and len(experts) == len(drivers) - 1:
         learn = "train", scenario, "--expert", experts[-1], "--preset", "demo"
-        say_next("learn on an expert", *learn, *_as_options(changes, "road."))
+        say_next("learn on an expert", *learn, *as_options(changes, "road."))
     elif drivers != ["human"]:
         see = "watch", scenario, "-d", drivers[-1], "--video", f"{Path(scenario).stem}.gif"
-        say_next("see it", *see, *_as_options(changes))
+        say_next("see it", *see, *as_options(changes))
     else:
         say_next("compare with an expert", *_command_without_out(), "-d", "pi")
 
 
-def _as_options(changes: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
+def as_options(changes: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
     """Yield the options that change a scenario so."""
     for key, value in changes.items():
         yield from ("--set", f"{prefix}{key}={value if isinstance(value, str) else json.dumps(value)}")

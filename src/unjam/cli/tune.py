@@ -20,7 +20,7 @@ from unjam.cli.options import (
     scenario_changes,
     with_options,
 )
-from unjam.cli.output import aside, console, print_json
+from unjam.cli.output import as_options, aside, console, print_json, say_next
 from unjam.errors import InputError, wrong
 
 SEEDS_BELOW = 2**32
@@ -69,9 +69,8 @@ def tune(
     from unjam.scenarios import make_scenario
     from unjam.training.family import FAMILY, GROUPS, roads_of
     from unjam.training.folder import new_and_owned
-    from unjam.training.search import space_of
     from unjam.training.tried import ASKED
-    from unjam.training.tune import space_around
+    from unjam.training.tune import space_around, space_asked
     from unjam.training.tune import tune as run
     from unjam.worlds.reward import make_reward
     from unjam.worlds.workers import Workers
@@ -88,7 +87,7 @@ def tune(
     made = next(iter(roads.values()))
     make_reward(reward or made.reward)
     around = space_around(expert, made.decision_step)
-    space = space_of(vary) if vary else around
+    space = space_asked(vary, around) if vary else around
     folder = new_folder(out, f"tune-{Path(scenario).stem}")
     with new_and_owned(folder, or_with=ASKED), Workers(workers) as pool:
         found = run(
@@ -107,4 +106,4 @@ def tune(
         f"{best.driver}: {best.score:.4g} on tuning seeds; {default.driver}: {before}", soft_wrap=True
     )
     on = FAMILY[next(iter(roads))].scenario if scenario in GROUPS else scenario
-    console.print(f"drive with it: unjam drive {on} --driver {found.file} --held-out", soft_wrap=True)
+    say_next("drive with it", "drive", on, "--driver", found.file, "--held-out", *as_options(changes))

@@ -210,7 +210,8 @@ def throughput_veh_per_h(episode: Episode) -> float:
     """
     if episode.peak[1] > 0:
         end = min(round(episode.peak[1] / episode.step), episode.steps)
-        begin = max(0, end - round(LAST_OF_PEAK / episode.step))
+        first = round(episode.peak[0] / episode.step)
+        begin = max(first if first < end else 0, end - round(LAST_OF_PEAK / episode.step))
         there = ~np.isnan(episode.speeds[begin : end + 1])
         left = (there[:-1] & ~there[1:]).sum()
         return float(left * 3600.0 / max(end - begin, 1) / episode.step)

@@ -28,7 +28,7 @@ from unjam.scenarios.on_ramp import OnRamp
 from unjam.scenarios.scenario import Scenario
 from unjam.training.evaluate import raise_failure
 from unjam.training.folder import hashes_of_files, origin
-from unjam.training.search import Choice, Range, Space, quiet_optuna
+from unjam.training.search import Choice, Range, Space, quiet_optuna, space_of
 from unjam.training.seeds import tuning_seeds
 from unjam.training.tried import Setting, Tried, Verdict
 from unjam.worlds.batch.possible import statistical_why_not, why_not
@@ -88,6 +88,24 @@ def space_around(expert: str, time_step: float) -> Space:
             space[field.name] = around
     if not space:
         raise InputError(f"expert: {expert!r} has nothing to tune")
+    return space
+
+
+def space_asked(texts: Sequence[str], around: Space) -> Space:
+    """Return what a user wants to vary of an expert; whole ends of a parameter that is none are no integers.
+
+    Args:
+        texts: as `search.space_of` reads them.
+        around: of `space_around`.
+
+    Raises:
+        InputError: a text is wrong.
+    """
+    space = space_of(texts)
+    for name, values in space.items():
+        default = around.get(name)
+        if isinstance(values, Range) and isinstance(default, Range) and not default.whole:
+            space[name] = Range(float(values.low), float(values.high), values.log)
     return space
 
 
