@@ -155,3 +155,11 @@ def test_one_seed_has_no_interval_and_proves_nothing() -> None:
     assert any("too few" in reason for reason in reasons)
     assert any("not shown to be shorter" in reason for reason in reasons)
     assert any("flow may be lower" in reason for reason in reasons)
+
+
+def test_both_harms_are_told_where_both_are_shown() -> None:
+    both = replace(GOOD, travel_time=between(2.0, 8.0), flow=between(-150.0, -50.0))
+    longer, lower = reasons_against(both)
+    assert longer == "travel time is longer than people's alone: +5.0 [+2.0, +8.0] s"
+    assert lower == "flow is lower than people's alone: -100 [-150, -50] veh/h"
+    assert harm_of(both) == f"{longer}; {lower}"

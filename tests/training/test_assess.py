@@ -9,6 +9,7 @@ import pytest
 
 from tests.worlds.sumo.own_roads import straight
 from unjam.errors import InputError
+from unjam.reports.assessment import render_assessment
 from unjam.reports.results import read_results, read_rows
 from unjam.training.assess import (
     CHOOSING,
@@ -66,6 +67,8 @@ def test_a_question_has_all_shares_and_drivers_and_people_alone(file: str) -> No
         ({"drivers": ["pacer"]}, "driver: 'pacer' is not allowed; allowed: one that needs no closed road"),
         ({"drivers": ["ghost"]}, "driver: 'ghost'"),
         ({"changes": {"cav_share": 0.5}}, "cav_share: it is not allowed here"),
+        ({"changes": {"cavs": 1}}, "cavs: it is not allowed here"),
+        ({"changes": {"penetration": 0.5}}, "penetration: it is not allowed here"),
         ({"changes": {"ghost": 1}}, "ghost: unknown name"),
     ],
 )
@@ -103,6 +106,13 @@ def test_the_document_is_that_of_the_folder_and_says_what_is_judged(answer: Asse
     assert (written["recommended"] is None) == bool(found.reasons)
     assert written["people"]["travel_time"]["count"] == written["seeds"]["judging"] >= 10
     assert written["manifest"]["packages"]["libsumo"]
+    assert written["notes"] == []
+    page = render_assessment(answer.page.parent)
+    lifted = "acc, 50 %: SUMO lifted 3 vehicles"
+    (answer.page.parent / "assessment.json").write_text(json.dumps({**written, "notes": [lifted]}))
+    assert lifted not in page
+    assert lifted in render_assessment(answer.page.parent)
+    (answer.page.parent / "assessment.json").write_text(json.dumps(written))
 
 
 @pytest.mark.long

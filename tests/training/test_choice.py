@@ -134,3 +134,22 @@ def test_each_batch_is_told_in_a_line() -> None:
         "choosing, 2 seeds: 2 of 2 left, too few for an interval of travel time (wanted: ±2 %)",
         "choosing, 4 seeds: 2 of 2 left, travel time known to ±0.0 % of people's (wanted: ±2 %)",
     ]
+
+
+def test_who_was_slower_comes_back_when_the_quicker_one_fails_or_no_car_could_drive_so() -> None:
+    for later in ({"status": "failed", "reason": "lost", "error": "EpisodeError"}, {"min_headway": 0.1}):
+        driven = list[int]()
+
+        def quicker(
+            generator: np.random.Generator, later: dict[str, Any] = later, driven: list[int] = driven
+        ) -> dict[str, Any]:
+            driven.append(1)
+            return shifted(-9.0, 3.0, **(later if len(driven) == LEAST_CHOOSING + 1 else {}))(generator)
+
+        drive = MadeUp(
+            {ACC: shifted(-2.0), PI: quicker, ACC_MORE: shifted(0.0, 20.0), PI_MORE: shifted(0, 9)}
+        )
+        found = choose(OPTIONS, drive, drive.budget, 0.001, quiet)
+        assert len(drive.seeds_of(ACC)) < len(drive.seeds_of(PEOPLE))  # for a while it was out
+        assert ACC in found.finalists
+        assert ACC not in found.set_aside

@@ -253,6 +253,8 @@ def assess(
     console.print(found.document["headline"], soft_wrap=True, markup=False)
     for each in found.judged:
         console.print(f"- {each.words}", soft_wrap=True, markup=False)
+    for note in found.document["notes"]:
+        aside.print(note, soft_wrap=True, markup=False)
     aside.print(f"report: {found.page}", soft_wrap=True, markup=False)
 
 

@@ -128,21 +128,24 @@ def beside_people(rows_by_driver: dict[str, list[dict[str, Any]]]) -> dict[str, 
 
 def harm_of(effect: Effect) -> str:
     """Return what CAVs are shown to make worse, travel time or flow; empty where nothing is shown."""
-    if effect.travel_time.low > 0:
-        return f"travel time is longer than people's alone: {signed(effect.travel_time, 1)} s"
-    if effect.flow.high < 0:
-        return f"flow is lower than people's alone: {signed(effect.flow)} veh/h"
-    return ""
+    return "; ".join(words for worse, words in _harms(effect) if worse)
+
+
+def _harms(effect: Effect) -> tuple[tuple[bool, str], ...]:
+    """Return whether travel time and flow are shown to be worse, each with the words for it."""
+    longer = f"travel time is longer than people's alone: {signed(effect.travel_time, 1)} s"
+    lower = f"flow is lower than people's alone: {signed(effect.flow)} veh/h"
+    return (effect.travel_time.low > 0, longer), (effect.flow.high < 0, lower)
 
 
 def reasons_against(effect: Effect) -> list[str]:
     """Return all reasons against recommending what was measured; none where there is nothing against it."""
-    harm, most = harm_of(effect), FLOW_LOST * effect.people_flow
+    most = FLOW_LOST * effect.people_flow
     # Written so that a NaN, of too few seeds, is a reason against.
     checks = (
         (effect.travel_time.count >= LEAST_JUDGED, f"{effect.travel_time.count} fresh seeds are too few"),
         (not effect.failed, f"{effect.failed} episodes failed"),
-        (not harm, harm),
+        *((not worse, words) for worse, words in _harms(effect)),
         (
             effect.travel_time.low > 0 or effect.travel_time.high < 0,
             f"travel time is not shown to be shorter: {signed(effect.travel_time, 1)} s",

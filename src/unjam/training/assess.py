@@ -32,7 +32,7 @@ from unjam.training.choice import (
     judge,
     least_episodes,
 )
-from unjam.training.evaluate import Evaluation, evaluate_each, save_evaluation
+from unjam.training.evaluate import Evaluation, evaluate_each, notes_on_teleports, save_evaluation
 from unjam.training.folder import make_new_folder
 from unjam.training.seeds import choosing_seeds, held_out_seeds
 from unjam.worlds.episode import can_drive
@@ -46,6 +46,8 @@ NOBODY = 1e-12
 """share of CAVs where people are alone: a network without any is not allowed"""
 CHOOSING = "choosing"
 """folder within the results: the rows of the seeds that chose"""
+WHO_IS_A_CAV = "cav_share", "cav_types", "cavs", "penetration"
+"""settings of a road that the shares stand for"""
 METRICS_OF_PEOPLE = (
     "travel_time",
     "throughput_veh_per_h",
@@ -99,7 +101,7 @@ def question(
     """
     if not file.endswith(".sumocfg"):
         raise wrong("scenario", file, "your own .sumocfg file")
-    for name in {"cav_share", "cav_types"} & set(changes or {}):
+    for name in [name for name in changes or {} if name in WHO_IS_A_CAV]:
         raise InputError(f"{name}: it is not allowed here: --shares says how many vehicles are CAVs")
     for share in shares:
         if not 0 <= share <= 1:
@@ -188,8 +190,11 @@ def assess(
     shown = driven(pictured, seeds, pictured=True).shown
 
     about = {"scenario": Path(asked.file).name, "reward": asked.road.reward, "manifest": manifest()}
-    document = {**about, **_document(asked, choice, rows, judged, chose, budget)}
     tried = {option.label: found for option, found in choice.rows.items()}
+    notes = notes_on_teleports(
+        {each.label: found for each, found in (rows if judged else choice.rows).items()}
+    )
+    document = {**about, **_document(asked, choice, rows, judged, chose, budget), "notes": notes}
     save_evaluation(folder / CHOOSING, Evaluation(tried, {}), about)
     save_evaluation(folder, Evaluation({each.label: found for each, found in rows.items()}, shown), about)
     write_whole(folder / ASSESSMENT_FILE, to_json(document, indent=1))

@@ -104,13 +104,20 @@ def choose(
     """
     rows: dict[Option, Rows] = {option: [] for option in (PEOPLE, *options)}
     set_aside: dict[Option, str] = {}
+    slower_than: dict[Option, Option] = {}
     while True:
         left = [option for option in options if option not in set_aside]
         _extend(rows, drive([PEOPLE, *left], choosing_seeds(BATCH, len(rows[PEOPLE]))))
         found = Choice(rows, set_aside, [])
         set_aside |= _failed(rows, left)
         if len(rows[PEOPLE]) >= LEAST_CHOOSING:
-            set_aside |= _hopeless(found, [option for option in left if option not in set_aside])
+            left = [option for option in left if option not in set_aside]
+            set_aside |= {option: harm for option in left if (harm := harm_of(found.effect(option)))}
+            for option in [each for each in slower_than if _is_better(each, slower_than[each], found)]:
+                del slower_than[option], set_aside[option]
+            slower = _slower(found, [option for option in left if option not in set_aside])
+            slower_than |= {option: rival for option, (rival, _) in slower.items()}
+            set_aside |= {option: words for option, (_, words) in slower.items()}
         left = [option for option in left if option not in set_aside]
         widths = [found.effect(option).width for option in left]
         said = f"choosing, {len(rows[PEOPLE])} seeds: {len(left)} of {len(options)} left"
@@ -164,18 +171,24 @@ def _failed(rows: dict[Option, Rows], options: Iterable[Option]) -> dict[Option,
     return {option: f"failed: {reason}" for option, reason in reasons.items() if reason is not None}
 
 
-def _hopeless(found: Choice, left: Sequence[Option]) -> dict[Option, str]:
-    """Return the options that are shown to harm, or to be slower than the best of their share, and why."""
-    reasons = {option: harm_of(found.effect(option)) for option in left}
+def _slower(found: Choice, left: Sequence[Option]) -> dict[Option, tuple[Option, str]]:
+    """Return which options are shown to be slower than the best of their share, that one, and the words."""
+    slower = dict[Option, tuple[Option, str]]()
     for option in left:
-        rivals = [each for each in left if each.share == option.share and not reasons[each]]
-        if reasons[option] or not rivals:
-            continue
-        best = min(rivals, key=lambda each: _order(found.effect(each)))
+        best = min(
+            (each for each in left if each.share == option.share),
+            key=lambda each: _order(found.effect(each)),
+        )
         more = paired_difference(found.rows[option], found.rows[best], "travel_time")
         if more.low > 0:
-            reasons[option] = f"slower than {best.driver}: travel time {signed(more, 1)} s"
-    return {option: reason for option, reason in reasons.items() if reason}
+            slower[option] = best, f"slower than {best.driver}: travel time {signed(more, 1)} s"
+    return slower
+
+
+def _is_better(option: Option, rival: Option, found: Choice) -> bool:
+    """Return whether who was quicker has turned out worse: it harms, failed, or no car could drive so."""
+    its, own = found.effect(rival), found.effect(option)
+    return bool(harm_of(its) or its.failed or _order(its)[:2] > _order(own)[:2])
 
 
 def _order(effect: Effect) -> tuple[bool, bool, float]:

@@ -237,7 +237,7 @@ def gain_of(config: RunConfig, rows: Rows) -> Estimate | None:
     return paired_difference(rows[TRAINED], rows[config.make_expert().describe()], "return")
 
 
-def _notes_on_teleports(rows: Rows) -> list[str]:
+def notes_on_teleports(rows: Rows) -> list[str]:
     """Return by drivers how often SUMO moved somebody on who stood: no road does that."""
     counts = {name: sum(row["teleports"] for row in found) for name, found in rows.items()}
     return [f"{name}: SUMO lifted {count} {LIFTED}" for name, count in counts.items() if count]
@@ -313,7 +313,7 @@ def drive(
         found = evaluate(made, drivers, seeds, pool, reward, progress)
         report, notes = None, notes_on_controllers(scenario_recipe(made), drivers, found.shown)
         notes += [f"{name} {WANTS_ACC}" for name, one in drivers.items() if _lacks_acc(one, made)]
-        notes += _notes_on_teleports(found.rows)
+        notes += notes_on_teleports(found.rows)
         ran = any(row["status"] != "failed" for rows in found.rows.values() for row in rows)
         if folder is not None and ran:
             about = {"scenario": Path(scenario).name, "reward": reward or made.reward, "manifest": manifest()}
