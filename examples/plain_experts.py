@@ -6,6 +6,7 @@ A controller needs the one that its residual is added to.
 import math
 from collections import deque
 from collections.abc import Sequence
+from itertools import pairwise
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
@@ -151,9 +152,11 @@ def cruise(p: Any, s: State, m: Any) -> float:
 
 def jam_ahead(p: Any, s: State, m: Any) -> float:
     told = (s.road_speeds if p.all_lanes else s.lane_speeds)[p.first : p.last + 1]
-    if not told or not s.to_merge > 0.0:
+    ahead = sum(told) / len(told) if told else math.inf
+    jammed = ahead < getattr(p, "jam", 0.75) * s.allowed_speed
+    if not told or not (jammed if math.isnan(s.to_merge) else s.to_merge > 0.0):
         return cruise(p, s, m)
-    wanted = sum(told) / len(told) + p.margin + p.margin_by_share * s.cav_share
+    wanted = ahead + p.margin + p.margin_by_share * s.cav_share
     cap = min(max(wanted, p.lowest), s.allowed_speed)
     return max((cap - s.speed) / p.time_constant, -p.slowing)
 
@@ -186,6 +189,15 @@ def constant(p: Any, s: State, m: Any) -> float:
     return p.acceleration
 
 
+def nearness(way: float) -> tuple[float, ...]:
+    """How near 0, 250, 500, 1,000 and 2,000 m before a ramp joins are: piecewise linear, in all one."""
+    places, found = (0.0, 250.0, 500.0, 1000.0, 2000.0), [1.0]
+    for low, high in pairwise(places):
+        share = clip((way - low) / (high - low), 0.0, 1.0)
+        found[-1:] = [found[-1] - share, share]
+    return tuple(found) if way > 0.0 else (0.0,) * len(places)
+
+
 def remember(m: SimpleNamespace, s: State, time_step: float) -> tuple[float, ...]:
     """Own speed, its spread and the gap over 10, 40 and 160 s, as networks that remember see them."""
     m.watched, m.means = getattr(m, "watched", 0) + 1, getattr(m, "means", [[0.0] * 3 for _ in range(3)])
@@ -204,7 +216,6 @@ EXPERTS |= {"ovm": ovm, "pacer": pacer, "jam-absorber": jam_absorber, "constant"
 EXPERTS |= {
     "cruise": cruise,
     "jam-ahead": jam_ahead,
-    "gap-maker": jam_ahead,  # but for the time headway that it asks of the car's own ACC
     "pi-from-gap": pi_from_gap,
     "adaptive-acc": adaptive_acc,
 }

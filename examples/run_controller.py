@@ -16,7 +16,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-from plain_experts import EXPERTS, State, clip, remember
+from plain_experts import EXPERTS, State, clip, nearness, remember
 from plain_safety import highest
 
 
@@ -27,6 +27,8 @@ class Driver:
         self.r, self.memory, self.age, self.held = recipe, SimpleNamespace(), 0, 0.0
         if recipe["kind"] == "named":
             self.p = SimpleNamespace(**recipe["parameters"])
+            if recipe["name"] not in EXPERTS:
+                raise ValueError(f"{recipe['name']} is not read here; read it with unjam")
             return
         if recipe["kind"] in ("filtered", "remembering"):
             self.inner = Driver(recipe["driver"], weights, f"{prefix}inner.")
@@ -43,6 +45,7 @@ class Driver:
             return EXPERTS[self.r["name"]](self.p, s, self.memory)
         if self.r["kind"] == "filtered":
             wanted = clip(self.inner.act(s), -self.r["action_limit"], self.r["action_limit"])
+            self.memory = self.inner.memory
             return min(wanted, highest(SimpleNamespace(**self.r["safety"]), s, self.r["time_step"]))
         if self.r["kind"] == "remembering":
             wanted, own = self.inner.act(s), remember(self.memory, s, self.r["time_step"])
@@ -65,6 +68,7 @@ class Driver:
             "expert_memory": getattr(self.memory, "features", ()),
             "loop_length": (s.loop_length / 250.0,),
             "allowed_speed": ((s.allowed_speed - s.speed) / 10.0,),
+            "approach": nearness(s.to_merge),
             "to_merge": (clip(s.to_merge / 1000.0, -1.0, 2.0),),
             "lane_speeds": tuple((speed - s.speed) / 10.0 for speed in s.lane_speeds),
             "road_speeds": tuple((speed - s.speed) / 10.0 for speed in s.road_speeds),
@@ -76,6 +80,8 @@ class Driver:
             "route_position": (s.route_position / 100.0,),
             "place": (math.cos(lap := 2.0 * math.pi * s.route_position / s.loop_length), math.sin(lap)),
         }
+        if unknown := [part for part in self.r["parts"] if part not in parts]:
+            raise ValueError(f"a network that sees {unknown[0]} is not read here; read it with unjam")
         units = np.array([number for part in self.r["parts"] for number in parts[part]])
         for weight, bias in self.layers[:-1]:
             units = np.maximum(units @ weight + bias, 0.0)

@@ -5,11 +5,13 @@
 
 A controller decides at times of its own, so SUMO's step must divide them: with its step of 1 s a controller
 of 0.1 s would drive on for ten times as long as its filter allows for. The vehicle's type should have the
-car-following model Krauss: SUMO then carries out each command exactly until it is unsafe. Whoever can reach
-that port can steer SUMO: do not open it to a network.
+car-following model Krauss: SUMO then carries out each command exactly until it is unsafe. The vehicle is told
+of its leader and its follower alone: a controller that looks at more, such as its place on a loop or speeds
+ahead, is refused. Whoever can reach that port can steer SUMO: do not open it to a network.
 """
 
 import sys
+from collections.abc import Iterator
 from typing import Any
 
 import traci
@@ -19,6 +21,11 @@ LARGEST_GAP = 100.0
 """[m]; stands for `nobody there`"""
 OBEDIENT = {"Accel": 20.0, "Decel": 20.0, "EmergencyDecel": 20.0, "ApparentDecel": 20.0, "MinGap": 0.5}
 """limits of SUMO's own that are wider than any command; only its check for a safe speed stays"""
+LOOK_FARTHER = (
+    "pacer jam-absorber cruise jam-ahead adaptive-acc loop_length route_position place approach to_merge"
+)
+LOOK_FARTHER += " allowed_speed lane_speeds road_speeds beside cav_share"
+"""experts and features that need what `perceive` does not tell, or an ACC of the car's own"""
 
 
 def perceive(vehicles: Any, name: str) -> State:
@@ -33,8 +40,19 @@ def perceive(vehicles: Any, name: str) -> State:
     return State(speed, *seen)
 
 
+def words(recipe: Any) -> Iterator[str]:
+    """All words of a driver's recipe, the names of its experts and features among them."""
+    if isinstance(recipe, str):
+        yield recipe
+    elif isinstance(recipe, dict | list):
+        for part in recipe.values() if isinstance(recipe, dict) else recipe:
+            yield from words(part)
+
+
 def drive(sumo: Any, controller: Controller, name: str) -> int:
     """Drive the vehicle from its entry to its exit; return the number of decisions."""
+    if more := sorted({*LOOK_FARTHER.split()} & {*words(controller.manifest["driver"])}):
+        raise SystemExit(f"the controller looks at more than leader and follower: {', '.join(more)}")
     step, decisions = sumo.simulation.getDeltaT(), 0
     vehicles, held = sumo.vehicle, round(controller.time_step / step)
     if abs(held * step - controller.time_step) > 1e-9:

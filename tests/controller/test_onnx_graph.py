@@ -46,6 +46,7 @@ onnxruntime = pytest.importorskip("onnxruntime")
 
 torch.set_num_threads(1)
 PARTS = PolicySettings().observe
+UNDRAWN = "human", "gap-maker"
 PARITY = 1e-6
 """[m/s2]"""
 
@@ -105,7 +106,7 @@ def test_driver_and_graph_agree_where_the_place_on_the_road_counts(simulation: S
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [name for name in EXPERTS if name != "human"])
+@pytest.mark.parametrize("name", [name for name in EXPERTS if name.partition(":")[0] not in UNDRAWN])
 def test_the_graph_of_every_expert_answers_what_the_expert_answers(name: str) -> None:
     same(named_driver(name, 0.1))
 
@@ -153,6 +154,11 @@ def test_a_driver_that_cannot_be_drawn_says_so_in_one_line(name: str, my_drivers
     with pytest.raises(InputError, match="is not allowed; allowed: drivers that run on tensors") as caught:
         onnx_graph(driver, 1.0)
     assert "\n" not in str(caught.value)
+
+
+def test_who_asks_for_time_headways_is_not_drawn_without_them() -> None:
+    with pytest.raises(InputError, match="gap-maker is not allowed: a graph asks for no time headways"):
+        onnx_graph(named_driver("gap-maker", 0.1), 1.0)
 
 
 def test_without_onnxscript_it_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:

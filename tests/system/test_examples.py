@@ -1,3 +1,4 @@
+import re
 import shutil
 import socket
 import subprocess
@@ -40,6 +41,8 @@ def test_the_examples_run(name: str, argument: int, words: str, tmp_path: Path) 
     assert words in ran.stdout
 
 
+UNREAD = "human", "gap-maker"
+"""the simulator itself, and who asks its car's own ACC for time headways"""
 WITHOUT_UNJAM = """
 import json, sys
 
@@ -59,21 +62,23 @@ assert not {"unjam", "torch", "safetensors"} & set(sys.modules)
 """
 
 
-def shipped(driver: Driver, path: Path, states: LocalState) -> Path:
+def shipped(driver: Driver, path: Path, states: LocalState, limit: float = 1.0) -> Path:
     about = {"time_step": 0.1, "action_limit": 1.5}
-    path.write_bytes(controller_bytes(driver, about, {SAMPLE: sample_bytes(driver, states, 1.0)}))
+    path.write_bytes(controller_bytes(driver, about, {SAMPLE: sample_bytes(driver, states, limit)}))
     return path
 
 
 @pytest.mark.long
 def test_the_plain_reader_drives_as_unjam_without_it(tmp_path: Path) -> None:
-    drivers = [named_driver(name, 0.1) for name in EXPERTS if name != "human"]
+    drivers = [named_driver(name, 0.1) for name in EXPERTS if name.partition(":")[0] not in UNREAD]
     drivers += [
         Pacer(varying=True, time_constant=1.0),
         residual(PISaturation(), hold=10),
         residual(Pacer(lap_time=40.0), hold=3, outputs=2),
         residual(residual(residual(FollowerStopper(), 1, hold=3), 2), 3, hold=5),
         residual(Remembering(PISaturation(), 0.1), hold=10),
+        residual(Filtered(PISaturation(), 1.0, SafetyFilter(), 0.1), hold=10),
+        residual(PISaturation(), hold=10, parts=("approach", "to_merge")),
         Filtered(residual(PISaturation(), hold=10), 1.0, SafetyFilter(gap_error=0.5), 0.1),
         Filtered(named_driver("constant:acceleration=1", 0.1), 1.5, SafetyFilter(time_headway=0.0), 0.1),
     ]
@@ -105,7 +110,19 @@ def test_the_plain_reader_compares_itself_with_the_recorded_sample(tmp_path: Pat
     assert compared(path).returncode != 0
 
 
+def test_where_no_map_tells_of_ramps_the_plain_reader_holds_back_for_jams_alone(tmp_path: Path) -> None:
+    states = perceived(700)._replace(to_merge=None)
+    driver = named_driver("jam-ahead", 1.0)
+    path = shipped(driver, tmp_path / "it.unjam", states, limit=1.5)
+    wanted = replay(driver, states, 1.5)
+    assert 0.1 < np.mean(wanted < 1.5) < 0.9
+    ran = compared(path)
+    assert (ran.returncode, ran.stderr) == (0, "")
+
+
 def test_the_plain_reader_says_what_it_cannot_read(tmp_path: Path) -> None:
+    asks = compared(shipped(named_driver("gap-maker", 0.1), tmp_path / "asks.unjam", perceived()))
+    assert asks.stderr.endswith("ValueError: gap-maker is not read here; read it with unjam\n")
     ran = compared(shipped(Mixed((PISaturation(), PISaturation())), tmp_path / "it.unjam", perceived()))
     assert ran.stderr.endswith(
         "ValueError: a driver of the kind mixed is not read here; read it with unjam\n"
@@ -136,13 +153,28 @@ def test_a_controller_is_not_driven_in_longer_steps_than_its_filter_allows_for()
     assert ran.stderr.endswith("it decides every 0.1 s: start SUMO with --step-length 0.1\n")
 
 
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("figure-eight-best", "pacer"),
+        ("on-ramp-tuned", "jam-ahead"),
+        ("best", "adaptive-acc|jam-ahead|pacer"),
+    ],
+)
+def test_a_controller_that_looks_farther_than_the_client_tells_is_refused(name: str, words: str) -> None:
+    command = [sys.executable, "-c", STEP_OF_A_SECOND, str(EXAMPLES), str(shipped_file(name))]
+    ran = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert ran.returncode == 1
+    assert re.search(f"looks at more than leader and follower: .*({words})|not read here", ran.stderr)
+
+
 def test_the_plain_reader_is_short() -> None:
     lines = [
         len((EXAMPLES / name).read_text().splitlines())
         for name in ("run_controller.py", "plain_experts.py", "plain_safety.py")
     ]
-    assert max(lines) < 215
-    assert lines[0] < 125
+    assert max(lines) < 225
+    assert lines[0] < 135
 
 
 def free_port() -> int:

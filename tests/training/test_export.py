@@ -124,6 +124,13 @@ def test_a_car_that_obeys_late_gets_no_file_whose_filter_does_not_know_it(tmp_pa
         export_controller(tmp_path / "late", tmp_path / "late.unjam")
 
 
+def test_no_graph_is_drawn_of_a_driver_that_looks_at_what_its_road_does_not_tell(tmp_path: Path) -> None:
+    file = tmp_path / "it.unjam"
+    with pytest.raises(InputError, match="filtered is not allowed: ring does not tell allowed_speed"):
+        export_controller("adaptive-acc", file, onnx=True, scenario="ring")
+    assert not file.exists()
+
+
 def test_a_controllers_file_keeps_its_road_and_origin(tmp_path: Path) -> None:
     shipped = manifest_of(shipped_file("figure-eight-tuned"))
     again = manifest_of(export_controller("unjam:figure-eight-tuned", tmp_path / "again.unjam").file)

@@ -90,6 +90,11 @@ def onnx_graph(driver: Driver, limit: float) -> bytes:
     state = [value for value in like_ones(driver.perceives, ones, ROWS) if value is not None]
     memory = (rows for _, rows in leaves(driver.initial_memory(ROWS)))
     arrays = (*state, *(torch.as_tensor(value, dtype=torch.float64) for value in memory))
+    asks = driver.time_headways(
+        LocalState(**dict(zip(driver.perceives, state, strict=True))), driver.initial_memory(ROWS)
+    )
+    if asks is not None:
+        raise InputError(f"onnx: {driver.describe()} is not allowed: a graph asks for no time headways")
     rows = torch.export.Dim("cavs")
     with torch.no_grad(), warnings.catch_warnings(), redirect_stdout(io.StringIO()):
         warnings.simplefilter("ignore")

@@ -129,12 +129,15 @@ def export_controller(source: str | Path, to: str | Path, onnx: bool = False, sc
         driver = Filtered(driver, asked, road.safety, road.decision_step)
     low, high = driver.limits or road.limits
     limit = max(-low, high)
-    graph: dict[str, bytes] = {}
+    states, graph = _perceived(road, driver), dict[str, bytes]()
     if onnx:
         from unjam.controller.onnx_graph import onnx_graph  # torch.onnx takes its time, and not all want it
 
+        missed = [name for name in driver.perceives if getattr(states, name) is None]
+        if missed:  # the graph takes all that a driver may look at
+            why = f"{road.title} does not tell {', '.join(missed)}; allowed: --scenario of a road that does"
+            raise InputError(f"onnx: {driver.describe()} is not allowed: {why}")
         graph = {GRAPH: onnx_graph(driver, limit)}
-    states = _perceived(road, driver)
     write_whole(to, controller_bytes(driver, about, {SAMPLE: sample_bytes(driver, states, limit), **graph}))
     verify_controller(to)
     beside = to.with_suffix(".onnx") if graph else None
