@@ -3,10 +3,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from unjam.controller import shipped_file
-from unjam.controller.domain import notes_on_controllers, other_road, outside_domain, road_of
+from unjam.controller import make_driver, shipped_file
+from unjam.controller.domain import notes_on_controllers, other_road, other_step, outside_domain, road_of
 from unjam.controller.file import read_controller
-from unjam.drivers import LocalState
+from unjam.drivers import IDM, LocalState
 from unjam.scenarios import Ring, Scenario, make_scenario, scenario_recipe
 
 TRAINED = {"scenario": scenario_recipe(Ring())}
@@ -50,3 +50,11 @@ def test_only_controllers_on_another_road_get_a_note() -> None:
     assert notes_on_controllers(road, names, {}) == [
         "unjam:ring-tuned was tuned on the ring, not on the figure-eight"
     ]
+
+
+def test_a_controller_that_counts_time_otherwise_gets_a_note() -> None:
+    loop = make_driver("unjam:best", 0.1).inner["loop"]
+    slow = scenario_recipe(make_scenario("ring-jammed", {"steps_per_decision": 10}))
+    assert other_step(loop, slow) == "counts time in steps of 0.1 s, and decisions here take 1 s"
+    assert other_step(loop, scenario_recipe(make_scenario("ring-jammed"))) == ""
+    assert other_step(IDM(), slow) == ""

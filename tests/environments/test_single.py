@@ -298,3 +298,17 @@ def test_a_reward_that_is_not_finite_is_refused_as_in_an_episode(tmp_path: Path)
     with pytest.raises(InputError, match=r"reward: step 0: term 'mean' is nan; allowed: finite"):
         environment.step(np.zeros(1, np.float32))
     environment.close()
+
+
+@pytest.mark.parametrize(
+    ("asked", "words"),
+    [
+        ({"observe": "local"}, "observe: 'local' is not allowed; allowed: a list of features"),
+        ({"observe": []}, r"observe: \[\] is not allowed; allowed: a list of features"),
+        ({"observe": ["locla"]}, "observe: 'locla' is not allowed; .* did you mean 'local'"),
+        ({"expert": "human"}, "expert: 'human' is not allowed; .* idm drives like people"),
+    ],
+)
+def test_what_cannot_be_observed_or_added_to_is_told(asked: dict[str, Any], words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        RoadEnv("ring", **asked)

@@ -122,6 +122,14 @@ def test_merging_changes_neither_side() -> None:
             {"world": "batch", "tasks": [{"scenario": "figure-eight"}, {"scenario": "merge"}]},
             "world: batch is not allowed; allowed: sumo, for figure-eight",
         ),
+        (
+            {"evaluation.patience": 5, "evaluation.every": 0},
+            "evaluation.patience: it is not allowed without validations",
+        ),
+        (
+            {"virtual.model": "road", "virtual.device": "cuda"},
+            "virtual.device: cuda is not allowed; allowed: cpu, for whole roads",
+        ),
     ],
 )
 def test_a_wrong_value_gets_one_line_that_begins_with_its_name(changes: dict[str, Any], words: str) -> None:

@@ -49,6 +49,11 @@ def test_rows_are_not_imagined_where_a_cav_is_told_more_than_they_know(tmp_path:
     check_possible(load_config(changes={**asked, "expert": "acc"}))
 
 
+def test_the_simulator_is_no_expert() -> None:
+    with pytest.raises(InputError, match=r"expert: 'human' is not allowed; .* idm drives like people"):
+        check_possible(load_config(changes={"expert": "human"}))
+
+
 def test_vehicles_on_a_network_of_ones_own_know_no_position(tmp_path: Path) -> None:
     file = straight(tmp_path, '<flow id="f" type="car" route="along" begin="0" end="60" period="3"/>')
     changes = {"scenario": str(file), "road.cav_types": ["car"], "policy.observe": ["route_position"]}

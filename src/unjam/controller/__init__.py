@@ -15,7 +15,7 @@ from unjam.drivers.driver import Driver
 from unjam.drivers.from_file import is_file_reference
 from unjam.drivers.registry import DRIVERS, named_driver
 from unjam.drivers.wrappers import Mixed
-from unjam.errors import wrong_name
+from unjam.errors import wrong, wrong_name
 from unjam.files import SHIPPED
 
 __all__ = [
@@ -25,6 +25,7 @@ __all__ = [
     "controller_bytes",
     "load_controller",
     "make_driver",
+    "make_expert",
     "shipped_file",
     "shipped_names",
 ]
@@ -59,6 +60,18 @@ def make_driver(text: str, time_step: float) -> Driver:
     if not named and (text.endswith(SUFFIX) or os.path.isdir(text)):
         return load_controller(text)
     return named_driver(text, time_step)
+
+
+def make_expert(text: str, time_step: float) -> Driver:
+    """Return the driver that `text` names, for something to be added to it; arguments as `make_driver`.
+
+    Raises:
+        InputError: there is no such driver, or the simulator itself drives it.
+    """
+    driver = make_driver(text, time_step)
+    if driver.native:
+        raise wrong("expert", text, "drivers that unjam asks; idm drives like people")
+    return driver
 
 
 def file_of(text: str) -> Path | None:

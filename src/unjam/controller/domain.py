@@ -2,7 +2,7 @@
 
 import json
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +11,7 @@ import numpy as np
 from unjam.controller import SHIPPED, shipped_file
 from unjam.controller.certificate import Domain
 from unjam.controller.file import CERTIFICATE, Controller, read_controller
+from unjam.drivers.driver import Driver
 from unjam.drivers.local_state import LocalState
 from unjam.errors import InputError
 from unjam.files import NONE_OF_OURS
@@ -37,7 +38,7 @@ def notes_on_controllers(road: dict[str, Any], names: Iterable[str], shown: dict
         controller = controller_of(name)
         if controller is None:
             continue
-        if other := other_road(controller.manifest, road):
+        if (other := other_road(controller.manifest, road)) or (other := other_step(controller.driver, road)):
             notes.append(f"{name} {other}")
         states = [each.states for each in shown[name].trajectories] if name in shown else []
         share = max((outside_domain(controller, each) for each in states), default=0.0)
@@ -73,6 +74,29 @@ def other_road(manifest: dict[str, Any], road: dict[str, Any]) -> str:
     words = [f"{name} {_short(here[name])} (there {_short(there[name])})" for name in differ[:SHOWN]]
     more = [f"{len(differ) - SHOWN} more"] if len(differ) > SHOWN else []
     return f"was {made} on another {road['kind']}: {', '.join(words + more)}" if differ else ""
+
+
+def other_step(driver: Driver, road: dict[str, Any]) -> str:
+    """Return that a driver counts time in steps which are not a road's decisions; empty where it does not.
+
+    `road` is the recipe of the scenario. Of drivers that are one driver it is enough that one has its step.
+    """
+    step = road["simulation_step"] * road["steps_per_decision"]
+    steps = set(_time_steps(driver.recipe()))
+    if not steps or any(abs(each - step) < 1e-9 for each in steps):
+        return ""
+    counted = ", ".join(f"{each:g}" for each in sorted(steps))
+    return f"counts time in steps of {counted} s, and decisions here take {step:g} s"
+
+
+def _time_steps(recipe: Any) -> Iterator[float]:
+    """Yield each time step in a driver's recipe [s]."""
+    if isinstance(recipe, dict):
+        for name, part in recipe.items():
+            yield from [part] if name == "time_step" else _time_steps(part)
+    elif isinstance(recipe, list):
+        for part in recipe:
+            yield from _time_steps(part)
 
 
 def road_of(manifest: dict[str, Any]) -> str:

@@ -25,7 +25,7 @@ from unjam.drivers.local_state import (
     lap_angle,
     like_ones,
 )
-from unjam.errors import InputError
+from unjam.errors import InputError, wrong_name
 from unjam.physics.arrays import Array, as_column, clip, join_columns, namespace, stack_columns
 
 RELATIVE_SPEED_SCALE = 5.0
@@ -199,6 +199,13 @@ def _known(name: str) -> str:
     if name not in FEATURES and not is_file_reference(name):
         raise ValueError(f"{', '.join(map(repr, FEATURES))} or 'path.py:name'")
     return name
+
+
+def check_features(names: Sequence[str]) -> None:
+    """Raise `InputError` where one of the names is not that of a feature, or of a function of one's own."""
+    for name in names:
+        if name not in FEATURES and not is_file_reference(name):
+            raise wrong_name("observe", name, [*FEATURES, "path.py:name"])
 
 
 FeatureName = Annotated[str, AfterValidator(_known)]

@@ -9,13 +9,13 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from unjam.controller import make_driver
+from unjam.controller import make_expert
 from unjam.drivers.car_following import Constant
 from unjam.drivers.command import Command, Limits
 from unjam.drivers.driver import Decision, Driver, Memory, Noise
 from unjam.drivers.local_state import LocalState
-from unjam.drivers.observation import FeatureName, Seen, asked_by, observation_size, observe
-from unjam.errors import EpisodeError, InputError, MissingPartError, UnjamError, wrong_name
+from unjam.drivers.observation import FeatureName, Seen, asked_by, check_features, observation_size, observe
+from unjam.errors import EpisodeError, InputError, MissingPartError, UnjamError, wrong, wrong_name
 from unjam.processes import has_display
 from unjam.scenarios import make_scenario
 from unjam.worlds.drive import Drive
@@ -110,9 +110,12 @@ class SteppedRoad:
         """Prepare a road as `RoadEnv` says; SUMO runs as `backend`, and is opened by the first `reset`."""
         self.scenario = make_scenario(scenario, changes)
         self._reward = make_reward(reward or self.scenario.reward)
-        driver = make_driver(expert, self.scenario.decision_step) if expert else Constant()
+        driver = make_expert(expert, self.scenario.decision_step) if expert else Constant()
         self._driver = Outside(driver, observe_parts, self.scenario.limits)
         check_can_drive(driver, self.scenario)
+        if isinstance(observe_parts, str) or not observe_parts:
+            raise wrong("observe", observe_parts, "a list of features, like ('local', 'expert_acceleration')")
+        check_features(observe_parts)
         check_can_see(self._driver.names, self.scenario, "observe")
         self._backend: Backend = backend
         self._simulation: Simulation | None = None

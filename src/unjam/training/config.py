@@ -122,6 +122,14 @@ class RunConfig(Agents):
         imagines = self.virtual.model if self.virtual.virtual_ratio > 0 else ""
         if self.policy.afterwards and imagines == "row":
             raise ValueError("policy.afterwards: true is not allowed; allowed: false where rows are imagined")
+        if self.evaluation.patience and not self.evaluation.every:
+            raise ValueError(
+                "evaluation.patience: it is not allowed without validations (evaluation.every 0)"
+            )
+        if imagines == "road" and self.virtual.device != "cpu":
+            raise ValueError(
+                f"virtual.device: {self.virtual.device} is not allowed; allowed: cpu, for whole roads"
+            )
         if self.policy.lasts and self.agent not in ("trpo", "ppo"):
             kind = self.policy.exploration
             raise ValueError(f"policy.exploration: {kind} is not allowed; allowed: anew, for {self.agent}")
@@ -185,10 +193,10 @@ class RunConfig(Agents):
 
     def make_expert(self) -> Driver:
         """Return the driver that the residual is added to."""
-        from unjam.controller import make_driver
+        from unjam.controller import make_expert
 
         step = self.make_scenario().decision_step
-        expert = Constant() if self.expert == "none" else make_driver(self.expert, step)
+        expert = Constant() if self.expert == "none" else make_expert(self.expert, step)
         return Remembering(expert, step) if self.policy.remember else expert
 
 
