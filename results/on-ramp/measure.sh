@@ -13,9 +13,9 @@ drive() {
 }
 for share in 05 10 20; do
     people="" # they are the same at every share
-    [ $share = 10 ] && people="-d human -d cruise -d adaptive-acc -d follower-stopper"
+    [ $share = 10 ] && people="-d human -d adaptive-acc -d follower-stopper"
     # shellcheck disable=SC2086
-    drive "share-$share" on-ramp --cav-share "0.$share" $people -d jam-ahead
+    drive "share-$share" on-ramp --cav-share "0.$share" $people -d cruise -d jam-ahead
 done
 # the same driver, untouched, elsewhere
 drive one-lane on-ramp-1 -d human -d jam-ahead
