@@ -113,6 +113,8 @@ class OpenTraffic(Traffic[OpenKind]):
         self._arrived = self._teleports = 0
         self._touched.clear()
         self._forget()
+        names, self._last_speeds = self._everybody()  # or the first step's changes of speed would be none
+        self._watched, self._of_cav = list(names), np.zeros(len(names), np.uint8)
         self._look()
 
     def _forget(self) -> None:
@@ -145,8 +147,11 @@ class OpenTraffic(Traffic[OpenKind]):
             commanded = self._legal(self._carried_out(asked, taken))
             self._simulate(commanded)
             still = [name for name in commanded if name in self._on_road]
-            for name, moved in zip(still, self._simulation.speeds(still), strict=True):
-                shield[name] = max(shield[name], (commanded[name] - moved) / step * obeys)
+            if obeys:
+                allowed = self._simulation.allowed_speeds(still)  # who has reached that is not overridden
+                moved = self._simulation.speeds(still)
+                for name, most, speed in zip(still, allowed, moved, strict=True):
+                    shield[name] = max(shield[name], (min(commanded[name], most) - speed) / step)
             if self.crashed:
                 break
         self.decisions += 1
@@ -155,7 +160,7 @@ class OpenTraffic(Traffic[OpenKind]):
             after = dict(zip(self._log.names, self.speeds, strict=True))
             changes = (after.get(name, speed) - speed for name, speed in zip(names, before, strict=True))
             wanted = [change / scenario.decision_step for change in changes]
-        less = [sum(values) / scenario.steps_per_decision for values in taken.values()]
+        less = [sum(values) / scenario.steps_per_decision * obeys for values in taken.values()]
         self._stays.applied.append([asked - part for asked, part in zip(wanted, less, strict=True)])
         self._stays.filtered.append([max(values, default=0.0) for values in taken.values()])
         self._stays.shield.append(list(shield.values()))
