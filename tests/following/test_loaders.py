@@ -170,6 +170,22 @@ def test_openacc_names_its_drivers(tmp_path: Path) -> None:
     ]
 
 
+def test_who_takes_over_is_another_driver_and_a_bad_gap_cuts_its_own_follower_alone(tmp_path: Path) -> None:
+    path = openacc(tmp_path / "platoon.csv")
+    lines = path.read_text().splitlines()
+    frame = pd.read_csv(path, skiprows=3)
+    frame.loc[MOMENTS // 2 :, "Driver2"] = "ACC"
+    frame.loc[MOMENTS // 2, "IVS2"] = np.nan
+    path.write_text("\n".join([*lines[:3], frame.to_csv(index=False)]))
+    found = read_pairs(path, reading=replace(SHORT, cut_bad=True))
+    behind = [(pair.driver, len(pair.speed)) for pair in found.pairs if pair.driver.startswith("Tesla")]
+    half = MOMENTS // 2
+    assert behind == [("Tesla(Model3)-ACC", MOMENTS - half), ("Tesla(Model3)-Human", half)]
+    third = [len(pair.speed) for pair in found.pairs if pair.driver == "BMW(X5)"]
+    assert sorted(third) == [MOMENTS - half - 1, half]
+    assert len(found.bad) == 1
+
+
 def spoilt(path: Path, row: int, column: str, value: object) -> Path:
     frame = pd.read_csv(table(path)).astype({column: object})
     frame.loc[row, column] = value

@@ -47,6 +47,17 @@ def test_another_vehicle_behind_is_another_drive(data: ActualData) -> None:
     assert [len(pair.speed) for pair in pairs] == [400, 501]
 
 
+def test_steps_within_a_decision_count_and_hard_braking_is_not_taken_for_another_vehicle() -> None:
+    # The follower brakes with 4 m/s2 in five steps of 0.2 s a decision, behind somebody who keeps 20 m/s.
+    changes = np.repeat([*[0.0] * 5, -4.0, -4.0, *[0.0] * 2, 4.0, 4.0, *[0.0] * 14], 5) * 0.2
+    every = 20.0 + np.concatenate([[0.0], np.cumsum(changes)])
+    gap = 20.0 + np.concatenate([[0.0], np.cumsum(20.0 - every[1:]) * 0.2])
+    own, none = np.full(26, 20.0), np.full(26, np.nan)
+    states = LocalState(own, own, own, every[::5], gap[::5], none, none)
+    assert [len(pair.speed) for pair in people_behind([states], 1.0, 5)] == [26]
+    assert people_behind([states], 1.0) == []
+
+
 def test_where_nobody_drove_behind_people_stay_as_they_are_known(data: ActualData) -> None:
     recording = data.recordings[0]
     alone = changed(recording, np.array(recording.states.loop_length, np.float64))

@@ -169,8 +169,7 @@ def _openacc(frame: pd.DataFrame, path: Path, reading: Reading) -> Recorded:
     numbers = sorted(int(name[3:]) for name in frame.columns if re.fullmatch(r"IVS\d+", name))
     if not numbers:
         raise InputError(f"{path.name}: no column IVS1: not an OpenACC file")
-    order = frame.attrs.get("vehicle_order", "").split(",")
-    vehicles = [name.strip() for name in order if name.strip()]
+    vehicles = [name.strip() for name in frame.attrs.get("vehicle_order", "").split(",") if name.strip()]
     parts = []
     for number in numbers:
         speeds = {f"Speed{number}": "leader_speed", f"Speed{number + 1}": "speed"}
@@ -180,7 +179,8 @@ def _openacc(frame: pd.DataFrame, path: Path, reading: Reading) -> Recorded:
         # Who takes over in mid-way is another driver.
         pair = f"{path.stem}-{number + 1}" + np.where(kind == "", "", "-" + kind)
         name = vehicles[number] if number < len(vehicles) else f"vehicle {number + 1}"
-        parts.append(part.assign(pair=pair, driver=name, kind=kind))
+        who = name + np.where(kind == "", "", "-" + kind) if len(set(kind)) > 1 else name
+        parts.append(part.assign(pair=pair, driver=who, kind=kind))
     return _trajectories(pd.concat(parts), path, reading)
 
 
@@ -284,20 +284,17 @@ def _trajectories(
     Raises:
         InputError: a row is bad, or nothing is left.
     """
-    bad, left_out = _bad_rows(frame), left_out or {}
+    (wrong, bad), left_out = _bad_rows(frame), left_out or {}
     if bad and not reading.cut_bad:
         more = f" ({len(bad)} bad rows)" if len(bad) > 1 else ""
         raise InputError(f"{path.name}: line {bad[0].line}: {bad[0].why}{more}; --cut-bad leaves them out")
-    good = frame.loc[~frame["line"].isin([row.line for row in bad])]
-    good = good.sort_values(by=["pair", "time"], kind="stable")
+    good = frame.loc[~wrong].sort_values(by=["pair", "time"], kind="stable")
     passed = good.groupby("pair", sort=False, dropna=False)["time"].diff()
     if passed.isna().all():
         raise InputError("time: no pair has two rows")
     step = round(float(passed.median()), 4)  # times in single precision are no better
     begins = ~((passed - step).abs() <= ROUGHNESS * step)
-    pairs: list[Pair] = []
-    parts: dict[str, int] = {}
-    short = 0
+    pairs, parts, short = list[Pair](), dict[str, int](), 0
     for _, rows in good.groupby(begins.cumsum(), sort=False):
         if (len(rows) - 1) * step < reading.shortest or len(rows) < 2:
             short += len(rows)
@@ -315,16 +312,19 @@ def _trajectories(
     return Recorded(pairs, len(frame) + sum(left_out.values()), bad, why)
 
 
-def _bad_rows(frame: pd.DataFrame) -> list[BadRow]:
+def _bad_rows(frame: pd.DataFrame) -> tuple[np.ndarray, list[BadRow]]:
+    """Return which rows cannot be used, shape (rows,), and their lines, each once."""
     found: dict[int, str] = {}
+    bad = np.zeros(len(frame), bool)
     for name in COLUMNS[1:]:
         values = frame[name].to_numpy(np.float64)
         low, high = ALLOWED.get(name, (-np.inf, np.inf))
         wrong = ~np.isfinite(values) | (values < low) | (values > high)
         allowed = f"{low:g} to {high:g}" if name in ALLOWED else "finite"
+        bad |= wrong
         for line, value in zip(frame["line"][wrong], values[wrong], strict=True):
             found.setdefault(int(line), f"{name}: {value:g} is not allowed; allowed: {allowed}")
     twice = frame.assign(time=frame["time"].round(6)).duplicated(["pair", "time"])
     for line, time in zip(frame["line"][twice], frame["time"][twice], strict=True):
         found.setdefault(int(line), f"time: {time:g} is there twice in its pair")
-    return [BadRow(line, found[line]) for line in sorted(found)]
+    return bad | twice.to_numpy(), [BadRow(line, found[line]) for line in sorted(found)]

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from unjam.drivers.local_state import LARGEST_GAP, LocalState
 from unjam.errors import wrong
 from unjam.physics.arrays import Floats
-from unjam.physics.kinematics import next_position
+from unjam.physics.kinematics import distance_driven, next_position
 
 SPLITS = ("train", "validation", "test")
 DRIVEN = ("speed", "leader_speed", "gap", "leader_path")
@@ -194,16 +194,21 @@ def of_split(pairs: Sequence[Pair], *names: str) -> list[Pair]:
     return [pair for pair in pairs if pair.split in names]
 
 
-def people_behind(recordings: Iterable[LocalState], step: float) -> list[Pair]:
+def people_behind(recordings: Iterable[LocalState], step: float, steps: int = 1) -> list[Pair]:
     """Return the drives of those who followed a CAV, each of the same vehicle throughout.
 
-    `recordings` are what CAVs perceived, each of shape (T,), a decision every `step` [s].
+    `recordings` are what CAVs perceived, each of shape (T,), a decision every `step` [s], of so many `steps`
+    of the simulation.
     """
     pairs = []
     for number, states in enumerate(recordings):
         largest = np.where(np.isnan(states.loop_length), LARGEST_GAP, states.loop_length)
         nobody = states.follower_gap >= largest
-        expected = states.follower_gap[:-1] + (states.speed[1:] - states.follower_speed[1:]) * step
+        ahead, behind = (
+            distance_driven(speed[:-1], speed[1:], step / steps, steps)
+            for speed in (states.speed, states.follower_speed)
+        )
+        expected = states.follower_gap[:-1] + ahead - behind
         other = np.abs(states.follower_gap[1:] - expected) > LONGEST_JUMP
         ends = np.flatnonzero(np.r_[True, other | nobody[1:] | nobody[:-1], True])
         for first, last in pairwise(ends):
