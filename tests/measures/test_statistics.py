@@ -337,3 +337,9 @@ def test_probabilities_of_improvement_cover(shift: float, trainings: int) -> Non
     )
     true = float(np.mean(generator.normal(shift, np.sqrt(3.0), 400_000) > 0))
     assert coverage([probability_of_improvement(table) for table in tables], true) >= 0.92
+
+
+def test_trimming_leaves_as_many_as_an_interval_needs() -> None:
+    found = estimate([100.0, 107.0, 113.0, 120.0], trim=0.25)
+    assert found == estimate([100.0, 107.0, 113.0, 120.0])
+    assert estimate([100.0, 107.0, 113.0, 120.0, 200.0], trim=0.25).mean == pytest.approx(340.0 / 3)

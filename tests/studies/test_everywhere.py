@@ -117,10 +117,14 @@ def test_only_what_is_not_known_is_driven_and_the_best_may_be_another(
     )
     files["unjam:ring-tuned"] = "another"
     go_on(("pi", "unjam:ring-tuned"))
-    assert asked[4:] == [[PEOPLE, "unjam:ring-tuned"], ["unjam:ring-tuned"]]
+    assert asked[4:] == [[PEOPLE, "pi", "unjam:ring-tuned"], ["unjam:ring-tuned"]], "the best may be another"
     del road["drove"][PEOPLE]  # as files of before have it
     go_on(("pi", "unjam:ring-tuned"))
     assert asked[6:] == [[PEOPLE]]
+    monkeypatch.setattr(everywhere, "JUDGED", {"PI": "pi:window=9"})
+    speeds["pi:window=9"] = 4.1
+    go_on(("pi", "unjam:ring-tuned"))
+    assert asked[7:] == [["pi:window=9"]], "other parameters are another law"
 
 
 def test_a_shipped_controller_is_known_by_its_file_and_others_by_their_name() -> None:

@@ -6,7 +6,8 @@ import pytest
 from unjam.errors import EpisodeError
 from unjam.scenarios import Ring
 from unjam.studies import study
-from unjam.studies.study import Part, about_study, judged, measure_parts, read_part
+from unjam.studies.parts import SHIPPED_THEN, Part, measure_parts, read_part
+from unjam.studies.study import about_study, judged
 from unjam.training.evaluate import Evaluation
 from unjam.worlds.workers import Workers
 
@@ -17,6 +18,10 @@ def square(number: int) -> dict[str, int]:
 
 def refuse(number: int) -> None:
     raise AssertionError(f"{number} is there already")
+
+
+def named(drivers: dict[str, str]) -> dict[str, str]:
+    return drivers
 
 
 def parts(count: int) -> dict[str, Part]:
@@ -35,6 +40,25 @@ def test_what_is_there_is_not_measured_again(tmp_path: Path) -> None:
     again: dict[str, Part] = {name: (refuse, (number,)) for number, name in enumerate(parts(2))}
     measure_parts(tmp_path, {**again, **parts(3)} | again, 1)
     assert read_part(tmp_path, "of-2") == {"square": 4}
+
+
+def test_a_part_is_measured_again_where_a_shipped_controller_in_it_is_another_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told: list[str] = []
+    given: dict[str, Part] = {
+        "shipped": (named, ({"ours": "unjam:ring-tuned"},)),
+        "other": (named, ({"ours": "pi"},)),
+    }
+    for _ in range(2):
+        measure_parts(tmp_path, given, 1, told.append)
+    assert told == ["shipped", "other"]
+    monkeypatch.setattr("unjam.studies.parts.file_of", lambda driver: "another")
+    measure_parts(tmp_path, given, 1, told.append)
+    assert told == ["shipped", "other", "shipped"]
+    (tmp_path / SHIPPED_THEN).unlink()  # as folders of before have it
+    measure_parts(tmp_path, given, 1, told.append)
+    assert len(told) == 3
 
 
 def test_a_part_that_fails_leaves_the_others(tmp_path: Path) -> None:

@@ -56,7 +56,8 @@ def estimate(
     finite = np.array([value for value in values if np.isfinite(value)], float)
     if not len(finite):
         return Estimate(nan, nan, nan, 0)
-    cut, ordered = int(trim * len(finite)), np.sort(finite)
+    most = max(0, (len(finite) - LEAST) // 2)  # at least so many are kept
+    cut, ordered = min(int(trim * len(finite)), most), np.sort(finite)
     kept = ordered[cut : len(finite) - cut] if cut else finite
     found = Estimate(float(kept.mean()), nan, nan, len(finite), float(ordered[0]), float(ordered[-1]))
     if len(finite) < LEAST or (kept.min() == kept.max() and found.smallest < found.largest):

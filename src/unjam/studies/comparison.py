@@ -32,6 +32,7 @@ from unjam.measures.statistics import (
 from unjam.measures.table import cell_of, unbroken
 from unjam.reports.figures import INK, LINES, STYLE, new_figure, space_time
 from unjam.reports.results import Shown, read_results, validations_of
+from unjam.studies.parts import read_part
 from unjam.studies.references import best_expert
 from unjam.studies.study import (
     PAPERS_ROADS,
@@ -43,7 +44,6 @@ from unjam.studies.study import (
     Table,
     TrainedRun,
     planned,
-    read_part,
 )
 from unjam.training.config import load_config
 

@@ -25,7 +25,8 @@ from unjam.physics.arrays import Floats
 from unjam.scenarios.figure_eight import FigureEight
 from unjam.scenarios.ring import Ring
 from unjam.scenarios.scenario import Scenario
-from unjam.studies.study import Study, StudyFolder, judged, planned, read_part
+from unjam.studies.parts import read_part
+from unjam.studies.study import Study, StudyFolder, judged, planned
 from unjam.training.family import GROWN
 from unjam.training.presets import BEST
 from unjam.worlds.workers import Workers

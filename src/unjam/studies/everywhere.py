@@ -7,7 +7,6 @@ decide than those that judge.
 import json
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +14,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from unjam.controller import SHIPPED, make_driver, shipped_file
+from unjam.controller import SHIPPED, make_driver
 from unjam.files import to_json, write_whole
 from unjam.measures.drivable import DRIVABLE, drivable_in_all
 from unjam.measures.gain import MOST, WORST, Rows, gain, gain_by_seed, nothing_to_gain, worth
@@ -25,6 +24,7 @@ from unjam.measures.table import PEOPLE
 from unjam.physics.arrays import Floats
 from unjam.reports.figures import INK, new_figure
 from unjam.scenarios.scenario import Scenario
+from unjam.studies.parts import file_of
 from unjam.studies.study import Study, StudyFolder
 from unjam.training.family import FAMILY, KINDS
 from unjam.training.seeds import held_out_seeds, tuning_seeds
@@ -132,7 +132,8 @@ def _go_on(scenario: Scenario, tuned: Sequence[str], found: dict[str, Any], run:
     """
     new = [driver for driver in tuned if found["tried"].get(driver) != file_of(driver)]
     if new:
-        candidates = dict.fromkeys((PEOPLE, found["best"], *new))
+        others = tuned if found["best"] in new else (found["best"], *new)
+        candidates = dict.fromkeys((PEOPLE, *others))
         rows = driven(scenario, {driver: driver for driver in candidates}, CHOOSING, run)
         found["best"] = best_of(rows)
         found["tried"] |= {driver: file_of(driver) for driver in new}
@@ -140,17 +141,16 @@ def _go_on(scenario: Scenario, tuned: Sequence[str], found: dict[str, Any], run:
     missing = {
         label: driver
         for label, driver in asked.items()
-        if label not in found["rows"] or found["drove"].get(label) != file_of(driver)
+        if label not in found["rows"] or found["drove"].get(label) != named(driver)
     }
     if missing:
         found["rows"] |= driven(scenario, missing, JUDGING, run)
-        found["drove"] |= {label: file_of(driver) for label, driver in missing.items()}
+        found["drove"] |= {label: named(driver) for label, driver in missing.items()}
 
 
-def file_of(driver: str) -> str:
-    """Return which file a shipped controller is; nothing for others, whose name says what they are."""
-    name = driver.removeprefix(SHIPPED)
-    return "" if name == driver else sha256(shipped_file(name).read_bytes()).hexdigest()[:12]
+def named(driver: str) -> str:
+    """Return what tells a driver from others under its label: its file, or its name with all parameters."""
+    return file_of(driver) or driver
 
 
 def best_of(rows: dict[str, Rows]) -> str:

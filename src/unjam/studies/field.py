@@ -40,7 +40,8 @@ from unjam.following.open_loop import (
 from unjam.following.pairs import Pair, Stretches, moments_of, of_split, split_by_trajectory, stretches_of
 from unjam.physics.idm import PAPER_IDM, parameter_rows
 from unjam.reports.figures import INK, LINES, STYLE, new_figure
-from unjam.studies.study import OnProgress, Part, Table, about_study, measure_parts
+from unjam.studies.parts import OnProgress, Part, measure_parts
+from unjam.studies.study import Table, about_study
 
 LIMITS: Bounds = (-4.0, 2.0)
 SEEDS = {"ngsim": 3, "astazero": 1}

@@ -29,7 +29,8 @@ from unjam.following.pairs import SPLITS, Floats, Moments, moments_of, of_split,
 from unjam.physics.arrays import at_least
 from unjam.physics.idm import PAPER_IDM, idm_acceleration
 from unjam.reports.figures import INK, LINES, STYLE, new_figure
-from unjam.studies.study import OnProgress, Part, Study, Table, about_study, measure_parts
+from unjam.studies.parts import OnProgress, Part, measure_parts
+from unjam.studies.study import Study, Table, about_study
 
 Split = Literal["trajectories", "rows", "released"]
 """How test rows are kept from training: `trajectories`: none of their trajectory is in it. `rows`: rows are

@@ -15,7 +15,8 @@ import pandas as pd
 from unjam.measures.statistics import over_trainings
 from unjam.measures.table import cell_of
 from unjam.studies.comparison import comparison_of
-from unjam.studies.study import VARIANTS, PlannedRun, Study, read_part
+from unjam.studies.parts import read_part
+from unjam.studies.study import VARIANTS, PlannedRun, Study
 from unjam.worlds.record import Floats
 
 LOOKS = (190_000, 380_000, 750_000, 1_500_000, 3_000_000, 6_000_000)

@@ -13,15 +13,9 @@ from unjam.manifest import manifest
 from unjam.reports.results import EVALUATION_FILE
 from unjam.scenarios import SCENARIOS
 from unjam.studies import STUDIES, TOGETHER
+from unjam.studies.parts import OnProgress
 from unjam.studies.references import drive_references
-from unjam.studies.study import (
-    ROADS,
-    OnProgress,
-    PlannedRun,
-    Study,
-    StudyFolder,
-    about_study,
-)
+from unjam.studies.study import ROADS, PlannedRun, Study, StudyFolder, about_study
 from unjam.training.executors import Executor, run_all, training_command
 from unjam.training.folder import read_config
 

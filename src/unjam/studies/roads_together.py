@@ -29,7 +29,8 @@ from unjam.studies.everywhere import (
     gains_of,
     kept_of,
 )
-from unjam.studies.study import VARIANTS, Part, PlannedRun, Study, StudyFolder, measure_parts
+from unjam.studies.parts import Part, measure_parts
+from unjam.studies.study import VARIANTS, PlannedRun, Study, StudyFolder
 from unjam.training.family import (
     GROWING,
     GROWN,

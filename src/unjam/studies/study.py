@@ -1,9 +1,7 @@
 """What a study is, what it is made of - trainings, drives, measured parts - and where all that lies."""
 
 import json
-import multiprocessing
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import product
@@ -46,10 +44,6 @@ LAST_SHARE = 0.1
 
 Table = list[dict[str, Any]]
 """rows, of results or of metrics of episodes"""
-Part = tuple[Callable[..., Any], tuple[Any, ...]]
-"""a function of a module, and its arguments; it answers what JSON can hold"""
-OnProgress = Callable[[str], None]
-"""told the name of what is there, when it is there"""
 
 
 def planned(roads: Iterable[str], variants: Sequence[str], seeds: int) -> "list[PlannedRun]":
@@ -70,35 +64,6 @@ def about_study(folder: Path, **facts: Any) -> dict[str, Any]:
         about["went_on"] = [*about.get("went_on", []), went_on]
     write_whole(path, to_json(about, indent=1))
     return about
-
-
-def measure_parts(
-    folder: Path, parts: dict[str, Part], workers: int, on_progress: OnProgress = lambda name: None
-) -> list[Any]:
-    """Return the answers of all parts; those without a `folder/NAME.json` are measured, and get one."""
-
-    def keep(name: str, answer: Any) -> None:
-        write_whole(folder / f"{name}.json", to_json(answer))
-        on_progress(name)
-
-    make_folder(folder)
-    missing = {name: part for name, part in parts.items() if not (folder / f"{name}.json").is_file()}
-    if workers == 1 or len(missing) < 2:
-        for name, (function, arguments) in missing.items():
-            keep(name, function(*arguments))
-    else:
-        # Fresh processes: a forked one would inherit threads of torch that are not there.
-        context = multiprocessing.get_context("spawn")
-        with ProcessPoolExecutor(workers, mp_context=context) as pool:
-            running = {pool.submit(function, *given): name for name, (function, given) in missing.items()}
-            for done in as_completed(running):
-                keep(running[done], done.result())
-    return [read_part(folder, name) for name in parts]
-
-
-def read_part(folder: Path, name: str) -> Any:
-    """Return what a part has answered."""
-    return json.loads((folder / f"{name}.json").read_text(encoding="utf-8"))
 
 
 def judged(
