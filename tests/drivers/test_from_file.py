@@ -7,7 +7,7 @@ from tests.conftest import random_network
 from unjam import check_driver
 from unjam.controller import make_driver
 from unjam.drivers.check import random_state
-from unjam.drivers.from_file import FileDriver
+from unjam.drivers.from_file import FileDriver, FileReference
 from unjam.drivers.registry import driver_from_recipe, recipe_of
 from unjam.drivers.residual import ResidualDriver
 from unjam.errors import InputError
@@ -104,3 +104,13 @@ def test_a_list_of_accelerations_will_do(tmp_path: Path) -> None:
     driver = ResidualDriver(make_driver(f"{tmp_path}/lists.py:d", 0.1), random_network(scale=0.0), 1.0)
     state = random_state(np.random.default_rng(0), 3)
     np.testing.assert_allclose(driver.act(state, driver.initial_memory(3))[0], 0.25)
+
+
+def test_what_a_file_prints_as_it_is_loaded_is_no_answer_of_ours(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "loud.py"
+    path.write_text("print('loading')\n\ndef gentle(state):\n    return 0.0 * state.speed\n")
+    FileReference(path, "gentle").load()
+    said = capsys.readouterr()
+    assert (said.out, said.err) == ("", "loading\n")

@@ -138,3 +138,9 @@ def test_a_passage_without_a_speed_counts_in_the_flow_alone() -> None:
     assert list(flows) == [120.0, 60.0]
     assert speeds[0] == 12.0
     assert isnan(speeds[1])
+
+
+def test_where_no_speed_was_measured_its_error_is_not_known() -> None:
+    found = agreement([Measurement("a", 0, 0, 60, 600, nan)], np.array([600.0]), np.array([20.0]))
+    assert isnan(found.speed_rmse)
+    assert found.score == 0.0

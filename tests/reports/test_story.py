@@ -108,6 +108,14 @@ def test_a_network_without_an_expert_is_told_by_its_return() -> None:
     assert lead == "On 2 held-out seeds the trained controller earns 15 an episode."
 
 
+def test_seeds_are_those_on_which_both_ran() -> None:
+    people = rows_of([1.0] * 3, travel_time=100.0)
+    result = driven(
+        human=people, pi=[*rows_of([2.0, 2.0], travel_time=90.0), {**failed_rows(1)[0], "seed": 2}]
+    )
+    assert lead_of(result).startswith("Beside people alone on ring, 2 episodes with the same seeds paired: ")
+
+
 def test_drives_are_told_by_speed_and_share_of_the_limit() -> None:
     lead = lead_of(driven(pi=rows_of([1.0, 2.0], mean_speed=4.0, speed_limit_ratio_steady=0.83)))
     assert "pi on ring, 2 episodes" in lead

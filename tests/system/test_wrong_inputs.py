@@ -64,6 +64,26 @@ WRONG: dict[str, tuple[str, list[str]]] = {
     "driver file that is missing": ("is not a file", ["drive ring --driver none.py:gentle"]),
     "driver that is not in the file": ("has no 'ghost'", ["drive ring --driver mine.py:ghost"]),
     "driver file with an error in it": ("SyntaxError", ["drive ring --driver torn.py:gentle"]),
+    "driver file that ends the program": (
+        "SystemExit when loading it",
+        ["drive ring --driver ends.py:gentle"],
+    ),
+    "reward file that ends the program": (
+        "SystemExit when loading it",
+        ["drive ring --driver pi --reward ends.py:gentle"],
+    ),
+    "an episode without end": ("horizon: 1000000000", ["drive ring --driver pi --set horizon=1000000000"]),
+    "two drivers in one window": ("driver: 'pi, acc'", ["watch ring -d pi -d acc --video film.gif"]),
+    "report over another file": ("allowed: a file that ends in .html", ["report full --out mine.py"]),
+    "certificate over another file": (
+        "allowed: a file that ends in .html",
+        ["certify torn.unjam --out mine.py"],
+    ),
+    "emissions of an own network": (
+        "emission_class: it is not allowed",
+        ["drive good.sumocfg --driver pi --cav-share 0.5 --set emission_class=zero"],
+    ),
+    "tuning a controller": ("expert: 'unjam:ring-best' is not", ["tune ring --expert unjam:ring-best"]),
     "driver that cannot be made": ("no battery", ["drive ring --driver mine.py:Raises"]),
     "driver that answers NaN": ("step 0: acceleration", ["drive ring --driver mine.py:broken"]),
     "driver that answers too many": ("one for each CAV", ["drive ring --driver mine.py:short"]),
@@ -179,6 +199,7 @@ WRONG: dict[str, tuple[str, list[str]]] = {
 @pytest.fixture
 def files(tmp_path: Path, my_drivers: Path) -> None:
     (tmp_path / "torn.py").write_text("def gentle(state:\n")
+    (tmp_path / "ends.py").write_text("def gentle(state):\n    return 0.0\n\nraise SystemExit(0)\n")
     (tmp_path / "torn.unjam").write_bytes(b"PK\x03\x04 not really")
     (tmp_path / "torn.toml").write_text("scenario = ring\n")
     networks = {"good": '<net version="1.20"/>', "old": "<net/>", "torn": '<net version="1.20"><edge'}

@@ -18,6 +18,7 @@ from unjam.training.folder import (
     MANIFEST,
     belonging,
     check_belongs,
+    check_files_of,
     last_state,
     note_lineage,
     save_checkpoint,
@@ -87,8 +88,11 @@ def test_what_a_training_is_made_of_cannot_change(
     config, run = make(tmp_path), tmp_path / "run"
     with_checkpoint(run, config)
     assert last_state(run, {run}, belonging(config)) is not None
+    check_files_of(run, config)
     (run / "progress.jsonl").write_text('{"iteration": 1}\n{"iteration": 2}\n')
     (tmp_path / file).write_text((tmp_path / file).read_text() + " ")
+    with pytest.raises(InputError, match=r"evaluate: .* has changed since the checkpoint"):
+        check_files_of(run, config)
     assert "has changed since the checkpoint" in refused(run, config)
 
 

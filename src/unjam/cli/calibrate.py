@@ -81,7 +81,8 @@ def calibrate(
     for name, columns in found.estimates().items():
         label, unit, digits = SHOWN[name]
         cells = (
-            f"{one.mean:.{digits}f} [{one.low:.{digits}f}, {one.high:.{digits}f}]" for one in columns.values()
+            f"{one.mean:.{digits}f} [{one.low:.{digits}f}, {one.high:.{digits}f}]" if one.count else "–"
+            for one in columns.values()
         )
         table.add_row(label, unit, *cells)
     console.print(table)

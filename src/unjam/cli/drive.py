@@ -117,8 +117,9 @@ def drive(
 def watch(
     *,
     scenario: ScenarioArgument,
-    driver: Annotated[
-        str, typer.Option("--driver", "-d", help="As in drive; a run folder shows its trained controller.")
+    drivers: Annotated[
+        list[str],
+        typer.Option("--driver", "-d", help="One, as in drive; a run folder shows its trained controller."),
     ],
     seed: SeedOption = 0,
     video: Annotated[
@@ -146,6 +147,9 @@ def watch(
     from unjam.training.evaluate import raise_failure
     from unjam.worlds.workers import EpisodeTask, Workers
 
+    if len(drivers) > 1:
+        raise wrong("driver", ", ".join(drivers), "one")
+    (driver,) = drivers
     road = make_scenario(scenario, changes | assignments(settings))
     driven = make_driver(driver, road.decision_step)
     for note in notes_on_controllers(scenario_recipe(road), [driver], {}):

@@ -92,10 +92,12 @@ def _draw(scenario: Any, name: str, path: Path) -> None:
 
 def _common_facts(scenario: Any) -> list[tuple[str, str]]:
     from unjam.drivers.observation import FEATURES
+    from unjam.scenarios.own_network import OwnNetwork
 
     warmup, seconds = scenario.warmup, scenario.warmup * scenario.simulation_step
+    ends = "a collision of a CAV" if isinstance(scenario, OwnNetwork) else "a collision"
     return [
-        ("episode", f"{scenario.horizon:,} decisions of {scenario.decision_step:g} s; a collision ends it"),
+        ("episode", f"{scenario.horizon:,} decisions of {scenario.decision_step:g} s; {ends} ends it"),
         ("warm-up", f"{warmup} all-human steps ({seconds:g} s), before control, not counted"),
         ("people", scenario.people_in_words),
         ("action", f"acceleration within ±{scenario.action_limit:g} m/s2, {scenario.actuation}"),

@@ -3,13 +3,14 @@
 from contextlib import nullcontext
 from dataclasses import asdict, replace
 from pathlib import Path
+from shlex import quote
 from typing import Annotated
 
 import typer
 
 from unjam.cli.options import DEFAULT_WORKERS, HumansOption, JsonOption, WorkersOption, scenario_changes
 from unjam.cli.output import aside, console, counting_steps, new_table, print_json, print_metrics
-from unjam.errors import InputError
+from unjam.errors import InputError, wrong
 from unjam.processes import go_on_limited, owned
 
 
@@ -41,17 +42,20 @@ def evaluate(
     from unjam.drivers.registry import DRIVERS
     from unjam.reports.results import read_results
     from unjam.training.evaluate import gain_of, judge, steps_to_judge
-    from unjam.training.folder import new_and_owned, read_config
+    from unjam.training.folder import check_files_of, new_and_owned, read_config
     from unjam.worlds.workers import Workers
 
     if humans is not None and out is None:
         raise InputError("humans: it is not allowed without --out: the run keeps its own evaluation")
     config = read_config(run)
+    check_files_of(run, config)
     config = replace(config, road={**config.road, **scenario_changes(humans=humans)})
     if config.tasks:
         raise InputError(f"run: {str(run)!r} is of several roads; allowed: the folder of one of them")
     if not (run / "controller.unjam").is_file():
-        raise InputError(f"run: {str(run)!r} has no controller yet; go on with: unjam train --resume {run}")
+        raise InputError(
+            f"run: {str(run)!r} has no controller yet; go on with: unjam train --resume {quote(str(run))}"
+        )
     from unjam.reports.html import write_report  # draws: so late that what is wrong is told at once
     from unjam.reports.story import lead_of
 
@@ -143,6 +147,7 @@ def report(
         if not folder.is_dir():
             raise InputError(f"report: {str(folder)!r} is not a folder; allowed: one with results")
     target = out or (folders[0] / "report.html" if len(folders) == 1 else Path("comparison.html"))
+    _check_page(target)
     go_on_limited(f"report: {', '.join(map(str, folders))}", target.absolute().parent, Path(get_cachedir()))
     from unjam.reports.html import write_report
 
@@ -152,6 +157,12 @@ def report(
         print_json({"report": str(written), "folders": [str(folder) for folder in folders]})
     else:
         console.print(str(written))
+
+
+def _check_page(path: Path) -> None:
+    """Raise `InputError` unless a path is that of a page: nothing else is written over."""
+    if path.suffix.lower() not in (".html", ".htm"):
+        raise wrong("out", str(path), "a file that ends in .html")
 
 
 def export(
@@ -216,6 +227,8 @@ def certify(
     from unjam.drivers.wrappers import Filtered
     from unjam.files import check_folder
 
+    if out is not None:
+        _check_page(out)
     controller, file = read_controller(file), controller_file(file)
     target = out or file.with_suffix(".html")
     check_folder(target)

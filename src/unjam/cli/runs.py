@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from unjam.cli.options import JsonOption
-from unjam.cli.output import aside, console, new_table, print_json
+from unjam.cli.output import aside, console, new_table, print_json, say_next
 from unjam.errors import InputError
 
 UnderOption = Annotated[Path, typer.Option("--under", help="The folder that holds the runs.")]
@@ -98,8 +98,7 @@ def compare(names: NamesArgument, under: UnderOption = RUNS, json: JsonOption = 
     console.print(table)
     if not settings:
         console.print("their settings are the same")
-    folders = " ".join(str(run.folder) for run in found)
-    aside.print(f"on one page: unjam report {folders} --out compared.html", soft_wrap=True)
+    say_next("on one page", "report", *(run.folder for run in found), "--out", "compared.html")
 
 
 @runs.command()

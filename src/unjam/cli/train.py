@@ -21,7 +21,16 @@ from unjam.cli.options import (
     scenario_changes,
     with_options,
 )
-from unjam.cli.output import Counted, after_training, aside, console, print_json, print_metrics, resumable
+from unjam.cli.output import (
+    Counted,
+    after_training,
+    aside,
+    console,
+    print_json,
+    print_metrics,
+    resumable,
+    say_next,
+)
 from unjam.errors import InputError
 from unjam.files import make_folder
 from unjam.processes import owned
@@ -230,7 +239,7 @@ def search(
         console.print(words_of_trial(one))
     untrained = sum(one.gain is not None and one.gain <= 0 for one in found)
     console.print(f"{untrained} of {len(found)} trainings kept the untrained network")
-    console.print(f"train with the best: unjam train --config {best}", soft_wrap=True)
+    say_next("train with the best", "train", "--config", best)
 
 
 def reproduce(

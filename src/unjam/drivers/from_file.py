@@ -9,6 +9,7 @@ import inspect
 import os
 import sys
 from collections.abc import Callable
+from contextlib import redirect_stdout
 from dataclasses import dataclass, field
 from pathlib import Path
 from traceback import extract_tb
@@ -79,8 +80,9 @@ class FileReference:
         before = set(sys.modules)
         sys.path.insert(0, str(path.parent))  # so that the file may import its neighbours
         try:
-            spec.loader.exec_module(module)
-        except Exception as error:  # whatever the user's code raises is the user's to mend
+            with redirect_stdout(sys.stderr):  # what is printed there is no answer of ours
+                spec.loader.exec_module(module)
+        except (Exception, SystemExit) as error:  # whatever the user's code raises is the user's to mend
             raise InputError(f"{path.name}: {type(error).__name__} when loading it: {error}") from error
         finally:
             sys.path.remove(str(path.parent))
@@ -107,7 +109,7 @@ class FileReference:
         """
         try:
             return function(*arguments)
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             frames = extract_tb(error.__traceback__)
             lines = [str(frame.lineno) for frame in frames if frame.filename == str(self.path)]
             place = f" (line {lines[-1]})" if lines else ""

@@ -50,7 +50,7 @@ class Agreement:
     flow_rmse: float
     """[veh/h]"""
     speed_rmse: float
-    """[m/s]; 0 where no speed was measured"""
+    """[m/s]; NaN where no speed was measured"""
     score: float
     """mean GEH over 5, plus the error of speed over the mean measured speed: what calibration makes small"""
 
@@ -171,7 +171,7 @@ def agreement(measured: Sequence[Measurement], flows: Floats, speeds: Floats) ->
     errors = geh(flows, counted)
     known = np.isfinite(wanted)
     missed = np.nan_to_num(speeds[known]) - wanted[known]
-    speed_rmse = float(np.sqrt(np.mean(missed**2))) if known.any() else 0.0
+    speed_rmse = float(np.sqrt(np.mean(missed**2))) if known.any() else nan
     typical = float(np.mean(wanted[known])) if known.any() else 0.0
     score = float(np.mean(errors)) / GOOD_GEH + (speed_rmse / typical if typical else 0.0)
     flow_rmse = float(np.sqrt(np.mean((flows - counted) ** 2)))

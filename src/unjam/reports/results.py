@@ -127,7 +127,11 @@ def read_results(folder: Path) -> Results:
     path, recorded = (folder / name for name in (EVALUATION_FILE, "shown.safetensors"))
     for file in (path, recorded):
         if not file.is_file():
-            hint = "; go on with: unjam train --resume" if (folder / "config.toml").exists() else ""
+            hint = (
+                f"; go on with: unjam train --resume {shlex.quote(str(folder))}"
+                if (folder / "config.toml").exists()
+                else ""
+            )
             raise InputError(f"report: {str(folder)!r} has no {file.name}{hint}")
     try:
         about, arrays = json.loads(path.read_text()), load_file(recorded)

@@ -107,7 +107,7 @@ def lead_of(result: Results) -> str:
     rows, effect = result.rows[result.trained], beside_people(result.rows).get(result.trained)
     if effect:
         scenario, words = result.about["scenario"], _words_of(effect, verdicts(result.rows)[result.trained])
-        said = f"Beside people alone on {scenario}, {len(rows)} held-out seeds paired: {words}."
+        said = f"Beside people alone on {scenario}, {_paired(effect)} held-out seeds paired: {words}."
     else:
         earned = estimate_of(rows, "return").mean
         said = f"On {len(rows)} held-out seeds the trained controller earns {earned:.0f} an episode."
@@ -124,6 +124,11 @@ def lead_of(result: Results) -> str:
     return said
 
 
+def _paired(effect: Effect) -> int:
+    """Return on how many seeds both ran."""
+    return max(effect.flow.count, effect.speed.count)
+
+
 def _words_of(effect: Effect, verdict: str) -> str:
     """Return what everybody on the road gains, and whether a car could drive so, as `verdict` says, too."""
     able = "; a car could drive so" + ("" if verdict == DRIVABLE else f", but {verdict}")
@@ -135,7 +140,7 @@ def _lead_of_drives(result: Results) -> str:
     """Return how fast all vehicles drive with each driver."""
     scenario, effects = result.about["scenario"], beside_people(result.rows)
     if effects:
-        count, found = len(result.rows["human"]), verdicts(result.rows)
+        count, found = max(_paired(effect) for effect in effects.values()), verdicts(result.rows)
         said = "; ".join(f"{label}: {_words_of(effect, found[label])}" for label, effect in effects.items())
         seeds = (
             f"{count} episodes with the same seeds paired" if count > 1 else "one seed, which proves nothing"

@@ -81,6 +81,10 @@ class OwnNetwork(Scenario):
                 )
             if not any(is_car(files.types.get(name, {})) for name in files.used_types):
                 raise ValueError(f"cav_share: no vehicle is a car; its types are {known}; name cav_types")
+        if self.emission_class != type(self).emission_class:
+            raise ValueError(
+                "emission_class: it is not allowed on your own network, whose vehicle types say it"
+            )
         self.check_people_are_native("on your own network")
         if self.population and not passenger_types(files):
             raise ValueError(f"population: no vehicle is a passenger car; its types are {known}")

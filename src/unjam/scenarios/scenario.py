@@ -106,6 +106,10 @@ def in_milliseconds(step: float) -> float:
     return step
 
 
+LONGEST = 10_000_000
+"""decisions of the longest episode: twelve days in tenths of a second; more would fill the memory"""
+
+
 @dataclass(frozen=True, config=STRICT)
 class Scenario:
     """What all scenarios share; each kind of road adds its own."""
@@ -126,7 +130,7 @@ class Scenario:
     """time step of SUMO [s]"""
     steps_per_decision: Count = 1
     """simulation steps for which one command holds"""
-    horizon: Count = 3000
+    horizon: Annotated[Count, Field(le=LONGEST)] = 3000
     """decisions in an episode"""
     warmup: CountOrNone = 0
     """all-human simulation steps before the CAVs take over"""

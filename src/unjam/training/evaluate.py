@@ -225,8 +225,8 @@ def judge(
         "controllers": _hashes({TRAINED: str(folder)}),
         "manifest": manifest(),
     }
+    raise_failures(found)  # before what was judged earlier is written over
     save_evaluation(out or folder, found, about)
-    raise_failures(found)
     return found
 
 

@@ -1,6 +1,7 @@
 """Controllers as files: those that a run keeps in its folders, and what `unjam export` ships."""
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -114,6 +115,8 @@ def export_controller(source: str | Path, to: str | Path, onnx: bool = False, sc
     if to.suffix != SUFFIX:
         raise wrong("to", str(to), f"a file that ends in {SUFFIX}")
     check_folder(to)
+    if _is_signed(to):
+        raise InputError(f"to: {str(to)!r} is a signed controller; allowed: another file")
     road, driver, about = _of_run(source, scenario) if source.is_dir() else _of_driver(str(source), scenario)
     code = code_of(recipe_of(driver)[0])
     if driver.native or code:
@@ -144,6 +147,13 @@ def export_controller(source: str | Path, to: str | Path, onnx: bool = False, sc
     if beside is not None:
         write_whole(beside, graph[GRAPH])
     return Exported(to, beside, driver.describe(), len(states.speed))
+
+
+def _is_signed(file: Path) -> bool:
+    """Return whether a file is a controller that somebody has signed."""
+    with suppress(InputError):
+        return file.is_file() and read_controller(file).signed_by is not None
+    return False
 
 
 def _of_run(folder: Path, scenario: str) -> tuple[Scenario, Driver, dict[str, Any]]:

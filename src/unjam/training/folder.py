@@ -298,12 +298,27 @@ def check_belongs(before: dict[str, Any], now: dict[str, Any]) -> None:
     for name, value in now["settings"].items():
         if name in before["settings"] and before["settings"][name] != value:
             raise wrong(f"resume: {name}", value, f"{before['settings'][name]!r}, as in the checkpoint")
-    for name in before["files"].keys() | now["files"].keys():
-        if before["files"].get(name) != now["files"].get(name):
-            raise InputError(f"resume: {name} has changed since the checkpoint; allowed: as it was then")
+    _check_files(before, now, "resume")
     for part in ("packages", "kernels"):
         if before[part] != now[part]:
             LOG.warning("resume: other %s than the checkpoint's: the result is not what it would be", part)
+
+
+def check_files_of(folder: Path, config: RunConfig) -> None:
+    """Raise `InputError` where a run that is judged was trained with other files than there are now.
+
+    Runs without a checkpoint do not tell.
+    """
+    for place in _places(folder / "checkpoint")[-1:]:
+        before = json.loads((place / STATE).read_text()).get("belongs")
+        if before:
+            _check_files(before, belonging(config), "evaluate")
+
+
+def _check_files(before: dict[str, Any], now: dict[str, Any], doing: str) -> None:
+    for name in sorted(before["files"].keys() | now["files"].keys()):
+        if before["files"].get(name) != now["files"].get(name):
+            raise InputError(f"{doing}: {name} has changed since the checkpoint; allowed: as it was then")
 
 
 def _files(road: RunConfig, task: Task) -> dict[str, str]:

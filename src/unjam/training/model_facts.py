@@ -3,6 +3,7 @@
 All of it is measured on episodes that no network learned from, and kept in the run folder as `model.json`.
 """
 
+import shlex
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -88,7 +89,8 @@ def measure_model(folder: Path, config: RunConfig) -> dict[str, Any]:
     progress = read_progress(folder)
     if checkpoint is None or not progress:
         raise InputError(
-            f"run: {str(folder)!r} has no checkpoint yet; go on with: unjam train --resume {folder}"
+            f"run: {str(folder)!r} has no checkpoint yet; go on with: "
+            f"unjam train --resume {shlex.quote(str(folder))}"
         )
     torch.set_num_threads(1)  # for small networks more are slower
     state, tensors = checkpoint

@@ -76,10 +76,10 @@ def space_around(expert: str, time_step: float) -> Space:
     Raises:
         InputError: there is no such expert, or nothing of it can be varied.
     """
-    default = named_driver(expert, time_step)
-    if expert not in DRIVERS or default.native:
-        known = [name for name, kind in DRIVERS.items() if not kind.native]
+    known = [name for name, kind in DRIVERS.items() if not kind.native]
+    if expert not in known:
         raise wrong_name("expert", expert, known)
+    default = named_driver(expert, time_step)
     space: Space = {}
     hints = get_type_hints(type(default))
     for field in fields(default):  # pyright: ignore[reportArgumentType]
