@@ -38,7 +38,8 @@ from unjam.errors import EpisodeError, InputError
 from unjam.processes import owned
 from unjam.scenarios import Ring, make_scenario
 from unjam.training import folder as run_folder
-from unjam.training.folder import STATE, belonging, last_state, start_folder
+from unjam.training.belonging import belonging
+from unjam.training.folder import STATE, last_state, start_folder
 from unjam.worlds.episode import run_episode
 from unjam.worlds.sumo import networks
 from unjam.worlds.sumo.apart import SimulationApart

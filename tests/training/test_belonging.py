@@ -12,12 +12,11 @@ import torch
 from tests.training.test_run import small_config
 from tests.worlds.sumo.own_roads import straight
 from unjam.errors import InputError
+from unjam.training.belonging import belonging, check_belongs
 from unjam.training.config import RunConfig, load_config, to_toml
 from unjam.training.export import KeptControllers
 from unjam.training.folder import (
     MANIFEST,
-    belonging,
-    check_belongs,
     check_files_of,
     last_state,
     note_lineage,

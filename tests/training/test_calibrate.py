@@ -16,8 +16,8 @@ from unjam.scenarios.own_network import OwnNetwork, own_network
 from unjam.sumo_files import read_sumo_files
 from unjam.training.calibrate import CALIBRATION, CONFIGURATION, Calibrated, calibrate
 from unjam.training.corridor import VARIED, Corridor, changed_types, corridor, varied
-from unjam.training.search import Range
 from unjam.training.seeds import held_out_seeds
+from unjam.training.space import Range
 from unjam.training.tried import ASKED, TRIED
 from unjam.worlds.episode import run_episode
 from unjam.worlds.sumo.counting import Counting

@@ -15,16 +15,14 @@ from unjam.training.config import load_config, to_toml
 from unjam.training.executors import CommandLine, Processes
 from unjam.training.search import (
     JOURNAL,
-    Choice,
-    Range,
     Trial,
     check_space,
     search,
-    space_of,
     trial_config,
     validation_gain,
     words_of_trial,
 )
+from unjam.training.space import Choice, Range, space_of
 
 BASE = small_config(evaluation__every=1)
 SPACE = space_of(["trpo.target_kl=0.001..0.1:log", "trpo.critic_batch=8,16", "trpo.critic_epochs=1..9"])

@@ -18,10 +18,10 @@ from unjam.measures.metrics import measure
 from unjam.scenarios import FigureEight, Merge, Ring
 from unjam.scenarios.on_ramp import ON_RAMP
 from unjam.training import tune as tuning
-from unjam.training.search import Choice, Range, Space
 from unjam.training.seeds import TUNE, tuning_seeds
+from unjam.training.space import Choice, Range, Space, space_around, space_asked
 from unjam.training.tried import TRIED
-from unjam.training.tune import EPISODES, FINALISTS, OF_EACH, TUNED, space_around, space_asked, tune
+from unjam.training.tune import EPISODES, FINALISTS, OF_EACH, TUNED, tune
 from unjam.worlds.batch.run import run_batches
 from unjam.worlds.episode import run_episode
 from unjam.worlds.sumo.simulation import Simulation

@@ -41,6 +41,9 @@ def kills_its_process(state):
 def leaves(state):
     sys.exit(5)
 
+def leaves_at_once(state):
+    os._exit(5)
+
 def talks(state):
     print("all is well " * 1000)
     sys.stderr.write("or is it? " * 1000)
@@ -291,11 +294,17 @@ def test_as_many_workers_are_lost_as_attempts_are_allowed(
         assert len(started) == 3
 
 
-def test_a_driver_that_leaves_is_told_with_its_exit_code(drivers: Path) -> None:
+@pytest.mark.parametrize(
+    ("name", "error", "words"),
+    [("leaves", "InputError", "SystemExit: 5"), ("leaves_at_once", "EpisodeError", "ended with code 5")],
+)
+def test_a_driver_that_leaves_is_told_with_its_exit_code(
+    name: str, error: str, words: str, drivers: Path
+) -> None:
     with Workers(1, attempts=1) as workers:
-        (failed,) = workers.run([EpisodeTask(SHORT, FileDriver(drivers, "leaves"), (0,))])
-    assert (failed.status, failed.error) == ("failed", "EpisodeError")
-    assert "ended with code 5" in failed.reason
+        (failed,) = workers.run([EpisodeTask(SHORT, FileDriver(drivers, name), (0,))])
+    assert (failed.status, failed.error) == ("failed", error)
+    assert words in failed.reason
 
 
 def test_a_driver_that_hangs_is_ended(drivers: Path) -> None:

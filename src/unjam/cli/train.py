@@ -215,8 +215,9 @@ def search(
       unjam search ring --vary policy.exploration_std=0.05..0.5 --executor ray --workers 64 --out /shared/it
     """
     from unjam.training.config import load_config
-    from unjam.training.search import BEST, check_space, space_of, words_of_trial
+    from unjam.training.search import BEST, check_space, words_of_trial
     from unjam.training.search import search as run
+    from unjam.training.space import space_of
 
     base, space = load_config(asked.file, asked.preset, asked.flags | asked.settings), space_of(vary or [])
     runner = executor_named(executor)

@@ -69,8 +69,8 @@ def tune(
     from unjam.scenarios import make_scenario
     from unjam.training.family import FAMILY, GROUPS, roads_of
     from unjam.training.folder import new_and_owned
+    from unjam.training.space import space_around, space_asked
     from unjam.training.tried import ASKED
-    from unjam.training.tune import space_around, space_asked
     from unjam.training.tune import tune as run
     from unjam.worlds.reward import make_reward
     from unjam.worlds.workers import Workers

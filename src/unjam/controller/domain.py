@@ -79,10 +79,10 @@ def other_road(manifest: dict[str, Any], road: dict[str, Any]) -> str:
 def other_step(driver: Driver, road: dict[str, Any]) -> str:
     """Return that a driver counts time in steps which are not a road's decisions; empty where it does not.
 
-    `road` is the recipe of the scenario. Of drivers that are one driver it is enough that one has its step.
+    `road` is the recipe of the scenario. Of a driver by kind of road it is not known which of them drives.
     """
-    step = road["simulation_step"] * road["steps_per_decision"]
-    steps = set(_time_steps(driver.recipe()))
+    step, recipe = road["simulation_step"] * road["steps_per_decision"], driver.recipe()
+    steps = set(_time_steps(recipe)) if recipe["kind"] != "by-road" else set()
     if not steps or any(abs(each - step) < 1e-9 for each in steps):
         return ""
     counted = ", ".join(f"{each:g}" for each in sorted(steps))

@@ -17,6 +17,7 @@ from unjam.drivers.residual import ResidualDriver
 from unjam.learners.settings import PolicySettings
 from unjam.manifest import manifest
 from unjam.scenarios.ring import Ring
+from unjam.scenarios.scenario import LONGEST
 from unjam.training.executors import OnLine
 from unjam.virtual.ensemble import torch_generator
 from unjam.virtual.roads import RoadModel, people_of
@@ -67,7 +68,7 @@ def batch_of(
     """
     generator, numbers = torch_generator((0,), device), partial(on_device, device=device)
     world = RingBatch(
-        [ring_of(vehicles, 10**9)] * rings,
+        [ring_of(vehicles, LONGEST)] * rings,
         [(number,) for number in range(rings)],
         numbers,
         keep=False,

@@ -21,8 +21,9 @@ from unjam.measures.statistics import Estimate, estimate
 from unjam.processes import PrivateFolder
 from unjam.sumo_files.changed import write_changed
 from unjam.training.corridor import FLOWS, VARIED, Corridor, Factors, changed_types
-from unjam.training.search import Space, quiet_optuna
+from unjam.training.search import quiet_optuna
 from unjam.training.seeds import held_out_seeds, tuning_seeds
+from unjam.training.space import Space
 from unjam.training.tried import Tried
 from unjam.worlds.sumo.counting import Counting
 

@@ -12,7 +12,7 @@ from unjam.measures.detectors import Measurement, read_detectors
 from unjam.scenarios.own_network import OwnNetwork, own_network, passenger_types
 from unjam.sumo_files import SumoFiles, read_sumo_files
 from unjam.training.assess import NOBODY
-from unjam.training.search import Range, Space, space_of
+from unjam.training.space import Range, Space, space_of
 from unjam.worlds.sumo.detectors import Loop
 from unjam.worlds.sumo.networks import edge_lengths, lane_counts
 

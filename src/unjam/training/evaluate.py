@@ -23,7 +23,7 @@ from unjam.files import make_folder, to_json, write_whole
 from unjam.manifest import manifest
 from unjam.measures.metrics import measure
 from unjam.measures.statistics import Estimate, paired_difference, summarise
-from unjam.reports.results import ABOUT_SHOWN, packed, shown_of
+from unjam.reports.results import ABOUT_SHOWN, EVALUATION_FILE, packed, shown_of
 from unjam.scenarios import make_scenario, scenario_recipe
 from unjam.scenarios.scenario import Scenario
 from unjam.training.config import RunConfig
@@ -225,8 +225,11 @@ def judge(
         "controllers": _hashes({TRAINED: str(folder)}),
         "manifest": manifest(),
     }
-    raise_failures(found)  # before what was judged earlier is written over
-    save_evaluation(out or folder, found, about)
+    target = out or folder
+    if (target / EVALUATION_FILE).is_file():  # what was judged before is not written over by less
+        raise_failure(found.rows[TRAINED])
+    save_evaluation(target, found, about)
+    raise_failures(found)
     return found
 
 

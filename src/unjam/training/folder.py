@@ -16,38 +16,28 @@ from unjam.controller import make_driver
 from unjam.controller.file import hash_of
 from unjam.drivers.driver import Driver
 from unjam.drivers.observation import feature, observation_size
-from unjam.errors import InputError
+from unjam.errors import InputError, wrong
 from unjam.files import DAMAGED, is_leftover, make_folder, to_json, write_folder, write_whole
 from unjam.manifest import manifest, package_versions
+from unjam.parameters import build
 from unjam.processes import LOCK, owned
 from unjam.reports.results import read_progress
 from unjam.scenarios import scenario_recipe
 from unjam.scenarios.on_ramp import OnRamp
-from unjam.scenarios.population import population_file
 from unjam.scenarios.scenario import Scenario
+from unjam.training.belonging import belonging, check_belongs, check_files
 from unjam.training.config import RunConfig, load_config, read_toml, to_toml
+from unjam.worlds.episode import check_can_drive, check_can_see
 from unjam.worlds.reward import make_reward
 
 if TYPE_CHECKING:
     from unjam.learners.learner import Tensors
-import logging
-from dataclasses import asdict
-
-from unjam.drivers.from_file import FileReference, is_file_reference
-from unjam.drivers.registry import recipe_of
-from unjam.errors import wrong
-from unjam.kernels import kernels
-from unjam.parameters import build, flat
-from unjam.scenarios.own_network import OwnNetwork
-from unjam.sumo_files import read_sumo_files
-from unjam.worlds.episode import Task, check_can_drive, check_can_see
 
 FORMAT = 4
 """of what a checkpoint holds; one of another unjam is refused"""
 GENERATIONS = 2
 MANIFEST, PROGRESS = "manifest.json", "progress.jsonl"
 STATE, TENSORS = "state.json", "tensors.safetensors"
-LOG = logging.getLogger(__name__)
 ROWS_TELL = {"to_crossing", "cav_share"}
 """of what a road tells a CAV, what virtual rows go on with"""
 
@@ -261,6 +251,17 @@ def load_checkpoint(folder: Path) -> "tuple[dict[str, Any], Tensors] | None":
     return None
 
 
+def check_files_of(folder: Path, config: RunConfig) -> None:
+    """Raise `InputError` where a run that is judged was trained with other files than there are now.
+
+    Runs without a checkpoint do not tell.
+    """
+    for place in _places(folder / "checkpoint")[-1:]:
+        before = json.loads((place / STATE).read_text()).get("belongs")
+        if before:
+            check_files(before, belonging(config), "evaluate")
+
+
 def _sweep(folder: Path) -> None:
     """Remove all but the newest two checkpoints, and those that were not written to their end."""
     for old in [*_places(folder)[:-GENERATIONS], *filter(is_leftover, folder.glob(".*"))]:
@@ -273,69 +274,3 @@ def _hash(state: dict[str, Any], data: bytes) -> str:
 
 def _places(folder: Path) -> list[Path]:
     return sorted(place for place in folder.glob("*") if place.is_dir() and place.name.isdigit())
-
-
-def belonging(config: RunConfig) -> dict[str, Any]:
-    """Return what a training's result depends on, as JSON.
-
-    Returns:
-        `settings`: all but steps and workers, by name; `files`: hashes of the expert, and of the user's own
-        code and networks; `packages` and `kernels`: what it computes with.
-    """
-    roads = zip(config.roads().values(), config.make_tasks(), strict=True)
-    files = {name: sha256 for road, task in roads for name, sha256 in _files(road, task).items()}
-    settings = flat(asdict(replace(config, steps=1, workers=1)))
-    found = {"settings": settings, "files": files, "packages": package_versions(), "kernels": kernels()}
-    return json.loads(to_json(found))
-
-
-def check_belongs(before: dict[str, Any], now: dict[str, Any]) -> None:
-    """Compare what a checkpoint belongs to with what would go on; other packages and kernels are only told.
-
-    Raises:
-        InputError: a setting, the expert, or a file of the user's own is another one.
-    """
-    for name, value in now["settings"].items():
-        if name in before["settings"] and before["settings"][name] != value:
-            raise wrong(f"resume: {name}", value, f"{before['settings'][name]!r}, as in the checkpoint")
-    _check_files(before, now, "resume")
-    for part in ("packages", "kernels"):
-        if before[part] != now[part]:
-            LOG.warning("resume: other %s than the checkpoint's: the result is not what it would be", part)
-
-
-def check_files_of(folder: Path, config: RunConfig) -> None:
-    """Raise `InputError` where a run that is judged was trained with other files than there are now.
-
-    Runs without a checkpoint do not tell.
-    """
-    for place in _places(folder / "checkpoint")[-1:]:
-        before = json.loads((place / STATE).read_text()).get("belongs")
-        if before:
-            _check_files(before, belonging(config), "evaluate")
-
-
-def _check_files(before: dict[str, Any], now: dict[str, Any], doing: str) -> None:
-    for name in sorted(before["files"].keys() | now["files"].keys()):
-        if before["files"].get(name) != now["files"].get(name):
-            raise InputError(f"{doing}: {name} has changed since the checkpoint; allowed: as it was then")
-
-
-def _files(road: RunConfig, task: Task) -> dict[str, str]:
-    """Return hashes by what they are of."""
-    recipe, arrays = recipe_of(task.expert)
-    weights = b"".join(arrays[name].tobytes() for name in sorted(arrays))
-    found = {f"expert {road.expert}": hash_of(json.dumps(recipe, sort_keys=True).encode() + weights)}
-    return found | hashes_of_files((road.reward, *road.policy.observe), task.scenario)
-
-
-def hashes_of_files(names: Iterable[str], *scenarios: Scenario) -> dict[str, str]:
-    """Return hashes of the files that `names` refer to and that scenarios are made from, by path."""
-    paths = [FileReference.of(name).path for name in names if is_file_reference(name)]
-    for scenario in scenarios:
-        if isinstance(scenario, OwnNetwork):
-            own = read_sumo_files(Path(scenario.file))
-            paths += [own.path, own.network, *own.additional_files, *own.route_files]
-        if scenario.population:
-            paths.append(population_file(scenario.population))
-    return {str(path): hash_of(path.read_bytes()) for path in paths}

@@ -5,7 +5,7 @@ choose a training's controller anyway; the held-out ones stay unseen.
 """
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from dataclasses import asdict, dataclass, replace
 from itertools import islice
@@ -15,89 +15,19 @@ from typing import TYPE_CHECKING, Any
 from unjam.errors import InputError, MissingPartError, UnjamError, wrong
 from unjam.files import to_json, write_whole
 from unjam.manifest import manifest
-from unjam.parameters import changed, nested, parse_value
+from unjam.parameters import changed, nested
 from unjam.reports.results import read_progress, validations_of
 from unjam.training.config import RunConfig, load_config, to_toml
 from unjam.training.executors import CommandLine, Executor, OnLine, running, training_command
 from unjam.training.folder import check_possible, make_new_folder, read_config
+from unjam.training.space import Choice, Range, Space
 
 if TYPE_CHECKING:
     from optuna import Study
-    from optuna.trial import Trial as OptunaTrial
 
 CONFIG, FOUND, BEST = "config.toml", "search.json", "best.toml"
 JOURNAL = "journal.log"
 """what Optuna remembers: which trials there were, and what became of them"""
-
-
-@dataclass(frozen=True)
-class Range:
-    """Numbers between two, both included."""
-
-    low: float
-    high: float
-    log: bool = False
-    """whether as many are tried between 0.01 and 0.1 as between 0.1 and 1"""
-
-    @property
-    def whole(self) -> bool:
-        """Whether they are integers."""
-        return isinstance(self.low, int) and isinstance(self.high, int)
-
-    @property
-    def ends(self) -> tuple[Any, ...]:
-        """What is checked before the search: if these can be, those between can."""
-        return self.low, self.high
-
-    def suggest(self, trial: "OptunaTrial", key: str) -> None:
-        """Let Optuna choose one."""
-        if self.whole:
-            trial.suggest_int(key, int(self.low), int(self.high), log=self.log)
-        else:
-            trial.suggest_float(key, self.low, self.high, log=self.log)
-
-
-@dataclass(frozen=True)
-class Choice:
-    """One of several values."""
-
-    ends: tuple[Any, ...]
-
-    def suggest(self, trial: "OptunaTrial", key: str) -> None:
-        """Let Optuna choose one."""
-        trial.suggest_categorical(key, self.ends)
-
-
-Space = dict[str, Range | Choice]
-
-
-def space_of(texts: Sequence[str]) -> Space:
-    """Return what is varied, from texts `key=low..high`, `key=low..high:log` or `key=a,b,c`.
-
-    Raises:
-        InputError: a text is none of these, or the range is empty.
-    """
-    space: Space = {}
-    for text in texts:
-        key, equals, values = (part.strip() for part in text.partition("="))
-        if not (key and equals and values):
-            raise wrong("vary", text, "key=low..high, key=low..high:log or key=a,b,c")
-        if ".." in values:
-            space[key] = _range(text, values)
-        else:
-            space[key] = Choice(tuple(parse_value(value.strip()) for value in values.split(",")))
-    if not space:
-        raise InputError("vary: at least one key is needed: --vary trpo.target_kl=0.003..0.1:log")
-    return space
-
-
-def _range(text: str, values: str) -> Range:
-    values, log = values.removesuffix(":log"), values.endswith(":log")
-    low, high, *more = (parse_value(end.strip()) for end in values.split(".."))
-    numbers = all(isinstance(end, int | float) and not isinstance(end, bool) for end in (low, high))
-    if more or not numbers or not low < high or not math.isfinite(high - low) or (log and low <= 0):
-        raise wrong("vary", text, "low < high, with :log low > 0")
-    return Range(low, high, log)
 
 
 def check_space(base: RunConfig, space: Space) -> None:

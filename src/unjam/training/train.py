@@ -24,13 +24,13 @@ from unjam.measures.statistics import Estimate
 from unjam.processes import owned
 from unjam.reports.html import write_report
 from unjam.reports.results import read_progress
+from unjam.training.belonging import belonging
 from unjam.training.config import RunConfig, to_toml
 from unjam.training.evaluate import Progress, Rows, gain_of, judge, raise_failure
 from unjam.training.executors import OnIteration, train_apart
 from unjam.training.export import KeptControllers
 from unjam.training.folder import (
     PROGRESS,
-    belonging,
     check_possible,
     continue_folder,
     last_state,

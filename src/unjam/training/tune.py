@@ -5,18 +5,18 @@ limits and filter. Settings that no car could drive do not count.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from functools import cache, partial
 from itertools import chain
 from math import inf
 from pathlib import Path
-from typing import Any, Literal, get_args, get_origin, get_type_hints
+from typing import Any
 
 import numpy as np
 
 from unjam.controller.file import SUFFIX, controller_bytes
 from unjam.drivers.driver import labelled
-from unjam.drivers.registry import DRIVERS, named_driver
+from unjam.drivers.registry import named_driver
 from unjam.errors import InputError, UnjamError, wrong_name
 from unjam.files import to_json, write_whole
 from unjam.manifest import manifest
@@ -26,10 +26,12 @@ from unjam.measures.metrics import measure
 from unjam.scenarios import scenario_recipe
 from unjam.scenarios.on_ramp import OnRamp
 from unjam.scenarios.scenario import Scenario
+from unjam.training.belonging import hashes_of_files
 from unjam.training.evaluate import raise_failure
-from unjam.training.folder import hashes_of_files, origin
-from unjam.training.search import Choice, Range, Space, quiet_optuna, space_of
+from unjam.training.folder import origin
+from unjam.training.search import quiet_optuna
 from unjam.training.seeds import tuning_seeds
+from unjam.training.space import Space
 from unjam.training.tried import Setting, Tried, Verdict
 from unjam.worlds.batch.possible import statistical_why_not, why_not
 from unjam.worlds.batch.run import run_batch, run_batches
@@ -44,10 +46,6 @@ FINALISTS = 5
 """settings that are driven again, on twice as many other seeds: else the luckiest would win"""
 SCREENED = 8
 """settings that are screened at once, each on rings of its own"""
-WIDTH = 4.0
-"""a parameter is varied from its default over this to its default times this"""
-TO_ONE = 1.0
-"""upper end for a parameter that is zero by default"""
 
 Run = Callable[[list[list[EpisodeTask]]], list[Rows]]
 """runs the tasks of each driver on one road, in SUMO or in a batch, and measures their episodes"""
@@ -68,61 +66,6 @@ class Tuned:
     """driven in batches, where settings were screened there"""
     file: Path
     """the tuned expert as a controller"""
-
-
-def space_around(expert: str, time_step: float) -> Space:
-    """Return the ranges around an expert's parameters: four times less and more, all words, both truths.
-
-    Raises:
-        InputError: there is no such expert, or nothing of it can be varied.
-    """
-    known = [name for name, kind in DRIVERS.items() if not kind.native]
-    if expert not in known:
-        raise wrong_name("expert", expert, known)
-    default = named_driver(expert, time_step)
-    space: Space = {}
-    hints = get_type_hints(type(default))
-    for field in fields(default):  # pyright: ignore[reportArgumentType]
-        around = _around(getattr(default, field.name), hints[field.name])
-        if around is not None and field.name != "time_step":
-            space[field.name] = around
-    if not space:
-        raise InputError(f"expert: {expert!r} has nothing to tune")
-    return space
-
-
-def space_asked(texts: Sequence[str], around: Space) -> Space:
-    """Return what a user wants to vary of an expert; whole ends of a parameter that is none are no integers.
-
-    Args:
-        texts: as `search.space_of` reads them.
-        around: of `space_around`.
-
-    Raises:
-        InputError: a text is wrong.
-    """
-    space = space_of(texts)
-    for name, values in space.items():
-        default = around.get(name)
-        if isinstance(values, Range) and isinstance(default, Range) and not default.whole:
-            space[name] = Range(float(values.low), float(values.high), values.log)
-    return space
-
-
-def _around(value: Any, hint: Any) -> Range | Choice | None:
-    """Return what is tried of a parameter; None where nothing is near, as for a list."""
-    if isinstance(value, bool):
-        return Choice((False, True))
-    if get_origin(hint) is Literal:
-        return Choice(get_args(hint))
-    if not isinstance(value, int | float):
-        return None
-    if value == 0:
-        return Range(0, round(WIDTH)) if isinstance(value, int) else Range(0.0, TO_ONE)
-    if isinstance(value, int):
-        return Range(max(1, round(value / WIDTH)), round(value * WIDTH), log=True)
-    ends = sorted((float(value) / WIDTH, float(value) * WIDTH))
-    return Range(*ends, log=value > 0)
 
 
 def tune(
