@@ -39,7 +39,8 @@ def validations(variant: str, study: str = "table-2", road: str = "ring") -> tup
     """
     curves = json.loads((RESULTS / study / "curves.json").read_text())[road][variant]
     steps, values = np.array(curves["steps"]), np.array(curves["return_validation"])
-    first = int(np.argmax((values != values[:, :1]).any(0)))  # until then the first is all that is known
+    known = (values != values[:, :1]).any(0)  # until then the first is all that is known
+    first = int(np.argmax(known)) if known.any() else len(steps)
     return steps[max(0, first - 1) :], values[:, max(0, first - 1) :]
 
 
@@ -52,18 +53,20 @@ def draw(
     """Draw validation against actual steps: mean and range of the runs; from `lowest` on, steps by powers."""
     figure = Figure(figsize=(9, 3.6), layout="constrained")
     axes = figure.subplots()
-    most = 0.0
+    most = -np.inf
     for (variant, label), colour in zip(labels.items(), COLOURS, strict=False):
         steps, curves = validations(variant, study, road)
         most = max(most, curves.max())
-        axes.fill_between(steps / 1000, curves.min(0), curves.max(0), color=colour, alpha=0.15, lw=0)
-        axes.plot(steps / 1000, curves.mean(0), color=colour, label=label)
+        low, high, once = curves.min(0), curves.max(0), len(steps) == 1
+        axes.fill_between(steps / 1000, low, high, color=colour, alpha=0.15, lw=0)
+        axes.plot(steps / 1000, curves.mean(0), "o" if once else "-", color=colour, label=label)
+        axes.vlines(steps / 1000, low, high, color=colour, alpha=0.15, lw=8 if once else 0)
     if lowest is not None:
         axes.set_xscale("log")
         axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
         axes.xaxis.set_major_formatter("{x:,.0f}")
         axes.xaxis.set_minor_locator(NullLocator())
-        axes.set_ylim(lowest, most + 5.0)
+        axes.set_ylim(lowest, most + max(5.0, 0.05 * (most - lowest)))
     axes.set_xlabel("actual simulator steps [thousands]")
     axes.set_ylabel("return of an episode, validation")
     axes.legend(frameon=False)
@@ -72,32 +75,6 @@ def draw(
     content = BytesIO()
     figure.savefig(content, format="png", dpi=130)
     return Image(content.getvalue(), width=900)
-
-
-def on_ramps_so_far() -> pd.DataFrame:
-    """Return what first trainings of the on-ramp earn in validation after so many actual steps."""
-    labels = {
-        "on-ramp-in-turn": "imagined, learned from in turn",
-        "on-ramp-union": "imagined, one update",
-        "on-ramp-few": "without",
-    }
-    files = [
-        (label, path) for folder, label in labels.items() for path in RESULTS.glob(f"tried/{folder}/*.jsonl")
-    ]
-    rows = pd.concat([pd.read_json(path, lines=True).assign(which=label) for label, path in files])
-    table = []
-    for (label, steps), found in rows.groupby(["which", "actual_steps"])["return_validation"]:
-        if count := found.count():
-            between = f" ({found.min():,.0f} to {found.max():,.0f})" if count > 1 else ""
-            earned = f"{found.mean():,.0f}{between}"
-            row = {
-                "": label,
-                "actual steps": f"{steps:,}",
-                "trainings": count,
-                "return in validation": earned,
-            }
-            table.append(row)
-    return pd.DataFrame(table)
 
 
 def judged() -> pd.DataFrame:

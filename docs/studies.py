@@ -106,6 +106,7 @@ COLUMNS = {
 OF_THE_RING = ("return", "mean speed [m/s]", "of the limit, steady", "std across vehicles [m/s]")
 OF_THE_RING += ("smallest headway [s]",)
 OF_THE_EIGHT = ("return", "return, Eq. 16", "mean speed [m/s]", "steady [m/s]", "std across vehicles [m/s]")
+OF_THE_ON_RAMP = ("return", "mean speed [m/s]", "leave [veh/h]", "smallest headway [s]")
 OF_THE_MERGE = ("return", "mean speed [m/s]", "steady [m/s]", "leave [veh/h]", "wait [veh]")
 
 
