@@ -136,20 +136,29 @@ def test_each_batch_is_told_in_a_line() -> None:
     ]
 
 
-def test_who_was_slower_comes_back_when_the_quicker_one_fails_or_no_car_could_drive_so() -> None:
-    for later in ({"status": "failed", "reason": "lost", "error": "EpisodeError"}, {"min_headway": 0.1}):
+FAILED: dict[str, Any] = {"status": "failed", "reason": "lost", "error": "EpisodeError"}
+
+
+@pytest.mark.parametrize("later", [FAILED, {"min_headway": 0.1}], ids=["failed", "no car could drive so"])
+@pytest.mark.parametrize("ends", [False, True], ids=["goes on", "ends at once"])
+def test_who_was_slower_comes_back_when_the_quicker_one_turns_out_worse(
+    later: dict[str, Any], ends: bool
+) -> None:
+    def turning(mean: float, spread: float, otherwise: dict[str, Any]) -> Change:
+        """Drives so, but otherwise on the first seed after some may be set aside."""
         driven = list[int]()
 
-        def quicker(
-            generator: np.random.Generator, later: dict[str, Any] = later, driven: list[int] = driven
-        ) -> dict[str, Any]:
+        def change(generator: np.random.Generator) -> dict[str, Any]:
             driven.append(1)
-            return shifted(-9.0, 3.0, **(later if len(driven) == LEAST_CHOOSING + 1 else {}))(generator)
+            return shifted(mean, spread, **(otherwise if len(driven) == LEAST_CHOOSING + 1 else {}))(
+                generator
+            )
 
-        drive = MadeUp(
-            {ACC: shifted(-2.0), PI: quicker, ACC_MORE: shifted(0.0, 20.0), PI_MORE: shifted(0, 9)}
-        )
-        found = choose(OPTIONS, drive, drive.budget, 0.001, quiet)
-        assert len(drive.seeds_of(ACC)) < len(drive.seeds_of(PEOPLE))  # for a while it was out
-        assert ACC in found.finalists
-        assert ACC not in found.set_aside
+        return change
+
+    others = {ACC_MORE: turning(0.0, 20.0, FAILED if ends else {}), PI_MORE: shifted(0.0, 9.0)}
+    drive = MadeUp({ACC: shifted(-2.0), PI: turning(-9.0, 3.0, later), **others})
+    found = choose(OPTIONS, drive, drive.budget, 0.001, quiet)
+    assert len(drive.seeds_of(ACC)) < len(drive.seeds_of(PEOPLE))  # for a while it was out
+    assert ACC in found.finalists
+    assert ACC not in found.set_aside

@@ -118,7 +118,7 @@ def choose(
             slower = _slower(found, [option for option in left if option not in set_aside])
             slower_than |= {option: rival for option, (rival, _) in slower.items()}
             set_aside |= {option: words for option, (_, words) in slower.items()}
-        left = [option for option in left if option not in set_aside]
+        left = [option for option in options if option not in set_aside]  # with who has come back
         widths = [found.effect(option).width for option in left]
         said = f"choosing, {len(rows[PEOPLE])} seeds: {len(left)} of {len(options)} left"
         on_line(f"{said}, {_wide(widths, precision)}")
