@@ -4,6 +4,7 @@ Every error that a user can cause or mend is one of these: one clear line, no tr
 """
 
 import errno
+import shlex
 from collections.abc import Iterable
 from difflib import get_close_matches
 
@@ -96,6 +97,11 @@ def wrong_name(field: str, value: object, names: Iterable[str]) -> InputError:
     """Return the error for a name that is not among `names`, with the one that may have been meant."""
     known = list(names)
     return wrong(field, value, f"{', '.join(known)}{did_you_mean(value, known)}")
+
+
+def go_on_with(folder: object) -> str:
+    """Return `; go on with: ` and the command that goes on with a training, to be copied."""
+    return f"; go on with: unjam train --resume {shlex.quote(str(folder))}"
 
 
 def did_you_mean(value: object, names: Iterable[str]) -> str:

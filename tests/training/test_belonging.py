@@ -93,6 +93,9 @@ def test_what_a_training_is_made_of_cannot_change(
     with pytest.raises(InputError, match=r"evaluate: .* has changed since the checkpoint"):
         check_files_of(run, config)
     assert "has changed since the checkpoint" in refused(run, config)
+    for state in (run / "checkpoint").rglob("state.json"):
+        state.write_text("{ torn")
+    check_files_of(run, config)  # what is damaged does not tell
 
 
 def test_other_packages_and_kernels_are_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

@@ -3,14 +3,13 @@
 from contextlib import nullcontext
 from dataclasses import asdict, replace
 from pathlib import Path
-from shlex import quote
 from typing import Annotated
 
 import typer
 
 from unjam.cli.options import DEFAULT_WORKERS, HumansOption, JsonOption, WorkersOption, scenario_changes
 from unjam.cli.output import aside, console, counting_steps, new_table, print_json, print_metrics
-from unjam.errors import InputError, wrong
+from unjam.errors import InputError, go_on_with, wrong
 from unjam.processes import go_on_limited, owned
 
 
@@ -53,9 +52,7 @@ def evaluate(
     if config.tasks:
         raise InputError(f"run: {str(run)!r} is of several roads; allowed: the folder of one of them")
     if not (run / "controller.unjam").is_file():
-        raise InputError(
-            f"run: {str(run)!r} has no controller yet; go on with: unjam train --resume {quote(str(run))}"
-        )
+        raise InputError(f"run: {str(run)!r} has no controller yet{go_on_with(run)}")
     from unjam.reports.html import write_report  # draws: so late that what is wrong is told at once
     from unjam.reports.story import lead_of
 

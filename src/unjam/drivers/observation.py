@@ -195,8 +195,12 @@ CAVs; on motorways the wanted speed, the way to where a ramp joins, also stretch
 in its lane and on all, and who drives beside it"""
 
 
+def _is_feature(name: str) -> bool:
+    return name in FEATURES or is_file_reference(name)
+
+
 def _known(name: str) -> str:
-    if name not in FEATURES and not is_file_reference(name):
+    if not _is_feature(name):
         raise ValueError(f"{', '.join(map(repr, FEATURES))} or 'path.py:name'")
     return name
 
@@ -204,7 +208,7 @@ def _known(name: str) -> str:
 def check_features(names: Sequence[str]) -> None:
     """Raise `InputError` where one of the names is not that of a feature, or of a function of one's own."""
     for name in names:
-        if name not in FEATURES and not is_file_reference(name):
+        if not _is_feature(name):
             raise wrong_name("observe", name, [*FEATURES, "path.py:name"])
 
 

@@ -286,10 +286,8 @@ def calibrated_people(recordings: Iterable[LocalState], scenario: Scenario) -> I
     `recordings` are what CAVs perceived, see `people_behind`. Desired speed and smallest gap stay the
     scenario's: in traffic that moves slowly nobody shows them.
     """
-    pairs, known = (
-        people_behind(recordings, scenario.decision_step, scenario.steps_per_decision),
-        scenario.humans,
-    )
+    pairs = people_behind(recordings, scenario.decision_step, scenario.steps_per_decision)
+    known = scenario.humans
     if not pairs:
         return known
     speed, gap = known.desired_speed, known.minimum_gap

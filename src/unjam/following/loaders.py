@@ -177,10 +177,10 @@ def _openacc(frame: pd.DataFrame, path: Path, reading: Reading) -> Recorded:
         driver = f"Driver{number + 1}"
         kind = frame[driver].astype(str) if driver in frame else pd.Series("", frame.index)
         # Who takes over in mid-way is another driver.
-        pair = f"{path.stem}-{number + 1}" + np.where(kind == "", "", "-" + kind)
+        marks = np.where(kind == "", "", "-" + kind)
         name = vehicles[number] if number < len(vehicles) else f"vehicle {number + 1}"
-        who = name + np.where(kind == "", "", "-" + kind) if len(set(kind)) > 1 else name
-        parts.append(part.assign(pair=pair, driver=who, kind=kind))
+        who = name + marks if len(set(kind)) > 1 else name
+        parts.append(part.assign(pair=f"{path.stem}-{number + 1}" + marks, driver=who, kind=kind))
     return _trajectories(pd.concat(parts), path, reading)
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from safetensors.numpy import load_file
 
-from unjam.errors import InputError
+from unjam.errors import InputError, go_on_with
 from unjam.files import DAMAGED, read_lines
 from unjam.measures.metrics import METRICS
 from unjam.worlds.record import Episode
@@ -127,11 +127,7 @@ def read_results(folder: Path) -> Results:
     path, recorded = (folder / name for name in (EVALUATION_FILE, "shown.safetensors"))
     for file in (path, recorded):
         if not file.is_file():
-            hint = (
-                f"; go on with: unjam train --resume {shlex.quote(str(folder))}"
-                if (folder / "config.toml").exists()
-                else ""
-            )
+            hint = go_on_with(folder) if (folder / "config.toml").exists() else ""
             raise InputError(f"report: {str(folder)!r} has no {file.name}{hint}")
     try:
         about, arrays = json.loads(path.read_text()), load_file(recorded)

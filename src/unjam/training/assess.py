@@ -17,7 +17,7 @@ from unjam.manifest import manifest
 from unjam.measures.effect import Judged, headline, recommended, shown_beside
 from unjam.measures.statistics import estimate_of
 from unjam.reports.assessment import ASSESSMENT_FILE, ASSESSMENT_PAGE, write_assessment
-from unjam.scenarios import make_scenario, scenario_recipe
+from unjam.scenarios import NAMED_BEFORE, make_scenario, scenario_recipe
 from unjam.scenarios.own_network import WITH_OWN_ACC
 from unjam.scenarios.scenario import Scenario
 from unjam.training.choice import (
@@ -46,7 +46,7 @@ NOBODY = 1e-12
 """share of CAVs where people are alone: a network without any is not allowed"""
 CHOOSING = "choosing"
 """folder within the results: the rows of the seeds that chose"""
-WHO_IS_A_CAV = "cav_share", "cav_types", "cavs", "penetration"
+WHO_IS_A_CAV = "cav_share", "cav_types", "cavs"
 """settings of a road that the shares stand for"""
 METRICS_OF_PEOPLE = (
     "travel_time",
@@ -101,7 +101,7 @@ def question(
     """
     if not file.endswith(".sumocfg"):
         raise wrong("scenario", file, "your own .sumocfg file")
-    for name in [name for name in changes or {} if name in WHO_IS_A_CAV]:
+    for name in [name for name in changes or {} if NAMED_BEFORE.get(name, name) in WHO_IS_A_CAV]:
         raise InputError(f"{name}: it is not allowed here: --shares says how many vehicles are CAVs")
     for share in shares:
         if not 0 <= share <= 1:

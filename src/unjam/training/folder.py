@@ -231,13 +231,8 @@ def load_checkpoint(folder: Path) -> "tuple[dict[str, Any], Tensors] | None":
     """
     from safetensors.torch import load
 
-    places = _places(folder)
-    for place in reversed(places):
+    for place, state, data in _whole(folder):
         try:
-            state = json.loads((place / STATE).read_text())
-            data = (place / TENSORS).read_bytes()
-            if state.pop("sha256") != _hash(state, data):
-                continue
             found, known = state.pop("format", 1), load(data)
         except DAMAGED:
             continue
@@ -246,20 +241,32 @@ def load_checkpoint(folder: Path) -> "tuple[dict[str, Any], Tensors] | None":
                 f"checkpoint: {place} has format {found!r}, of another version of unjam; allowed: {FORMAT}"
             )
         return state, known
-    if places:
+    if places := _places(folder):
         raise InputError(f"checkpoint: all {len(places)} under {folder} are damaged")
     return None
+
+
+def _whole(folder: Path) -> Iterator[tuple[Path, dict[str, Any], bytes]]:
+    """Yield place, state and tensors of the checkpoints whose hash is right, the newest first."""
+    for place in reversed(_places(folder)):
+        try:
+            state = json.loads((place / STATE).read_text())
+            data = (place / TENSORS).read_bytes()
+            right = state.pop("sha256") == _hash(state, data)
+        except DAMAGED:
+            continue
+        if right:
+            yield place, state, data
 
 
 def check_files_of(folder: Path, config: RunConfig) -> None:
     """Raise `InputError` where a run that is judged was trained with other files than there are now.
 
-    Runs without a checkpoint do not tell.
+    Runs without a checkpoint that is whole do not tell.
     """
-    for place in _places(folder / "checkpoint")[-1:]:
-        before = json.loads((place / STATE).read_text()).get("belongs")
-        if before:
-            check_files(before, belonging(config), "evaluate")
+    newest = next((state for _, state, _ in _whole(folder / "checkpoint")), {})
+    if before := newest.get("belongs"):
+        check_files(before, belonging(config), "evaluate")
 
 
 def _sweep(folder: Path) -> None:

@@ -3,7 +3,6 @@
 All of it is measured on episodes that no network learned from, and kept in the run folder as `model.json`.
 """
 
-import shlex
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -12,7 +11,7 @@ from typing import Any, cast
 import numpy as np
 import torch
 
-from unjam.errors import InputError
+from unjam.errors import InputError, go_on_with
 from unjam.files import to_json, write_whole
 from unjam.learners.algorithm_1 import kind_of_imagination
 from unjam.learners.imagination import RowImagination, WholeRoads
@@ -88,10 +87,7 @@ def measure_model(folder: Path, config: RunConfig) -> dict[str, Any]:
     checkpoint = load_checkpoint(folder / "checkpoint")
     progress = read_progress(folder)
     if checkpoint is None or not progress:
-        raise InputError(
-            f"run: {str(folder)!r} has no checkpoint yet; go on with: "
-            f"unjam train --resume {shlex.quote(str(folder))}"
-        )
+        raise InputError(f"run: {str(folder)!r} has no checkpoint yet{go_on_with(folder)}")
     torch.set_num_threads(1)  # for small networks more are slower
     state, tensors = checkpoint
     settings = replace(config.virtual, device="cpu")

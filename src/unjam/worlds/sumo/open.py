@@ -147,11 +147,11 @@ class OpenTraffic(Traffic[OpenKind]):
             commanded = self._legal(self._carried_out(asked, taken))
             self._simulate(commanded)
             still = [name for name in commanded if name in self._on_road]
-            if obeys:
-                allowed = self._simulation.allowed_speeds(still)  # who has reached that is not overridden
-                moved = self._simulation.speeds(still)
-                for name, most, speed in zip(still, allowed, moved, strict=True):
-                    shield[name] = max(shield[name], (min(commanded[name], most) - speed) / step)
+            moved = dict(zip(still, self._simulation.speeds(still), strict=True)) if obeys else {}
+            slower = [name for name, speed in moved.items() if speed < commanded[name]]
+            # Who has reached what the road allows is not overridden.
+            for name, most in zip(slower, self._simulation.allowed_speeds(slower), strict=True):
+                shield[name] = max(shield[name], (min(commanded[name], most) - moved[name]) / step)
             if self.crashed:
                 break
         self.decisions += 1
