@@ -7,6 +7,7 @@ that it takes.
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
+from itertools import cycle
 from pathlib import Path
 
 import numpy as np
@@ -27,9 +28,9 @@ TIMES = (1, 2, 3)
 """how many times the actual steps the method may take without the model"""
 WITHOUT = {
     "eight": ("eight-few", "eight-middle", "best-in-batches"),
-    "ramp": ("ramp-few",) * len(TIMES),
+    "ramp": ("ramp-few",) * len(TIMES) + ("ramp-small",) * len(TIMES),
 }
-"""who is without it: with few steps, with twice as many, with all; on the on-ramp one goes so far"""
+"""who is without it: with few steps, with twice as many, with all; on the on-ramp two go so far"""
 
 
 def compared_with(prefix: str) -> tuple[str, ...]:
@@ -51,7 +52,7 @@ def efficiency(road: str, compared: Sequence[str], looks: Sequence[int], folder:
     rows = [
         _row(VARIANTS[name].label, names, [at_each(at) for at in looks]) for name, at_each in seen.items()
     ]
-    for name, times in zip(others, TIMES, strict=True):
+    for name, times in zip(others, cycle(TIMES)):
         beyond = [seen[modelled](at) - seen[name](times * at) for at in looks]
         label = f"with the model beyond “{VARIANTS[name].label}” after {times} times as many"
         rows.append(_row(label, names, beyond, "+"))

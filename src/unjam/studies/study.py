@@ -120,6 +120,8 @@ LEFT_TO_LEARN = {
 RAMP = few_steps("ramp", 9_600, 86_400, horizon=2400, **LEFT_TO_LEARN, **{"virtual.kappa": 10_000.0})
 IN_TURN = {**RAMP["ramp-imagined"].changes, "virtual.update": "sequential"}
 """first an update on actual roads, then five on imagined ones, each of the policy as it is by then"""
+SMALL = {**RAMP["ramp-few"].changes, "trpo.batch_steps": 4_800, "evaluation.every": 6}
+"""twice as many updates from the same steps, as many as those in turn have by three times their steps"""
 ALONE = {"expert": "none", "virtual.virtual_ratio": 0.0}
 TO_THE_END = {"evaluation.converged": 0}
 TWO_EACH = {"evaluation.episodes": 2}
@@ -165,6 +167,7 @@ VARIANTS: dict[str, Variant] = {
     **few_steps("eight", 6_000, 612_000, horizon=1500),
     **RAMP,
     "ramp-imagined": replace(RAMP["ramp-imagined"], changes=IN_TURN, steps=28_800),
+    "ramp-small": Variant("ours, few steps in small iterations", "best", SMALL, 86_400),
     "best-in-batches": Variant("ours, all its steps", "best", {"world": "batch"}, None),
     "by-150-seconds": Variant("residual", "best", BY_150_SECONDS, None),
     "rings": Variant("residual", "rings", TWO_EACH, None),
