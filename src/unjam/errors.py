@@ -54,6 +54,12 @@ class EpisodeError(UnjamError):
     """An episode failed again and again: the message holds what is needed to repeat it."""
 
 
+class RefusedError(EpisodeError):
+    """SUMO refuses the files that it was given, and says why."""
+
+    exit_code = 2
+
+
 class LostError(EpisodeError):
     """The process that ran an episode was lost, for whatever reason: the same may well run again."""
 

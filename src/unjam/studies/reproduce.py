@@ -26,6 +26,8 @@ SECONDS: dict[str, dict[str, float]] = {
 }
 """what 300,000 actual steps took on one core of the machine of results/, model-free, on the on-ramp in
 batches [s]"""
+RAMP_IN_SUMO = 1150.0
+"""what more they take on the on-ramp where its episodes are SUMO's [s]"""
 VIRTUAL_SECONDS = 60.0
 """what the virtual environment adds, for each virtual decision per actual one up to one [s]"""
 DRIVE_SECONDS = {"ring": 60.0, "figure-eight": 60.0, "merge": 400.0, "on-ramp": 1500.0}
@@ -74,7 +76,8 @@ def estimated_seconds(run: PlannedRun) -> float:
     config = run.config
     actual, virtual = SECONDS[config.agent][_kind(run.road)], config.virtual
     rows, roads = VIRTUAL_SECONDS * min(1.0, virtual.virtual_ratio), actual * virtual.virtual_ratio
-    return config.steps / 300_000 * (actual + (roads if virtual.model == "road" else rows))
+    in_sumo = RAMP_IN_SUMO if _kind(run.road) == "on-ramp" and config.world == "sumo" else 0.0
+    return config.steps / 300_000 * (actual + in_sumo + (roads if virtual.model == "road" else rows))
 
 
 def _kind(road: str) -> str:

@@ -207,6 +207,7 @@ def test_what_sumo_refuses_of_the_users_own_network_is_told_in_one_line_and_the_
     scenario = make_scenario(str(broken(tmp_path, network, vehicles)), {"cav_share": 1.0})
     with pytest.raises(EpisodeError, match=words) as caught:
         run_episode(scenario, IDM(), (0,), simulation=simulation)
+    assert caught.value.exit_code == 2
     assert "\n" not in str(caught.value)
     assert run_episode(RING, IDM(), (0,), simulation=simulation).status == "completed"
 

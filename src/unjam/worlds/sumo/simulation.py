@@ -15,7 +15,7 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from unjam.errors import EpisodeError, UnjamError, wrong
+from unjam.errors import EpisodeError, RefusedError, UnjamError, wrong
 from unjam.processes import PrivateFolder, printed_to
 from unjam.sandbox import keep_disk
 from unjam.scenarios.scenario import Actuation
@@ -138,7 +138,8 @@ class Simulation:
         """Start an episode: load network and traffic, and put the vehicles on the road.
 
         Raises:
-            EpisodeError: SUMO refuses the files; the message holds its reason.
+            RefusedError: SUMO refuses the files; the message holds its reason.
+            EpisodeError: it cannot start for another one.
         """
         traffic = Path(self._folder.name) / "traffic.rou.xml"
         traffic.write_text(files.traffic)
@@ -160,8 +161,8 @@ class Simulation:
         except Exception as error:
             self._end()  # only then are SUMO's words in its log, and can the next episode start afresh
             words = said_in(self._error_log) or (said_in(self._printed) if self._printed else "")
-            words = words or " ".join(str(error).split())
-            raise EpisodeError(f"SUMO cannot start: {words}") from error
+            kind = RefusedError if words or self.backend != "gui" else EpisodeError  # a window may be missing
+            raise kind(f"SUMO cannot start: {words or ' '.join(str(error).split())}") from error
 
     def _readable(self, path: Path, files: Files) -> str:
         """Return what SUMO reads instead of a file: itself, or a harmless copy of its content."""
