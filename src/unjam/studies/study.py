@@ -116,7 +116,7 @@ LEFT_TO_LEARN = {
     "expert": "jam-ahead:margin=2,margin_by_share=0",
     **{"world": "sumo", "evaluation.every": 3, "evaluation.validation_episodes": 16},
 }
-"""the on-ramp's best method on a law that gains nothing there: on the tuned one nothing is left to learn"""
+"""the on-ramp's best method on a law that gains nothing there: on the tuned one little is left to learn"""
 RAMP = few_steps("ramp", 9_600, 86_400, horizon=2400, **LEFT_TO_LEARN, **{"virtual.kappa": 10_000.0})
 IN_TURN = {**RAMP["ramp-imagined"].changes, "virtual.update": "sequential"}
 """first an update on actual roads, then five on imagined ones, each of the policy as it is by then"""
@@ -167,6 +167,9 @@ VARIANTS: dict[str, Variant] = {
     **few_steps("eight", 6_000, 612_000, horizon=1500),
     **RAMP,
     "ramp-imagined": replace(RAMP["ramp-imagined"], changes=IN_TURN, steps=28_800),
+    "ramp-in-turn": Variant(
+        "ours, on the tuned law", "best", {**IN_TURN, "expert": "unjam:on-ramp-tuned"}, 28_800
+    ),
     "ramp-small": Variant("ours, few steps in small iterations", "best", SMALL, 86_400),
     "best-in-batches": Variant("ours, all its steps", "best", {"world": "batch"}, None),
     "by-150-seconds": Variant("residual", "best", BY_150_SECONDS, None),
