@@ -13,23 +13,19 @@ from tables import RESULTS
 from studies import rows_of
 from unjam.studies.comparison import interval
 from unjam.studies.imagined import compared_with
-from unjam.studies.study import VARIANTS
+from unjam.studies.study import PlannedRun
 
 LABELS = {"ours": "with the virtual environment", "ours-without-model": "without"}
 COLOURS = ("#2b6cb0", "#e07a1f", "#3a8f5c", "#7b8794")
 
 
-def imagined(prefix: str) -> dict[str, str]:
-    """Return the labels of the variants that a study of imagined roads compares."""
-    modelled, few, middle, many = compared_with(prefix)
-    if few == many:
-        return {modelled: "whole roads imagined besides", few: "without"}
-    return {
-        modelled: "whole roads imagined besides",
-        many: "without, in large iterations",
-        middle: f"without, in iterations of {VARIANTS[middle].changes['trpo.batch_steps']:,}",
-        few: "without, in small ones",
-    }
+def imagined(prefix: str, road: str = "ring") -> dict[str, str]:
+    """Return the labels of the variants that a study of imagined roads compares, large iterations first."""
+    modelled, *others = compared_with(prefix)
+    sizes = {name: PlannedRun(road, name, 0).config.learner.batch_steps for name in others}
+    labels = {name: f"without, in iterations of {size:,}" for name, size in sizes.items()}
+    ordered = sorted(labels, key=lambda name: -sizes[name])
+    return {modelled: "whole roads imagined besides", **{name: labels[name] for name in ordered}}
 
 
 def validations(variant: str, study: str = "table-2", road: str = "ring") -> tuple[np.ndarray, np.ndarray]:
