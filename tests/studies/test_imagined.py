@@ -3,7 +3,7 @@
 import json
 from pathlib import Path
 
-from unjam.studies.imagined import compared_with, imagined
+from unjam.studies.imagined import LOOKS_ON_RAMPS, compared_with, imagined
 
 
 def test_returns_stand_beside_those_of_as_few_steps_and_of_three_times_as_many(tmp_path: Path) -> None:
@@ -21,8 +21,26 @@ def test_returns_stand_beside_those_of_as_few_steps_and_of_three_times_as_many(t
     assert table.loc["ours, few steps and whole roads imagined", "750,000"] == "2125"
     assert table.loc["ours, few steps", "1,500,000"] == "–"
     assert table.loc["ours, all its steps", "380,000"] == "–"  # nobody had looked
-    assert table.loc["with the model beyond “ours, few steps” after 1 times as many", "380,000"] == "+31"
+    assert table.loc["with the model beyond “ours, few steps” after as many", "380,000"] == "+31"
     assert table.loc["with the model beyond “ours, twice as many” after 2 times as many", "750,000"] == "+26"
     assert table.loc[
         "with the model beyond “ours, all its steps” after 3 times as many", "750,000"
     ].startswith("+7")
+
+
+def test_on_the_on_ramp_both_sizes_of_iterations_stand_beside_the_model_by_how_many_steps_they_took(
+    tmp_path: Path,
+) -> None:
+    steps = [28_800.0, 57_600.0, 86_400.0]
+    curves = {
+        "ramp-imagined": {"steps": steps[:1], "return_validation": [[-2450.0]] * 3},
+        "ramp-few": {"steps": steps, "return_validation": [[-2760.0, -2660.0, -2620.0]] * 3},
+        "ramp-small": {"steps": steps, "return_validation": [[-2710.0, -2610.0, -2560.0]] * 3},
+    }
+    (tmp_path / "curves.json").write_text(json.dumps({"on-ramp": curves}))
+    table = imagined("on-ramp", "ramp", LOOKS_ON_RAMPS).tables["efficiency"](tmp_path).set_index("")
+    beyond = table["28,800"].tail(6)
+    assert list(beyond) == ["+310", "+210", "+170", "+260", "+160", "+110"]
+    assert beyond.index[5] == (
+        "with the model beyond “ours, few steps in small iterations” after 3 times as many"
+    )

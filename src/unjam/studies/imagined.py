@@ -54,7 +54,8 @@ def efficiency(road: str, compared: Sequence[str], looks: Sequence[int], folder:
     ]
     for name, times in zip(others, cycle(TIMES)):
         beyond = [seen[modelled](at) - seen[name](times * at) for at in looks]
-        label = f"with the model beyond “{VARIANTS[name].label}” after {times} times as many"
+        more = "as many" if times == 1 else f"{times} times as many"
+        label = f"with the model beyond “{VARIANTS[name].label}” after {more}"
         rows.append(_row(label, names, beyond, "+"))
     return pd.DataFrame(rows)
 
