@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from unjam.drivers.from_file import FileReference
 from unjam.errors import InputError
 from unjam.trust import TRUSTED, check_trusted, check_values, remember, trusting_code
 
@@ -63,6 +64,22 @@ def test_trust_ends_with_the_block_and_what_ran_in_it_is_remembered(code: Path) 
     with pytest.raises(InputError):
         check_trusted("run", other)
     assert TRUSTED not in os.environ
+
+
+def test_what_code_imports_from_beside_it_is_trusted_as_it_was(code: Path) -> None:
+    helper, file = code.with_name("helper_beside.py"), FileReference(code, "x")
+    helper.write_text("value = 1\n")
+    code.write_text("from helper_beside import value as x\n")
+    assert file.load() == 1
+    check_trusted("run", code)
+    helper.write_text("value = 22\n")
+    with pytest.raises(InputError, match="not as it is now"):
+        check_trusted("run", code)
+    assert file.load() == 22  # whoever names it runs it
+    check_trusted("run", code)
+    helper.unlink()
+    with pytest.raises(InputError):
+        check_trusted("run", code)
 
 
 def test_what_cannot_be_remembered_is_told_to_this_process_and_its_children(

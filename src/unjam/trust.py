@@ -57,20 +57,22 @@ def check_values(where: str, values: Any) -> None:
             check_values(where, value)
 
 
-def remember(code: Path) -> None:
+def remember(code: Path, imported: Iterable[Path] = ()) -> None:
     """Keep for later, and for children, that this user runs this code; else, for children alone.
 
-    The place belongs to it: beside the same file elsewhere may lie other modules that it imports.
+    The place belongs to it: beside the same file elsewhere may lie other modules that it imports. Those that
+    it `imported` are kept with it.
     """
     try:
-        key = _key(code)
+        key, others = _key(code), {_key(each): each for each in imported}
     except OSError:  # who loads it will be told
         return
-    if _is_known(key):
+    if _is_known(key) and (key in _told() or others.keys() <= _kept(key).keys()):
         return
+    lines = [os.fsencode(code), *(each.encode() + b" " + os.fsencode(path) for each, path in others.items())]
     try:
         _folder().mkdir(parents=True, exist_ok=True)
-        write_whole(_folder() / key, os.fsencode(code) + b"\n")
+        write_whole(_folder() / key, b"\n".join(lines) + b"\n")
     except (OSError, DiskError):
         os.environ[TRUSTED] = " ".join([*_told(), key])
 
@@ -91,7 +93,19 @@ def _key(code: Path) -> str:
 
 
 def _is_known(key: str) -> bool:
-    return key in _told() or (_folder() / key).is_file()
+    """Return whether code ran before, and what it imported then is as it was."""
+    if key in _told():
+        return True
+    try:
+        return all(_key(path) == kept for kept, path in _kept(key).items())
+    except OSError:
+        return False
+
+
+def _kept(key: str) -> dict[str, Path]:
+    """Return what code imported that ran before, by key; raise `OSError` where it never ran."""
+    others = (_folder() / key).read_bytes().splitlines()[1:]
+    return {line[:64].decode(): Path(os.fsdecode(line[65:])) for line in others}
 
 
 def _told() -> list[str]:

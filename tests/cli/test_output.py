@@ -92,8 +92,10 @@ def test_after_a_training_of_several_roads_it_is_the_whole_run_that_goes_on(
         (
             ["human", "pi"],
             {"cavs": 2, "actuation": "raw"},
-            "unjam train ring --expert pi --preset demo --set road.cavs=2 --set road.actuation=raw",
+            "unjam train ring --expert pi --preset demo --reward eq16 --set road.cavs=2 --set "
+            "road.actuation=raw",
         ),
+        (["unjam:best", "human"], {}, "unjam watch ring -d unjam:best --video ring.gif"),
     ],
 )
 def test_what_is_proposed_after_a_drive_is_for_the_same_road(
@@ -101,7 +103,7 @@ def test_what_is_proposed_after_a_drive_is_for_the_same_road(
 ) -> None:
     text = StringIO()
     monkeypatch.setattr(output, "aside", Console(file=text, width=400))
-    output.after_drive("ring", drivers, changes)
+    output.after_drive("ring", drivers, changes, "eq16")
     proposed = text.getvalue().strip().partition(": ")[2]
     assert proposed == words
     asked = shlex.split(proposed)

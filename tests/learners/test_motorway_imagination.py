@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from tests.learners.test_road_imagination import network_of
 from unjam.drivers.registry import named_driver
@@ -129,6 +130,28 @@ def test_it_imagines_as_many_episodes_as_are_asked_for_in_mirrored_pairs(actual:
     first, second = one.trajectories[0], mirrored.trajectories[0]
     calm = network(first.observations[:1])
     assert first.residual[0] + second.residual[0] == pytest.approx(2.0 * calm[0])
+
+
+@pytest.mark.usefixtures("often")
+def test_for_a_while_there_are_more_of_them_and_none_where_no_cav_comes(actual: list[Episode]) -> None:
+    imagination = MotorwayImagination(replace(VIRTUAL, k_max=80), Task(ROAD, EXPERT), POLICY, 0)
+    imagination.learn(actual[:2], 1)
+    network = replace(network_of(0.05, POLICY), lasts=True)
+    assert imagination.imagine(network, 1, 0, 1, HOW) is not None
+    assert imagination.steps == 2 * 160
+    imagination.k_star = 5
+    assert imagination.imagine(network, 2, 0, 64, HOW) is None
+
+
+def test_twins_meet_the_same_people_and_are_held_out_together(
+    actual: list[Episode], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen = list[NDArray[np.int64]]()
+    monkeypatch.setattr(motorways, "fit_people", lambda model, rows, *_, **__: seen.append(rows.episode))
+    kept = [moments_of_motorway(actual[0], number, ROAD, "idm") for number in (6, 7, 8)]
+    for twins, numbers in ((1, {6, 7, 8}), (2, {3, 4})):
+        motorways.fit_motorways(RoadModel(VIRTUAL, (0,)), kept, VIRTUAL, (0,), twins)
+        assert set(seen[-1].tolist()) == numbers
 
 
 def test_who_knows_nothing_of_following_takes_people_to_go_on_as_fast_as_they_are() -> None:

@@ -63,6 +63,16 @@ def test_differences_are_paired_and_stand_in_columns_of_their_own() -> None:
     assert better[4] == Cell("0.50", f"[{found.low:.2f}, {found.high:.2f}]")
 
 
+def test_a_difference_of_few_pairs_says_of_how_many() -> None:
+    never = {"time_to_dissolve": np.nan}
+    alone = [row | {"time_to_dissolve": 100.0} for row in rows_of(1.0, 1.0, 1.0, 1.0)]
+    pi = [row | ({"time_to_dissolve": 60.0 + k} if k < 3 else never) for k, row in enumerate(alone)]
+    gain = row_named(table_of({"human": alone, "pi": pi}, "human"), METRICS["time_to_dissolve"].label).cells[
+        2
+    ]
+    assert (gain.mean, gain.interval) == ("-39", "[-41, -37] 3 of 4")
+
+
 def test_a_cell_says_how_many_values_it_stands_for() -> None:
     assert cell_of(estimate([1.0, 1.0]), 2, 2) == Cell("1.00")
     assert cell_of(estimate([1.0, 3.0, np.nan]), 1, 3) == Cell("2.0", "(1.0 to 3.0) 2 of 3")

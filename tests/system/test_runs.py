@@ -33,7 +33,11 @@ def test_removing_asks_and_spares_what_is_no_run(unjam: Run, tmp_path: Path) -> 
     assert "with --yes" in asked.stderr
     assert unjam("runs", "remove", "ring-001", "runs", "--yes").returncode == 2
     assert (tmp_path / "runs" / "ring-001").is_dir()
-    assert unjam("runs", "remove", "ring-001", "--yes").returncode == 0
+    elsewhere = unjam("runs", "--under", "studies", "remove", "ring-001", "--yes")
+    assert elsewhere.returncode == 2
+    assert "allowed: behind it, as in unjam runs remove --under studies" in elsewhere.stderr
+    assert (tmp_path / "runs" / "ring-001").is_dir()
+    assert unjam("runs", "remove", "ring-001", "runs/ring-001", "--yes").returncode == 0
     assert not (tmp_path / "runs" / "ring-001").exists()
     assert (tmp_path / "runs" / "ring-002").is_dir()
 

@@ -116,6 +116,23 @@ def test_what_cannot_be_exported_is_refused(
     assert not Path(to).exists()
 
 
+def test_a_file_that_does_not_verify_leaves_the_one_before(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    to = tmp_path / "pi.unjam"
+    export_controller("pi", to, scenario="ring")
+    before = to.read_bytes()
+
+    def refuse(path: Path) -> None:
+        raise InputError(f"{path}: is another")
+
+    monkeypatch.setattr("unjam.training.export.verify_controller", refuse)
+    with pytest.raises(InputError, match="is another"):
+        export_controller("idm", to, scenario="ring")
+    assert [path.name for path in tmp_path.iterdir()] == ["pi.unjam"]
+    assert to.read_bytes() == before
+
+
 def test_a_car_that_obeys_late_gets_no_file_whose_filter_does_not_know_it(tmp_path: Path) -> None:
     config = small_config(steps=100, virtual__virtual_ratio=0.0, road__actuator__lag=0.5)
     with empty_pictures():

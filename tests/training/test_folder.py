@@ -1,3 +1,4 @@
+import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -99,6 +100,24 @@ def test_budget_and_workers_may_change_when_a_run_goes_on(tmp_path: Path) -> Non
     changed = replace(small_config(), steps=9 * STEPS, workers=7)
     continue_folder(tmp_path, changed)
     assert read_config(tmp_path) == changed
+
+
+def test_a_run_that_gave_up_takes_no_more_steps(tmp_path: Path) -> None:
+    config = small_config(evaluation__every=1, evaluation__patience=2)
+    start_folder(tmp_path, config)
+    rows = [{"iteration": n, "return_expert": 5.0, "return_validation": 4.0} for n in (1, 2, 3)]
+    (tmp_path / "progress.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    continue_folder(tmp_path, config)
+    with pytest.raises(InputError, match=rf"^steps: {9 * STEPS} is not allowed: evaluation.patience"):
+        continue_folder(tmp_path, replace(config, steps=9 * STEPS))
+    assert read_config(tmp_path) == config
+
+
+@pytest.mark.parametrize("words", ['title = "mine"\n', "[[tasks]]\nname = 'ring'\n"])
+def test_a_run_beside_a_strangers_config_goes_on(words: str, tmp_path: Path) -> None:
+    (tmp_path / "config.toml").write_text(words)
+    start_folder(tmp_path / "ring", small_config())
+    continue_folder(tmp_path / "ring", small_config())
 
 
 def test_a_run_whose_road_was_given_in_python_goes_on(tmp_path: Path) -> None:

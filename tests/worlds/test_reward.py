@@ -10,7 +10,15 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from unjam.errors import InputError
-from unjam.worlds.reward import AFTER_CRASH, REWARDS, Outcome, make_reward, released, time_headway
+from unjam.worlds.reward import (
+    AFTER_CRASH,
+    LEAST_AFTER_CRASH,
+    REWARDS,
+    Outcome,
+    make_reward,
+    released,
+    time_headway,
+)
 
 
 @st.composite
@@ -161,8 +169,19 @@ def test_tensors_earn_what_arrays_earn(outcome: Outcome, name: str) -> None:
 def test_travel_time_counts_who_is_there_and_who_waits(outcome: Outcome) -> None:
     found = REWARDS["travel-time"](outcome)["travel"]
     for row, waiting in enumerate(outcome.waiting.tolist()):
-        times = 1 + AFTER_CRASH * bool(outcome.crashed[row])  # to end an episode is to earn nothing
-        assert found[row] == pytest.approx(-times * (len(there(outcome.speeds[row])) + waiting) / 100.0)
+        count = len(there(outcome.speeds[row])) + waiting
+        closed = AFTER_CRASH * max(count, LEAST_AFTER_CRASH) if outcome.crashed[row] else 0
+        assert found[row] == pytest.approx(-(count + closed) / 100.0)
+
+
+def test_the_sooner_a_road_is_closed_by_a_crash_the_less_is_earned() -> None:
+    coming = np.minimum(np.arange(2400), 150)  # one a decision enters, up to a jam of 150
+    without = -coming.sum() / 100.0
+    crashed = [
+        -coming[: end + 1].sum() / 100.0 - AFTER_CRASH * max(int(coming[end]), LEAST_AFTER_CRASH) / 100.0
+        for end in (10, 60, 90, 600, 2399)
+    ]
+    assert max(crashed) < without
 
 
 @given(outcomes())

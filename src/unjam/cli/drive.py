@@ -109,7 +109,7 @@ def drive(
             aside.print(f"note: {note}", markup=False, soft_wrap=True)
         if result.report is not None:
             aside.print(f"report: {result.report}")
-        after_drive(scenario, driver, changes)
+        after_drive(scenario, driver, changes, reward)
     raise_failures(result)
 
 

@@ -154,7 +154,7 @@ def say_next(why: str, *words: object) -> None:
     aside.print(f"{why}: {shlex.join(['unjam', *map(str, words)])}", soft_wrap=True, markup=False)
 
 
-def after_drive(scenario: str, drivers: Sequence[str], changes: Mapping[str, Any]) -> None:
+def after_drive(scenario: str, drivers: Sequence[str], changes: Mapping[str, Any], reward: str) -> None:
     """Compare with people first, then learn on an expert, then look at what was learned, on the same road."""
     from unjam.drivers.registry import DRIVERS
 
@@ -163,9 +163,10 @@ def after_drive(scenario: str, drivers: Sequence[str], changes: Mapping[str, Any
         say_next("compare with people", *_command_without_out(), "-d", "human")
     elif experts and len(experts) == len(drivers) - 1:
         learn = "train", scenario, "--expert", experts[-1], "--preset", "demo"
-        say_next("learn on an expert", *learn, *as_options(changes, "road."))
-    elif drivers != ["human"]:
-        see = "watch", scenario, "-d", drivers[-1], "--video", f"{Path(scenario).stem}.gif"
+        earning = ("--reward", reward) if reward else ()
+        say_next("learn on an expert", *learn, *earning, *as_options(changes, "road."))
+    elif others := [driver for driver in drivers if driver != "human"]:
+        see = "watch", scenario, "-d", others[-1], "--video", f"{Path(scenario).stem}.gif"
         say_next("see it", *see, *as_options(changes))
     else:
         say_next("compare with an expert", *_command_without_out(), "-d", "pi")

@@ -42,6 +42,9 @@ def list_them(
       unjam runs remove ring-001
     """
     if context.invoked_subcommand is not None:
+        if under != RUNS or scenario or json:
+            allowed = f"behind it, as in unjam runs {context.invoked_subcommand} --under studies"
+            raise InputError(f"runs: options are not allowed before the command; allowed: {allowed}")
         return
     from unjam.training.runs import list_runs
 
@@ -161,4 +164,5 @@ def remove(
 def _read(names: Sequence[str], under: Path) -> list[Any]:
     from unjam.training.runs import find_run, read_run
 
-    return [read_run(find_run(name, under), name) for name in dict.fromkeys(names)]
+    found = (read_run(find_run(name, under), name) for name in names)
+    return list({run.folder.resolve(): run for run in found}.values())

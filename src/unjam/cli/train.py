@@ -99,10 +99,14 @@ def train(
         config = load_config(asked.file, asked.preset, changes)
         folder = new_folder(out, config.scenario)
     check_possible(config)
-    from unjam.reports.results import read_results  # and torch: seconds that nobody waits for a wrong word
+    from unjam.reports.results import (  # and torch: seconds that nobody waits for a wrong word
+        read_progress,
+        read_results,
+    )
     from unjam.reports.story import lead_of
     from unjam.training.config import steps_to_train
     from unjam.training.evaluate import Evaluation
+    from unjam.training.stopping import ends_early
     from unjam.training.tensorboard import tensorboard_into
     from unjam.training.train import train as run
 
@@ -136,7 +140,8 @@ def train(
         console.print(lead_of(judged), soft_wrap=True)
         aside.print(f"controller: {of.controller}")
         steps = max(config.steps, judged.progress[-1]["actual_steps"])
-        after_training(of.folder, of.gain, steps, result.folder)
+        if not ends_early(config, read_progress(result.folder)):
+            after_training(of.folder, of.gain, steps, result.folder)
     aside.print(f"report: {result.report}")
 
 

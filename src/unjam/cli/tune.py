@@ -106,4 +106,6 @@ def tune(
         f"{best.driver}: {best.score:.4g} on tuning seeds; {default.driver}: {before}", soft_wrap=True
     )
     on = FAMILY[next(iter(roads))].scenario if scenario in GROUPS else scenario
-    say_next("drive with it", "drive", on, "--driver", found.file, "--held-out", *as_options(changes))
+    earning = ("--reward", reward) if reward else ()
+    words = "drive", on, "--driver", found.file, "--held-out", *earning, *as_options(changes)
+    say_next("drive with it", *words)

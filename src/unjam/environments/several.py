@@ -1,6 +1,7 @@
 """A road with several CAVs as a PettingZoo environment."""
 
 from collections.abc import Iterable, Sequence
+from copy import deepcopy
 from typing import Any, ClassVar
 
 import numpy as np
@@ -39,8 +40,10 @@ class ParallelRoad(ParallelEnv[str, Any, Any]):
         self._gone: set[str] = set()
         """whose vehicle has left: where it comes back, only its expert drives it, as no agent does"""
         self.render_mode = None
-        self.observation_spaces = dict.fromkeys(self.possible_agents, self._road.observation_space)
-        self.action_spaces = dict.fromkeys(self.possible_agents, self._road.action_space)
+        self.observation_spaces = {
+            agent: deepcopy(self._road.observation_space) for agent in self.possible_agents
+        }
+        self.action_spaces = {agent: deepcopy(self._road.action_space) for agent in self.possible_agents}
 
     def observation_space(self, agent: str) -> spaces.Box:
         """Return the observation space of one CAV."""

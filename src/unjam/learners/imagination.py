@@ -113,8 +113,8 @@ class Imagination(Generic[Model]):
         """Add actual episodes to D_a, fit the model to it, and find the rollout length of Eq. 15."""
         first = self.data.episodes
         self.data.add(episodes, self.scenario)
-        newest = [kept for kept in self.data.recordings if kept.episode >= first]
-        self._first, self._actual = first, sum(len(kept.reward) for kept in newest)
+        driven = (len(each.reward) for episode in episodes for each in episode.trajectories)
+        self._first, self._actual = first, sum(driven)
         settings = self.settings
         if settings.calibrate and first == 0:
             states = (kept.states for kept in self.data.recordings)
@@ -223,8 +223,14 @@ class WholeRoads(Imagination[RoadModel], Generic[Kept]):
     @property
     def _unseen(self) -> Kept:
         """The newest episode that no network learned from, if there is one."""
-        share = self.settings.holdout
-        return ([each for each in self.moments if is_held_out(each.episode, share)] or self.moments)[-1]
+        share, twins = self.settings.holdout, self._twins
+        unseen = [each for each in self.moments if is_held_out(each.episode // twins, share)]
+        return (unseen or self.moments)[-1]
+
+    @property
+    def _twins(self) -> int:
+        """How many episodes in a row meet the same people: they are held out together."""
+        return len(self._policy.explores)
 
     def learn(self, episodes: Sequence[Episode], iteration: int) -> None:
         """Add actual episodes to D_a, fit the model to it, and find the rollout length of Eq. 15."""

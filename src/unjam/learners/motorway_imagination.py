@@ -60,15 +60,15 @@ class MotorwayImagination(WholeRoads[MotorwayMoments]):
         return moments_of_motorway(episode, number, cast(OnRamp, self.scenario), self.model.base)
 
     def _fit_moments(self, seed: Sequence[int]) -> Fit:
-        return fit_motorways(self.model, self.moments, self.settings, seed)
+        return fit_motorways(self.model, self.moments, self.settings, seed, self._twins)
 
     def imagine(
         self, network: Network, iteration: int, part: int, parts: int, how: AsExperience
     ) -> Experience | None:
         """Return what the policy `network` does where the people of actual episodes come once more.
 
-        In all `parts` of an iteration together there are `virtual_ratio` times as many episodes as newest
-        actual ones; None where they are not trusted.
+        In all `parts` of an iteration together there are `virtual_ratio` times as many decisions as in the
+        newest actual episodes; None where they are not trusted, or no CAV comes.
         """
         driver = full_policy(self._task, self._policy, network)
         decisions = min(self.k_star, self.scenario.horizon) // driver.hold * driver.hold
@@ -78,7 +78,8 @@ class MotorwayImagination(WholeRoads[MotorwayMoments]):
             self._seed(iteration, each, part) for each in (STARTS, NOISE, EXPLORATION)
         )
         signs = self._policy.explores
-        count = max(1, round(self.settings.virtual_ratio * len(self._newest) / parts / len(signs)))
+        episodes = self.settings.virtual_ratio * self._driven * self.scenario.horizon / decisions
+        count = max(1, round(episodes / parts / len(signs)))
         chosen = np.random.default_rng(list(starts)).integers(len(self.moments), size=count).tolist()
         kept = [self.moments[each] for each in chosen for _ in signs]
         earned, crashed, found = list[float](), list[bool](), list[Experience]()
@@ -91,11 +92,12 @@ class MotorwayImagination(WholeRoads[MotorwayMoments]):
             self.steps += sum(episode.steps for episode in episodes)
             earned += [float(episode.reward.sum()) for episode in episodes]
             crashed += [episode.status == "collision" for episode in episodes]
-            found.append(how.of_episodes(episodes))
+            if any(episode.trajectories for episode in episodes):
+                found.append(how.of_episodes(episodes))
         if part == 0:
             self._note(kept, earned, decisions)
             self.facts["crash_share"] = float(np.mean(crashed))
-        return join(found)
+        return join(found) if found else None
 
     def waves(self, drive: Callable[[EpisodeTask], Episode]) -> Waves:
         """Return an actual road that no network learned from, and those where its people come once more.
@@ -146,9 +148,9 @@ class MotorwayImagination(WholeRoads[MotorwayMoments]):
         return beside_known(model, generator, steps, self.settings.noise)
 
     @property
-    def _newest(self) -> list[MotorwayMoments]:
-        """Those of the newest policy's episodes."""
-        return [each for each in self.moments if each.episode >= self._first]
+    def _driven(self) -> int:
+        """How many episodes the newest policy drove, whether all of them are kept or not."""
+        return self.data.episodes - self._first
 
     def _note(self, kept: Sequence[MotorwayMoments], earned: Sequence[float], decisions: int) -> None:
         """Note what the policy that drove the newest actual episodes earned here and there."""

@@ -88,8 +88,8 @@ def table_of(rows_by_driver: Rows, baseline: str) -> list[TableRow]:
             cell_of(estimate_of(rows, name), metric.digits, len(rows)) for rows in rows_by_driver.values()
         ]
         cells += [
-            cell_of(paired_difference(rows, rows_by_driver[baseline], name), metric.digits, sign="+")
-            for rows in compared.values()
+            cell_of(paired_difference(rows, people, name), metric.digits, min(len(rows), len(people)), "+")
+            for rows, people in ((rows, rows_by_driver[baseline]) for rows in compared.values())
         ]
         about = " ".join((metric.function.__doc__ or "").split())
         table.append(TableRow(metric.label, metric.unit, about, cells))

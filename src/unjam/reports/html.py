@@ -68,9 +68,19 @@ def write_report(folders: Sequence[Path], target: Path) -> Path:
     try:
         page = render(results)
     except DAMAGED as error:
-        raise damaged(folders[0], error) from error
+        raise damaged(_damaged_of(folders, results), error) from error
     write_whole(target, page)
     return target
+
+
+def _damaged_of(folders: Sequence[Path], results: Sequence[Results]) -> Path:
+    """Return the first folder whose results cannot be shown alone."""
+    for folder, found in zip(folders, results, strict=True):
+        try:
+            render([found])
+        except DAMAGED:
+            return folder
+    return folders[0]
 
 
 def filled(template: str, **values: Any) -> str:

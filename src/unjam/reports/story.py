@@ -232,8 +232,8 @@ def cards_of(result: Results) -> list[dict[str, str]]:
 def against_people(columns: Sequence[Column]) -> dict[str, Any]:
     """Return the table of differences to people alone in the same folder, seeds paired; empty without them.
 
-    A cell is marked better or worse where its interval lies on one side of zero: each for itself, so that of
-    twenty cells one is marked by chance.
+    A cell is marked better or worse where its interval lies on one side of zero, of all pairs: each for
+    itself, so that of twenty cells one is marked by chance.
     """
     others = [(column, column.people) for column in columns if column.people is not None]
     if not others:
@@ -245,10 +245,11 @@ def against_people(columns: Sequence[Column]) -> dict[str, Any]:
         if not any(gain.count for gain in gains):
             continue
         cells = []
-        for gain in gains:
-            shown = gain.low > 0 or gain.high < 0
+        for gain, (column, people) in zip(gains, others, strict=True):
+            pairs = min(len(column.rows), len(people))
+            shown = (gain.low > 0 or gain.high < 0) and gain.count == pairs
             mark = ("better" if (gain.mean > 0) == (better is MORE) else "worse") if shown else ""
-            cells.append({"text": str(cell_of(gain, metric.digits, sign="+")), "mark": mark})
+            cells.append({"text": str(cell_of(gain, metric.digits, pairs, "+")), "mark": mark})
         rows.append({"label": metric.label, "unit": metric.unit, "cells": cells})
     return {"names": [column.name for column, _ in others], "rows": rows}
 

@@ -19,6 +19,7 @@ from unjam.errors import InputError, wrong
 from unjam.learners.settings import Agents, PolicySettings
 from unjam.parameters import STRICT, Count, CountOrNone, Positive, build, changed, flat, nested, parse_toml
 from unjam.scenarios import SCENARIOS, make_scenario
+from unjam.scenarios.on_ramp import OnRamp
 from unjam.scenarios.scenario import Scenario
 from unjam.training.presets import preset_values
 from unjam.training.sampling import Sampling, episodes_of_iteration, shares_by_weight
@@ -133,6 +134,10 @@ class RunConfig(Agents):
         if self.policy.lasts and self.agent not in ("trpo", "ppo"):
             kind = self.policy.exploration
             raise ValueError(f"policy.exploration: {kind} is not allowed; allowed: anew, for {self.agent}")
+        on_ramps = imagines == "road" and all(isinstance(road, OnRamp) for road in scenarios)
+        if self.policy.exploration == "mirrored" and imagines and not on_ramps:
+            allowed = "anew, lasting, for what is imagined here has no twins"
+            raise ValueError(f"policy.exploration: mirrored is not allowed; allowed: {allowed}")
         if self.sampling == "regret" and (len(self.tasks) < 2 or self.evaluation.every == 0):
             raise ValueError(
                 "sampling: regret is not allowed; allowed: weights, but for several validated tasks"

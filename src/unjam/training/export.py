@@ -141,8 +141,14 @@ def export_controller(source: str | Path, to: str | Path, onnx: bool = False, sc
             why = f"{road.title} does not tell {', '.join(missed)}; allowed: --scenario of a road that does"
             raise InputError(f"onnx: {driver.describe()} is not allowed: {why}")
         graph = {GRAPH: onnx_graph(driver, limit)}
-    write_whole(to, controller_bytes(driver, about, {SAMPLE: sample_bytes(driver, states, limit), **graph}))
-    verify_controller(to)
+    made = controller_bytes(driver, about, {SAMPLE: sample_bytes(driver, states, limit), **graph})
+    unverified = to.with_name(f".{to.stem}.new{to.suffix}")
+    try:
+        write_whole(unverified, made)
+        verify_controller(unverified)
+    finally:
+        unverified.unlink(missing_ok=True)
+    write_whole(to, made)  # what was there before is good until then
     beside = to.with_suffix(".onnx") if graph else None
     if beside is not None:
         write_whole(beside, graph[GRAPH])

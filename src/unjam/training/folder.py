@@ -6,7 +6,7 @@ are made at the end of iterations: written whole, checked by hash, two generatio
 
 import json
 import shutil
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
@@ -27,6 +27,7 @@ from unjam.scenarios.on_ramp import OnRamp
 from unjam.scenarios.scenario import Scenario
 from unjam.training.belonging import belonging, check_belongs, check_files
 from unjam.training.config import RunConfig, load_config, read_toml, to_toml
+from unjam.training.stopping import ends_early
 from unjam.worlds.episode import check_can_drive, check_can_see
 from unjam.worlds.reward import make_reward
 
@@ -148,11 +149,14 @@ def continue_folder(folder: Path, config: RunConfig) -> None:
             one road of a run of several.
     """
     whole = folder.absolute().parent
-    if (whole / "config.toml").is_file() and folder.name in read_config(whole).roads():
+    if folder.name in _roads_of(whole):
         raise InputError(f"resume: {str(folder)!r} is one road of a run of several; allowed: {whole}")
     before = read_config(folder)
     if replace(before, steps=config.steps, workers=config.workers) != config:
         raise InputError("resume: only steps and workers may change; all else is the run's")
+    if config.steps > before.steps and ends_early(before, read_progress(folder)):
+        why = f"evaluation.patience or evaluation.converged ended it; allowed: {before.steps}, or a new run"
+        raise InputError(f"steps: {config.steps} is not allowed: {why}")
     if config.steps < before.steps:
         made = max((row.get("actual_steps", 0) for row in read_progress(folder)), default=0)
         if config.steps < made:
@@ -161,6 +165,14 @@ def continue_folder(folder: Path, config: RunConfig) -> None:
         write_whole(folder / "config.toml", to_toml(config))
     if not (folder / MANIFEST).is_file():  # it was stopped before it had written that
         write_whole(folder / MANIFEST, to_json(manifest(), indent=1))
+
+
+def _roads_of(folder: Path) -> Collection[str]:
+    """Return the names of the roads of a run of several; what is none has none."""
+    with suppress(InputError):
+        if (folder / MANIFEST).is_file():
+            return read_config(folder, to_run=False).roads()
+    return ()
 
 
 def note_lineage(folder: Path, iteration: int) -> None:

@@ -184,14 +184,21 @@ def beside_known(
 
 
 def fit_motorways(
-    model: RoadModel, kept: Sequence[MotorwayMoments], settings: VirtualSettings, seed: Sequence[int]
+    model: RoadModel,
+    kept: Sequence[MotorwayMoments],
+    settings: VirtualSettings,
+    seed: Sequence[int],
+    twins: int = 1,
 ) -> Fit:
     """Teach `model` what people did beside the base; what they misjudge is no ignorance.
+
+    So many `twins` in a row meet the same people: they are held out together.
 
     Raises:
         UnjamError: a loss is not finite.
     """
     rows = PeopleRows(*(np.concatenate(each) for each in zip(*(one.people for one in kept), strict=True)))
+    rows = rows._replace(episode=rows.episode // twins)
     sigma = float(np.sqrt(np.mean([one.noise for one in kept])))
     least = 0.0 if model.base == "none" else LEAST
     return fit_people(model, rows, sigma, settings, seed, noise_known=False, least=least)

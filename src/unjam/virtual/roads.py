@@ -179,7 +179,7 @@ def _inputs(speed: Array, leader_speed: Array, gap: Array, known: Array) -> Tens
 
 
 def residual_of(model: RoadModel, generator: torch.Generator) -> Learned | None:
-    """Return what the networks add, a random one for each vehicle; None where that is nothing."""
+    """Return what the networks add, a random one for each 64 vehicles; None where that is nothing."""
     if not model.learned.any():
         return None
     layers = model.layers()

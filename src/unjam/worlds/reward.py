@@ -21,6 +21,8 @@ MERGE_VEHICLES = 30.0
 """scale of how many are on the road in power: about as many as on the merge in free flow"""
 AFTER_CRASH = 2_400
 """decisions for which a crash closes a road, to its reward: the whole of an on-ramp's episode"""
+LEAST_AFTER_CRASH = 200
+"""how many wait then, at least, for others were still to come: more than in an on-ramp's longest jam"""
 STANDING = 1e-3
 """speed below which a time headway means nothing [m/s]"""
 
@@ -121,10 +123,11 @@ def travel_time(outcome: Outcome) -> dict[str, Array]:
 
     Whoever wants to drive is given by the demand, so that the sum over an episode is, but for its scale, the
     mean travel time with waiting: nothing is earned by keeping vehicles out. Nor by a crash, which ends the
-    episode: who is there then waits for `AFTER_CRASH` decisions.
+    episode: who is there then, and at least `LEAST_AFTER_CRASH`, wait for `AFTER_CRASH` decisions.
     """
-    there = (~namespace(outcome.speeds).isnan(outcome.speeds)).sum(-1)
-    return {"travel": -(there + outcome.waiting) / 100.0 * (1 + AFTER_CRASH * outcome.crashed)}
+    there = (~namespace(outcome.speeds).isnan(outcome.speeds)).sum(-1) + outcome.waiting
+    closed = AFTER_CRASH * at_least(there, LEAST_AFTER_CRASH) * outcome.crashed
+    return {"travel": -(there + closed) / 100.0}
 
 
 def too_close(outcome: Outcome) -> Array:
