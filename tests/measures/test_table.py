@@ -67,9 +67,8 @@ def test_a_difference_of_few_pairs_says_of_how_many() -> None:
     never = {"time_to_dissolve": np.nan}
     alone = [row | {"time_to_dissolve": 100.0} for row in rows_of(1.0, 1.0, 1.0, 1.0)]
     pi = [row | ({"time_to_dissolve": 60.0 + k} if k < 3 else never) for k, row in enumerate(alone)]
-    gain = row_named(table_of({"human": alone, "pi": pi}, "human"), METRICS["time_to_dissolve"].label).cells[
-        2
-    ]
+    table = table_of({"human": alone, "pi": pi}, "human")
+    gain = row_named(table, METRICS["time_to_dissolve"].label).cells[2]
     assert (gain.mean, gain.interval) == ("-39", "[-41, -37] 3 of 4")
 
 

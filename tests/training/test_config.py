@@ -110,6 +110,10 @@ def test_merging_changes_neither_side() -> None:
             "policy.exploration: mirrored is not allowed; allowed: anew, for sac",
         ),
         (
+            {"policy.exploration": "mirrored", "virtual.model": "road"},
+            "policy.exploration: mirrored is not allowed; allowed: anew, lasting, for what is imagined here",
+        ),
+        (
             {"policy.afterwards": True},
             "policy.afterwards: true is not allowed; allowed: false where rows are imagined",
         ),
