@@ -181,7 +181,9 @@ def test_a_run_that_imagines_an_on_ramp_shows_its_waves_lane_by_lane(world: str,
     roads = {label: np.array(road["speeds"], float) for label, road in found["waves"].items()}
     assert list(roads) == ["recorded", "imagined", "base"]
     came = {label: (~np.isnan(speeds)).sum() for label, speeds in roads.items()}
-    assert came["recorded"] == came["imagined"] == came["base"] > 0  # the same people at the same times
+    assert came["imagined"] == came["base"] > 0  # the same people at the same times
+    alike = 0.0 if world == "batch" else 0.1  # SUMO lets some enter a second sooner or later than the batch
+    assert came["recorded"] == pytest.approx(came["base"], rel=alike)
     assert not np.array_equal(roads["recorded"], roads["base"], equal_nan=True)  # who misjudge anew
     drawn = waves(found)
     titles = [axes.get_title(loc="left") or axes.get_title() for axes in drawn.axes]

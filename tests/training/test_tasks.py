@@ -182,6 +182,7 @@ def test_a_training_in_the_batch_is_that_in_sumo(agent: str, exploration: str, t
     for world in ("sumo", "batch"):
         with Workers(1) as workers:
             how = {"world": world, "agent": agent, "policy.exploration": exploration}
+            how |= {"virtual.virtual_ratio": 0.0} if exploration == "mirrored" else {}
             learn_with(workers, tmp_path / world, small_config(**mixture, **how))
         runs[world] = read_progress(tmp_path / world)
     for one, other in zip(runs["sumo"], runs["batch"], strict=True):
