@@ -86,13 +86,10 @@ class FileReference:
             raise InputError(f"{path.name}: {type(error).__name__} when loading it: {error}") from error
         finally:
             sys.path.remove(str(path.parent))
-            neighbours = [
-                name for name in set(sys.modules) - before if _lies_in(sys.modules[name], path.parent)
-            ]
-            files = [
-                Path(str(sys.modules.pop(name).__file__)) for name in neighbours
-            ]  # others have that name
-            remember(path, [file for file in files if file.resolve() != path.resolve()])
+            new = set(sys.modules) - before
+            neighbours = [name for name in new if _lies_in(sys.modules[name], path.parent)]
+            # Another folder's file may have neighbours of these names.
+            remember(path, [Path(str(sys.modules.pop(name).__file__)) for name in neighbours])
         if not hasattr(module, self.name):
             public = ", ".join(key for key in vars(module) if not key.startswith("_")) or "nothing"
             raise InputError(f"{path.name}: has no {self.name!r}; it has: {public}")

@@ -22,7 +22,8 @@ MERGE_VEHICLES = 30.0
 AFTER_CRASH = 2_400
 """decisions for which a crash closes a road, to its reward: the whole of an on-ramp's episode"""
 LEAST_AFTER_CRASH = 200
-"""how many wait then, at least, for others were still to come: more than in an on-ramp's longest jam"""
+"""how many wait then, at least, for others were still to come: on an on-ramp, where 3,700 vehicles an hour
+take people's 154 s, some 160 are there"""
 STANDING = 1e-3
 """speed below which a time headway means nothing [m/s]"""
 
