@@ -15,6 +15,7 @@ import libsumo
 import numpy as np
 import sumo
 
+from unjam.files import to_json, write_whole
 from unjam.manifest import manifest
 from unjam.measures.statistics import estimate
 
@@ -52,19 +53,8 @@ def episode(seed: int, follower: str, folder: Path) -> Found:
             f'<vType id="car" length="5" minGap="2.5" speedFactor="1" speedDev="0.1" {FOLLOWERS[follower]}/>'
         )
         types.write_text(f"<additional>{line}</additional>")
-    command = [
-        "sumo",
-        "-c",
-        RAMP,
-        "--seed",
-        seed,
-        "--end",
-        END,
-        "--step-length",
-        STEP,
-        "--no-step-log",
-        "--no-warnings",
-    ]
+    command = ["sumo", "-c", RAMP, "--seed", seed, "--end", END, "--step-length", STEP]
+    command += ["--no-step-log", "--no-warnings"]
     command += ["--time-to-teleport", -1, "--max-depart-delay", -1, "--collision.action", "warn"]
     command += ["--additional-files", types if follower else folder / "nothing.add.xml"]
     libsumo.start([str(word) for word in command])
@@ -128,9 +118,7 @@ def main() -> None:
         "travel_time": float(np.mean([one.travel_time for one in people])),
         "flow": float(np.mean([one.flow for one in people])),
     }
-    asked.out.write_text(
-        json.dumps({"manifest": manifest(), "people": alone, "followers": rows}, indent=1) + "\n"
-    )
+    write_whole(asked.out, to_json({"manifest": manifest(), "people": alone, "followers": rows}, indent=1))
 
 
 if __name__ == "__main__":

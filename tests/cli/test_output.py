@@ -76,8 +76,19 @@ def test_after_a_training_of_several_roads_it_is_the_whole_run_that_goes_on(
 ) -> None:
     text = StringIO()
     monkeypatch.setattr(output, "aside", Console(file=text, width=200))
-    output.after_training(Path("runs/all/ring"), estimate([0.0, 0.0]), 100, Path("runs/all"))
+    output.after_training(Path("runs/all/ring"), estimate([0.0, 0.0]), 100, Path("runs/all"), over=False)
     assert "unjam train --resume runs/all --steps 200" in text.getvalue()
+
+
+def test_a_training_that_is_over_is_shipped_where_it_gained_and_not_trained_on_where_it_did_not(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    text = StringIO()
+    monkeypatch.setattr(output, "aside", Console(file=text, width=200))
+    output.after_training(Path("runs/one"), estimate([0.0, 0.0]), 100, Path("runs/one"), over=True)
+    assert text.getvalue() == ""
+    output.after_training(Path("runs/one"), estimate([5.0, 6.0, 7.0]), 100, Path("runs/one"), over=True)
+    assert text.getvalue() == "ship it: unjam export runs/one --to one.unjam\n"
 
 
 @pytest.mark.parametrize(

@@ -32,6 +32,13 @@ def test_what_may_be_nothing_has_no_mark_and_what_is_unknown_no_row() -> None:
     assert [(row["label"], row["cells"][0]["mark"]) for row in found["rows"]] == [("fuel", "")]
 
 
+def test_a_difference_of_few_of_the_pairs_says_of_how_many_and_has_no_mark() -> None:
+    people = column("human", [100.0, 200.0, 300.0, 400.0])
+    found = against_people([people, column("pi", [90.0, 191.0, 289.0, float("nan")], people)])
+    [fuel] = found["rows"]
+    assert fuel["cells"] == [{"text": "-10.0 [-12.5, -7.5] 3 of 4", "mark": ""}]
+
+
 def test_each_stands_beside_the_people_of_its_own_folder() -> None:
     others = column("b: human", [1100.0, 1200.0, 1300.0])
     pairs = (("a", PEOPLE, 0.0), ("b", others, 1000.0))

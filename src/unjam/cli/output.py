@@ -163,8 +163,7 @@ def after_drive(scenario: str, drivers: Sequence[str], changes: Mapping[str, Any
         say_next("compare with people", *_command_without_out(), "-d", "human")
     elif experts and len(experts) == len(drivers) - 1:
         learn = "train", scenario, "--expert", experts[-1], "--preset", "demo"
-        earning = ("--reward", reward) if reward else ()
-        say_next("learn on an expert", *learn, *earning, *as_options(changes, "road."))
+        say_next("learn on an expert", *learn, *as_options(changes, "road.", reward))
     elif others := [driver for driver in drivers if driver != "human"]:
         see = "watch", scenario, "-d", others[-1], "--video", f"{Path(scenario).stem}.gif"
         say_next("see it", *see, *as_options(changes))
@@ -172,8 +171,10 @@ def after_drive(scenario: str, drivers: Sequence[str], changes: Mapping[str, Any
         say_next("compare with an expert", *_command_without_out(), "-d", "pi")
 
 
-def as_options(changes: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
-    """Yield the options that change a scenario so."""
+def as_options(changes: Mapping[str, Any], prefix: str = "", reward: str = "") -> Iterator[str]:
+    """Yield the options that ask for a reward, if there is one, and change a scenario so."""
+    if reward:
+        yield from ("--reward", reward)
     for key, value in changes.items():
         yield from ("--set", f"{prefix}{key}={value if isinstance(value, str) else json.dumps(value)}")
 
@@ -187,13 +188,14 @@ def _command_without_out() -> list[str]:
     return [word for word in words if not word.startswith("--out=")]
 
 
-def after_training(folder: Path, gain: "Estimate | None", steps: int, run: Path) -> None:
-    """Ship what gained, train on what did not; a single held-out seed shows nothing.
+def after_training(folder: Path, gain: "Estimate | None", steps: int, run: Path, over: bool) -> None:
+    """Ship what gained, train on what did not, unless that is `over`; a single held-out seed shows nothing.
 
     `folder` is a road's, `run` that of the training: the same, where it is of one road.
     """
     if gain is not None and not gain.low > 0:
-        say_next("no gain is shown; train longer", "train", "--resume", run, "--steps", 2 * steps)
+        if not over:
+            say_next("no gain is shown; train longer", "train", "--resume", run, "--steps", 2 * steps)
     else:
         say_next("export it" if gain is None else "ship it", "export", folder, "--to", f"{folder.name}.unjam")
 

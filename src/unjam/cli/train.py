@@ -140,8 +140,8 @@ def train(
         console.print(lead_of(judged), soft_wrap=True)
         aside.print(f"controller: {of.controller}")
         steps = max(config.steps, judged.progress[-1]["actual_steps"])
-        if not ends_early(config, read_progress(result.folder)):
-            after_training(of.folder, of.gain, steps, result.folder)
+        over = ends_early(config, read_progress(result.folder))
+        after_training(of.folder, of.gain, steps, result.folder, over)
     aside.print(f"report: {result.report}")
 
 

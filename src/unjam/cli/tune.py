@@ -106,6 +106,5 @@ def tune(
         f"{best.driver}: {best.score:.4g} on tuning seeds; {default.driver}: {before}", soft_wrap=True
     )
     on = FAMILY[next(iter(roads))].scenario if scenario in GROUPS else scenario
-    earning = ("--reward", reward) if reward else ()
-    words = "drive", on, "--driver", found.file, "--held-out", *earning, *as_options(changes)
-    say_next("drive with it", *words)
+    options = as_options(changes, reward=reward)
+    say_next("drive with it", "drive", on, "--driver", found.file, "--held-out", *options)

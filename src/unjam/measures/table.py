@@ -13,6 +13,7 @@ from unjam.measures.statistics import (
     digits_of,
     estimate_of,
     interval_of,
+    paired,
     paired_by_training,
     paired_difference,
     probability_of_improvement,
@@ -70,6 +71,7 @@ def table_of(rows_by_driver: Rows, baseline: str) -> list[TableRow]:
     A cell per driver, then the differences to the baseline, same seeds paired; none without one.
     """
     compared = _compared(rows_by_driver, baseline)
+    pairs = {label: len(paired(rows, rows_by_driver[baseline])) for label, rows in compared.items()}
     said = [Cell(verdict or "–") for verdict in verdicts(rows_by_driver).values()]
     about = "The first reason against it; docs: What a car can drive."
     table = [TableRow("could a car drive so?", "", about, [*said, *(Cell("") for _ in compared)])]
@@ -88,8 +90,8 @@ def table_of(rows_by_driver: Rows, baseline: str) -> list[TableRow]:
             cell_of(estimate_of(rows, name), metric.digits, len(rows)) for rows in rows_by_driver.values()
         ]
         cells += [
-            cell_of(paired_difference(rows, people, name), metric.digits, min(len(rows), len(people)), "+")
-            for rows, people in ((rows, rows_by_driver[baseline]) for rows in compared.values())
+            cell_of(paired_difference(rows, rows_by_driver[baseline], name), metric.digits, pairs[label], "+")
+            for label, rows in compared.items()
         ]
         about = " ".join((metric.function.__doc__ or "").split())
         table.append(TableRow(metric.label, metric.unit, about, cells))

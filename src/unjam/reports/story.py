@@ -10,7 +10,7 @@ import pandas as pd
 from unjam.measures.drivable import DRIVABLE, verdicts
 from unjam.measures.effect import Effect, beside_people
 from unjam.measures.metrics import METRICS
-from unjam.measures.statistics import estimate_of, paired_difference, signed, verdict_on
+from unjam.measures.statistics import estimate_of, paired, paired_difference, signed, verdict_on
 from unjam.measures.table import PEOPLE, baseline_of, cell_of
 from unjam.reports.results import Results, Shown
 
@@ -246,7 +246,7 @@ def against_people(columns: Sequence[Column]) -> dict[str, Any]:
             continue
         cells = []
         for gain, (column, people) in zip(gains, others, strict=True):
-            pairs = min(len(column.rows), len(people))
+            pairs = len(paired(column.rows, people))
             shown = (gain.low > 0 or gain.high < 0) and gain.count == pairs
             mark = ("better" if (gain.mean > 0) == (better is MORE) else "worse") if shown else ""
             cells.append({"text": str(cell_of(gain, metric.digits, pairs, "+")), "mark": mark})
