@@ -281,7 +281,10 @@ def test_train_go_on_drive_and_export(unjam: Run, tmp_path: Path) -> None:
     }
     assert document(unjam("verify", "ring.unjam", "--json"))["verified"].keys() >= {"weights", "sample"}
     assert "ok sample: 80 decisions" in unjam("verify", "ring.unjam").stdout
-    assert "ring.unjam: " in unjam("export", "run", "--to", "ring.unjam").stdout
+    (tmp_path / "ring.onnx").write_text("of another controller")
+    written = unjam("export", "run", "--to", "ring.unjam")
+    assert "ring.unjam: " in written.stdout
+    assert "ring.onnx was there before: it is not the graph of this controller" in written.stderr
     drive = ("drive", "ring", "--driver", "ring.unjam", *SMALL, "-n", 1, "--json")
     again = document(unjam(*drive, pictures=False))
     assert again["mean"] == driven["mean"]

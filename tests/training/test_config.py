@@ -118,6 +118,10 @@ def test_merging_changes_neither_side() -> None:
             "policy.afterwards: true is not allowed; allowed: false where rows are imagined",
         ),
         (
+            {"policy.remember": True, "policy.observe": ["local"]},
+            "policy.remember: true is not allowed; allowed: false, where expert_memory is not observed",
+        ),
+        (
             {"road.simulation_step": 0.0333},
             "scenario ring.simulation_step: 0.0333 is not allowed; allowed: a whole number of milliseconds",
         ),

@@ -7,7 +7,7 @@ import pytest
 
 from tests.training.test_run import STEPS, controller_manifest, learn_with, outcome, small_config
 from unjam.errors import MissingPartError
-from unjam.reports.results import read_progress
+from unjam.reports.results import read_progress, validations_of
 from unjam.training.stopping import gave_up, has_converged
 from unjam.training.tensorboard import FOLDER, tensorboard_into
 from unjam.training.train import Trainer
@@ -60,6 +60,19 @@ def test_the_policy_that_has_converged_is_the_controller(tmp_path: Path) -> None
     returns = [row["return_mean"] for row in read_progress(tmp_path / "run")]
     assert returns[-1] <= returns[-2]
     assert controller_manifest(tmp_path / "run")["iteration"] == len(returns) < 20
+
+
+def test_the_validation_of_what_has_converged_is_in_its_progress_and_judges_a_trial(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    returns = iter([5.0, 7.5])  # of the expert, and where it ends: before any validation was due
+    monkeypatch.setattr(Trainer, "returns_of", lambda *given: [next(returns)])
+    config = small_config(steps=20 * STEPS, evaluation__every=50, evaluation__converged=1)
+    with Workers(1) as workers:
+        learn_with(workers, tmp_path / "run", config)
+    found = [row["return_validation"] for row in read_progress(tmp_path / "run")]
+    assert found == [None] * (len(found) - 1) + [7.5]
+    assert validations_of(read_progress(tmp_path / "run")) == (2.5, 2.5)
 
 
 @pytest.mark.long

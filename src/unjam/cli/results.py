@@ -198,6 +198,10 @@ def export(
         return
     for written in filter(None, (done.file, done.graph)):
         console.print(f"{written}: {written.stat().st_size:,} bytes")
+    if done.graph is None and (older := to.with_suffix(".onnx")).exists():
+        aside.print(
+            f"{older} was there before: it is not the graph of this controller; --onnx draws that one"
+        )
     aside.print(f"{done.driver}, verified on {done.decisions:,} decisions of a held-out episode")
 
 

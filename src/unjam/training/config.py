@@ -13,6 +13,7 @@ from pydantic.dataclasses import dataclass
 
 from unjam.drivers.car_following import Constant
 from unjam.drivers.driver import Driver
+from unjam.drivers.from_file import is_file_reference
 from unjam.drivers.observation import observed
 from unjam.drivers.wrappers import Remembering
 from unjam.errors import InputError, wrong
@@ -123,6 +124,11 @@ class RunConfig(Agents):
         imagines = self.virtual.model if self.virtual.virtual_ratio > 0 else ""
         if self.policy.afterwards and imagines == "row":
             raise ValueError("policy.afterwards: true is not allowed; allowed: false where rows are imagined")
+        own = any(is_file_reference(name) for name in self.policy.observe)
+        if self.policy.remember and "expert_memory" not in self.policy.observe and not own:
+            raise ValueError(
+                "policy.remember: true is not allowed; allowed: false, where expert_memory is not observed"
+            )
         if self.evaluation.patience and not self.evaluation.every:
             raise ValueError(
                 "evaluation.patience: it is not allowed without validations (evaluation.every 0)"

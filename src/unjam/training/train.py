@@ -143,10 +143,7 @@ def _train_owned(
     progress: Progress | None,
 ) -> dict[str, Rows]:
     """Train into a folder that no other process writes."""
-    if resume:
-        continue_folder(folder, config)
-    else:
-        start_folder(folder, config)
+    (continue_folder if resume else start_folder)(folder, config)
     torch.set_num_threads(1)  # more threads would fight with the workers for the cores
     with ExitStack() as held, Workers(config.workers) as workers:
         for place in [folder / name for name in config.roads() if name]:  # others may evaluate one alone
@@ -247,29 +244,15 @@ class Trainer:
     def write(self, iteration: Iteration, validated: Validated) -> bool:
         """Write a row of progress, of the whole run and of each road, and a checkpoint.
 
-        Return whether it is time to stop: the user says so, `evaluation.patience` is over, or it has
-        converged.
+        Return whether it is time to stop: the user says so, or `ends_early`.
         """
-        rows = [self._row(iteration, validated, index) for index in range(len(self.tasks))]
-        whole = rows[0]
-        if self.config.tasks:
-            for place, row in zip(self.folders, rows, strict=True):
-                append_line(place / PROGRESS, to_json(row))
-            names = [*RETURNS, *MEANS] if validated else [*RETURNS[:-1], *MEANS]
-            whole = {
-                **rows[0],
-                **{name: self._sampler.mean([row[name] for row in rows]) for name in names},
-                **{"k_star": None, "eps_m": None, "virtual": {}},
-                **{name: sum(row[name] for row in rows) for name in ("collisions", "episodes")},
-                "tasks": {
-                    task.name: {name: row[name] for name in (*RETURNS, "episodes", "k_star", "eps_m")}
-                    for task, row in zip(self.tasks, rows, strict=True)
-                },
-            }
-        append_line(self.folder / PROGRESS, to_json(whole))
-        early = ends_early(self.config, read_progress(self.folder))
+        whole, *roads = self._rows(iteration, validated)
+        early = ends_early(self.config, [*read_progress(self.folder), whole])
         if early and validated is None:
-            self.validate(iteration, ended=True)
+            whole, *roads = self._rows(iteration, self.validate(iteration, ended=True))
+        for place, row in zip(self.folders, roads, strict=False):
+            append_line(place / PROGRESS, to_json(row))
+        append_line(self.folder / PROGRESS, to_json(whole))
         counters, tensors = self.training.state()
         state = {**counters, "belongs": self._belongs, "sampler": self._sampler.state()}
         state |= {"validation_best": self._validation_best, "expert_returns": self._expert_returns}
@@ -296,6 +279,24 @@ class Trainer:
         episodes = (at_once if self.config.world == "batch" else self.workers.run)(now)
         raise_failure([measure(episode) for episode in episodes if not episode.ok])
         return [episodes[end - count : end] for end, count in zip(np.cumsum(counts), counts, strict=True)]
+
+    def _rows(self, iteration: Iteration, validated: Validated) -> list[dict[str, Any]]:
+        """Return the row of progress of the whole run, then those of its roads, where it has several."""
+        rows = [self._row(iteration, validated, index) for index in range(len(self.tasks))]
+        if not self.config.tasks:
+            return rows
+        names = [*RETURNS, *MEANS] if validated else [*RETURNS[:-1], *MEANS]
+        whole = {
+            **rows[0],
+            **{name: self._sampler.mean([row[name] for row in rows]) for name in names},
+            **{"k_star": None, "eps_m": None, "virtual": {}},
+            **{name: sum(row[name] for row in rows) for name in ("collisions", "episodes")},
+            "tasks": {
+                task.name: {name: row[name] for name in (*RETURNS, "episodes", "k_star", "eps_m")}
+                for task, row in zip(self.tasks, rows, strict=True)
+            },
+        }
+        return [whole, *rows]
 
     def _row(self, iteration: Iteration, validated: Validated, index: int) -> dict[str, Any]:
         """Return the row of progress of one road."""
