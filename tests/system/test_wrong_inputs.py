@@ -106,6 +106,14 @@ WRONG: dict[str, tuple[str, list[str]]] = {
     "tuning with too few steps": ("steps: 10", ["tune rings --steps 10"]),
     "training into a folder that is not empty": ("--resume full", ["train ring --out full"]),
     "resuming what is no run": ("not a run folder", ["train --resume full"]),
+    "what an option says too": (
+        "--set length: it is not allowed beside the option for it",
+        ["drive ring --length 230 --set length=240"],
+    ),
+    "what an option of a training says too": (
+        "--set road.length: it is not allowed beside the option for it",
+        ["train ring --length 230 --set road.length=240"],
+    ),
     "resuming with a preset": ("not allowed beside it", ["train --resume full --preset demo"]),
     "evaluating what is no run": ("not a run folder", ["evaluate full"]),
     "virtual environment of what is no run": ("not a run folder", ["model full"]),

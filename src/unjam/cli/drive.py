@@ -19,6 +19,7 @@ from unjam.cli.options import (
     new_folder,
     people_changes,
     scenario_changes,
+    together,
     with_options,
 )
 from unjam.cli.output import after_drive, aside, console, counting_steps, print_json, print_metrics
@@ -85,7 +86,7 @@ def drive(
     from unjam.training.evaluate import drive as run
     from unjam.training.evaluate import raise_failures
 
-    changes |= assignments(settings)
+    changes = together(changes, assignments(settings))
     if out is not None and not report:
         raise InputError("out: it is not allowed with --no-report, which writes nothing")
     if not driver:
@@ -150,7 +151,7 @@ def watch(
     if len(drivers) > 1:
         raise wrong("driver", ", ".join(drivers), "one")
     (driver,) = drivers
-    road = make_scenario(scenario, changes | assignments(settings))
+    road = make_scenario(scenario, together(changes, assignments(settings)))
     driven = make_driver(driver, road.decision_step)
     for note in notes_on_controllers(scenario_recipe(road), [driver], {}):
         aside.print(f"note: {note}", markup=False, soft_wrap=True)
@@ -244,7 +245,7 @@ def assess(
     from unjam.training.folder import new_and_owned
     from unjam.worlds.workers import Workers
 
-    drivers, changes = driver or DRIVERS_OF_OPEN_ROADS, {**changes, **assignments(settings)}
+    drivers, changes = driver or DRIVERS_OF_OPEN_ROADS, together(changes, assignments(settings))
     asked = question(scenario, _shares(shares), episodes, precision, minutes, drivers, changes)
     folder = new_folder(out, f"assess-{Path(scenario).stem}")
     total = asked.road.horizon * episodes

@@ -11,7 +11,7 @@ from typing import Annotated, Any, NamedTuple
 
 import typer
 
-from unjam.errors import wrong, wrong_name
+from unjam.errors import InputError, wrong, wrong_name
 from unjam.files import SHIPPED
 from unjam.learners.settings import AGENTS
 from unjam.parameters import parse_assignments
@@ -214,3 +214,10 @@ def executor_named(name: str) -> Executor:
     if name not in EXECUTORS:
         raise wrong_name("executor", name, EXECUTORS)
     return name
+
+
+def together(options: dict[str, Any], settings: dict[str, Any]) -> dict[str, Any]:
+    """Return what options and `--set` ask for; raise `InputError` where both ask for the same."""
+    if twice := options.keys() & settings.keys():
+        raise InputError(f"--set {min(twice)}: it is not allowed beside the option for it")
+    return options | settings

@@ -19,6 +19,7 @@ from unjam.cli.options import (
     executor_named,
     new_folder,
     scenario_changes,
+    together,
     with_options,
 )
 from unjam.cli.output import (
@@ -87,8 +88,8 @@ def train(
     settings = dict(asked.settings)
     if "out" in settings:
         out = Path(str(settings.pop("out")))
-    changes = {**asked.flags, **{f"road.{key}": value for key, value in road.items()}, "workers": workers}
-    changes |= settings
+    changes = {**asked.flags, **{f"road.{key}": value for key, value in road.items()}}
+    changes = {"workers": workers, **together(changes, settings)}
     if resume is not None:
         if out is not None or asked.preset or asked.file is not None:
             raise InputError("resume: --out, --preset and --config are not allowed beside it")

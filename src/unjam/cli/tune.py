@@ -18,6 +18,7 @@ from unjam.cli.options import (
     assignments,
     new_folder,
     scenario_changes,
+    together,
     with_options,
 )
 from unjam.cli.output import as_options, aside, console, print_json, say_next
@@ -77,7 +78,7 @@ def tune(
 
     if seed >= SEEDS_BELOW:
         raise wrong("seed", seed, f"less than {SEEDS_BELOW}")
-    changes = road | assignments(settings)
+    changes = together(road, assignments(settings))
     if scenario in GROUPS:
         if changes or reward:
             raise InputError(f"scenario: with {scenario} neither changes nor a reward are allowed")
