@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # Measures what docs/on-ramp.md says, on seeds that chose nothing. Each JSON file here is the evaluation.json of one
-# `unjam drive`, its manifest included. Half an hour on two cores.
+# `unjam drive`, its manifest included. Three quarters of an hour on two cores.
 set -eu
 cd "$(dirname "$0")/../.."
 runs=runs/on-ramp
@@ -27,3 +27,7 @@ drive tuned-05 on-ramp --cav-share 0.05 -d unjam:on-ramp-tuned
 # what longer tuning finds; the last --episodes counts
 long=$(python -c "from unjam.training.presets import ON_RAMP_LONG; print(ON_RAMP_LONG)")
 drive tuned-long-05 on-ramp --cav-share 0.05 --episodes 40 -d human -d unjam:on-ramp-tuned -d "$long"
+# what it is worth when CAVs change lanes otherwise than people; the last --episodes counts
+for lanes in keep_right=5 keep_right=0 overtake=5 overtake=0; do
+    drive "lanes-$lanes" on-ramp --cav-share 0.05 --episodes 40 -d unjam:on-ramp-tuned --set "cruise.$lanes"
+done

@@ -55,7 +55,7 @@ far more timid where roads cross.
 
 @dataclass(frozen=True, config=STRICT)
 class CruiseControl:
-    """A CAV's own ACC, an IDM as SUMO has it.
+    """A CAV's own ACC, an IDM as SUMO has it, and how it changes lanes.
 
     What makes an ACC worse than people is weak acceleration, not a long headway. With 1 s it follows below
     0.8 s for moments.
@@ -69,6 +69,10 @@ class CruiseControl:
     """comfortable [m/s2]"""
     gap: Positive = 2.0
     """to who stands ahead [m]"""
+    keep_right: NotNegative | None = None
+    """how eagerly it keeps right; None: as the vehicle does by itself, 1 for most; 0: it does not"""
+    overtake: NotNegative | None = None
+    """how eagerly it changes lanes to be faster, likewise"""
 
     def set_speed(self, speed: Array, wanted: Array, highest: float, step: float) -> Array:
         """Return the set speed with which it accelerates as wanted where nobody is near [m/s].

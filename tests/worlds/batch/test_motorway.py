@@ -361,6 +361,8 @@ REFUSED: dict[str, dict[str, Any]] = {
     "simulation_step": {"simulation_step": 0.25, "steps_per_decision": 4},
     "warmup": {"warmup": 100},
     "roadside.loss": {"roadside": replace(SHORT.roadside, loss=0.1)},
+    "cruise.keep_right": {"cruise": replace(SHORT.cruise, keep_right=5.0)},
+    "cruise.keep_right and cruise.overtake": {"cruise": replace(SHORT.cruise, overtake=0.0)},
     "sensors": {"actuator": replace(SHORT.actuator, lag=0.3)},
 }
 

@@ -188,6 +188,28 @@ def test_cavs_want_to_drive_as_fast_as_those_whom_they_replace(simulation: Simul
         assert traffic.perceive().allowed_speed[row] == libsumo.vehicle.getAllowedSpeed(name)
 
 
+def on_the_left(simulation: Simulation, **lanes: float) -> float:
+    """Return in what share of the time CAVs upstream of the ramp are on the left lane."""
+    road = replace(BUSY, peak=(0.0, 0.0), cruise=replace(BUSY.cruise, **lanes))
+    traffic = motorway(simulation, road)
+    left = upstream = 0
+    for _ in range(200):
+        traffic.advance(Command(np.full(traffic.rows, 100.0)))
+        lanes_now = [libsumo.vehicle.getLaneID(name) for name in traffic.cavs]
+        left += lanes_now.count("motorway_1")
+        upstream += lanes_now.count("motorway_1") + lanes_now.count("motorway_0")
+    return left / upstream
+
+
+def test_cavs_keep_right_and_overtake_as_eagerly_as_their_road_says(simulation: Simulation) -> None:
+    as_people = on_the_left(simulation)
+    assert on_the_left(simulation, keep_right=1.0, overtake=1.0) == as_people
+    assert on_the_left(simulation, keep_right=10.0) < as_people - 0.05
+    assert on_the_left(simulation, overtake=5.0) > as_people + 0.05
+    assert on_the_left(simulation, keep_right=0.0) > as_people + 0.05
+    assert on_the_left(simulation, overtake=0.0) < as_people - 0.05
+
+
 def test_the_message_is_the_mean_speed_of_the_lane_ahead(simulation: Simulation) -> None:
     traffic = motorway(simulation)
     for _ in range(120):

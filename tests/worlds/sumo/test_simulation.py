@@ -96,7 +96,7 @@ def test_loading_puts_every_vehicle_in_its_place_at_rest(road: Files, simulation
     ids = RING.draw(np.random.default_rng(0)).vehicle_ids
     assert simulation.speeds(ids) == [0.0] * 22
     assert simulation.distances(ids) == [0.0] * 22
-    assert simulation.colliding_count() == 0
+    assert not simulation.colliding()
 
 
 BROKEN_TRAFFIC = {

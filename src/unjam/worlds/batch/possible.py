@@ -54,6 +54,10 @@ def _why_not_on_ramp(scenario: OnRamp) -> str:
         return (
             "actuation: CAVs have no ACC of their own that follows alone; allowed: cruise, without a filter"
         )
+    if scenario.cruise.keep_right is not None or scenario.cruise.overtake is not None:
+        return (
+            "cruise.keep_right and cruise.overtake: CAVs change lanes otherwise than people; allowed: neither"
+        )
     if scenario.simulation_step != MOTORWAY_STEP:
         return f"simulation_step: {scenario.simulation_step:g} s; allowed: {MOTORWAY_STEP:g} s"
     if not scenario.sensors.exact or not scenario.actuator.instant:

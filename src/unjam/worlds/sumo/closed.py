@@ -161,7 +161,7 @@ class ClosedTraffic(Traffic[ClosedRoad]):
             simulation.replace_speeds(self._human_ids, compress(speeds, self._human_mask))
         self.speeds = speeds
         self._log_speeds.fromlist(speeds)
-        if simulation.colliding_count():
+        if simulation.colliding():
             self._touched.update(simulation.colliding())
             self.crashed = True
 

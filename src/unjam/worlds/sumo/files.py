@@ -200,6 +200,21 @@ def _cav_layer(scenario: Scenario) -> Attributes:
     }
 
 
+def lane_change_parameters(scenario: Scenario) -> dict[str, str]:
+    """Return what of how a vehicle changes lanes is another thing once it is a CAV, as SUMO's LC2013 has it.
+
+    A type that a vehicle gets later does not change that: https://sumo.dlr.de/docs/TraCI/Change_Vehicle_State.html
+    """
+    if scenario.actuation != "cruise":
+        return {}
+    asked = {"lcKeepRight": scenario.cruise.keep_right, "lcSpeedGain": scenario.cruise.overtake}
+    return {
+        f"laneChangeModel.{name}": str(eagerness)
+        for name, eagerness in asked.items()
+        if eagerness is not None
+    }
+
+
 def _obedient_layer(scenario: Scenario) -> Attributes:
     """Return the attributes of a type that executes any safe command exactly.
 

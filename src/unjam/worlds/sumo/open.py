@@ -1,6 +1,7 @@
 """Traffic on roads with ends: vehicles come and go, and each stay of a CAV is a trajectory of its own."""
 
 from collections.abc import Sequence
+from itertools import product
 from math import inf
 from typing import Any
 
@@ -13,6 +14,7 @@ from unjam.drivers.safety import Ahead
 from unjam.physics.kinematics import next_speed
 from unjam.worlds.audit import CAV, PEOPLE, SHIELD_ROUNDING, Audit, BrakingLog, Following, following
 from unjam.worlds.record import Episode, Floats, Trajectory
+from unjam.worlds.sumo.files import lane_change_parameters
 from unjam.worlds.sumo.log import TrafficLog
 from unjam.worlds.sumo.stays import StayLog
 from unjam.worlds.sumo.traffic import OpenKind, Scene, Traffic
@@ -239,6 +241,8 @@ class OpenTraffic(Traffic[OpenKind]):
             new = [name for name in new if name not in self._taken]
             self._taken.update(new)
             simulation.take_control(new, scenario.actuation, scenario.right_of_way, self._cav_type)
+            for name, (key, value) in product(new, lane_change_parameters(scenario).items()):
+                simulation.set_parameter(name, key, value)
         names, self.speeds = self._everybody()
         self._note_moment()
         self._log.note(names, self.speeds)

@@ -111,13 +111,13 @@ class Simulation:
         """changes that for one vehicle"""
         self.set_headway: Callable[[str, float], object] = call("vehicle", "setTau")
         """changes the time headway that a vehicle keeps [s]"""
+        self.set_parameter: Callable[[str, str, str], object] = call("vehicle", "setParameter")
+        """changes one of a vehicle's other parameters, by name"""
         self._set_previous_speed = call("vehicle", "setPreviousSpeed")
         self.on_lane: Callable[[str], Sequence[str]] = call("lane", "getLastStepVehicleIDs")
         """whose front bumpers are on a lane"""
         self.vehicle_count: Callable[[], int] = call("vehicle", "getIDCount")
         """how many vehicles are on the road"""
-        self.colliding_count: Callable[[], int] = call("simulation", "getCollidingVehiclesNumber")
-        """how many vehicles touched another in the last step"""
         self.step: Callable[[], object] = call("simulation", "step")
         """simulates one time step"""
         self.departed: Callable[[], Sequence[str]] = call("simulation", "getDepartedIDList")
