@@ -62,7 +62,7 @@ STUDIES: dict[str, Study] = {
     "drivable": DRIVABLE_STUDY,
     "drivable-eight": DRIVABLE_EIGHT,
     "drivable-jammed": DRIVABLE_JAMMED,
-    "on-ramp-trained": ramp_trained({"best": "residual on the one tuned longer"}),
+    "on-ramp-trained": ramp_trained({"ramp-long": "residual on the one tuned longer"}),
     "on-ramp-in-turn": ramp_trained({"ramp-in-turn": "residual on unjam:on-ramp-tuned, learned in turn"}),
     "envelope": ENVELOPE,
     "everywhere": EVERYWHERE_STUDY,

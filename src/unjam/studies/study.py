@@ -21,7 +21,9 @@ from unjam.scenarios.scenario import Scenario
 from unjam.training.config import RunConfig, load_config
 from unjam.training.evaluate import TRAINED, evaluate, raise_failures
 from unjam.training.folder import read_config
+from unjam.training.presets import ON_RAMP_LONG
 from unjam.training.seeds import held_out_seeds
+from unjam.virtual.settings import VirtualSettings
 from unjam.worlds.workers import Workers
 
 BUDGET = 300_000
@@ -112,16 +114,19 @@ def few_steps(prefix: str, batch: int, steps: int, horizon: int = 3000, **same: 
     }
 
 
-LEFT_TO_LEARN = {
-    "expert": "jam-ahead:margin=2,margin_by_share=0",
-    **{"world": "sumo", "evaluation.every": 3, "evaluation.validation_episodes": 16},
+WITHOUT_MODEL = {
+    **{f"virtual.{name}": getattr(VirtualSettings, name) for name in ("model", "begin", "k_max", "update")},
+    "virtual.virtual_ratio": 0.0,
 }
-"""the on-ramp's best method on a law that gains nothing there: on the tuned one little is left to learn"""
-RAMP = few_steps("ramp", 9_600, 86_400, horizon=2400, **LEFT_TO_LEARN, **{"virtual.kappa": 10_000.0})
-IN_TURN = {**RAMP["ramp-imagined"].changes, "virtual.update": "sequential"}
-"""first an update on actual roads, then five on imagined ones, each of the policy as it is by then"""
+LEFT_TO_LEARN = {"expert": "jam-ahead:margin=2,margin_by_share=0", "world": "sumo"}
+"""a law that gains nothing on the on-ramp: on the tuned one little is left to learn"""
+RAMP = few_steps("ramp", 9_600, 86_400, horizon=2400, **LEFT_TO_LEARN, **WITHOUT_MODEL)
 SMALL = {**RAMP["ramp-few"].changes, "trpo.batch_steps": 4_800, "evaluation.every": 6}
 """twice as many updates from the same steps, as many as those in turn have by three times their steps"""
+LONG_IN_BATCHES = {
+    **{"expert": ON_RAMP_LONG, "world": "batch", "trpo.batch_steps": 153_600, **WITHOUT_MODEL},
+    **{"evaluation.every": 10, "evaluation.validation_episodes": 128},
+}
 ALONE = {"expert": "none", "virtual.virtual_ratio": 0.0}
 TO_THE_END = {"evaluation.converged": 0}
 TWO_EACH = {"evaluation.episodes": 2}
@@ -166,10 +171,9 @@ VARIANTS: dict[str, Variant] = {
     **few_steps("jammed", 24_000, 768_000),
     **few_steps("eight", 6_000, 612_000, horizon=1500),
     **RAMP,
-    "ramp-imagined": replace(RAMP["ramp-imagined"], changes=IN_TURN, steps=28_800),
-    "ramp-in-turn": Variant(
-        "ours, on the tuned law", "best", {**IN_TURN, "expert": "unjam:on-ramp-tuned"}, 28_800
-    ),
+    "ramp-imagined": replace(RAMP["ramp-imagined"], changes=LEFT_TO_LEARN, steps=28_800),
+    "ramp-in-turn": Variant("ours, on the tuned law", "best", {}, None),
+    "ramp-long": Variant("ours, on the law that was tuned longer", "best", LONG_IN_BATCHES, 4_608_000),
     "ramp-small": Variant("ours, few steps in small iterations", "best", SMALL, 86_400),
     "best-in-batches": Variant("ours, all its steps", "best", {"world": "batch"}, None),
     "by-150-seconds": Variant("residual", "best", BY_150_SECONDS, None),
