@@ -31,12 +31,12 @@ drive tuned-long-05 on-ramp --cav-share 0.05 --episodes 40 -d human -d unjam:on-
 for lanes in keep_right=5 keep_right=0 overtake=5 overtake=0; do
     drive "lanes-$lanes" on-ramp --cav-share 0.05 --episodes 40 -d unjam:on-ramp-tuned --set "cruise.$lanes"
 done
-# what is learned at 5 % beside its expert, elsewhere
-both=(-d unjam:on-ramp-tuned -d unjam:on-ramp-best)
-drive best-10 on-ramp "${both[@]}"
-drive best-20 on-ramp --cav-share 0.2 "${both[@]}"
-drive best-one-lane on-ramp-1 "${both[@]}"
-drive best-late-message on-ramp "${both[@]}" --set roadside.smoothing=60 --set roadside.age=10
-drive best-other-people on-ramp "${both[@]}" --set following=IDM --set time_headways=[1.4,2.0] \
+# what is learned at 5 % elsewhere, beside its expert and what longer tuning finds
+all_three=(-d unjam:on-ramp-tuned -d "$long" -d unjam:on-ramp-best)
+drive best-10 on-ramp "${all_three[@]}"
+drive best-20 on-ramp --cav-share 0.2 "${all_three[@]}"
+drive best-one-lane on-ramp-1 "${all_three[@]}"
+drive best-late-message on-ramp "${all_three[@]}" --set roadside.smoothing=60 --set roadside.age=10
+drive best-other-people on-ramp "${all_three[@]}" --set following=IDM --set time_headways=[1.4,2.0] \
     --set accelerations=[1.8,2.8] --set decelerations=[2.5,3.5] --set gaps=[2.5,3.2] --set inflow=3600
-drive best-no-jam on-ramp "${both[@]}" --set inflow=1800 --set ramp_flow=250
+drive best-no-jam on-ramp "${all_three[@]}" --set inflow=1800 --set ramp_flow=250
