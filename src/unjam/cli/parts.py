@@ -192,7 +192,8 @@ def _parameter_table(rows: list[dict[str, Any]], title: str) -> Any:
         value = row["default"]
         if isinstance(value, dict):
             value = ", ".join(
-                f"{key}={entry if isinstance(entry, bool) else f'{entry:g}'}" for key, entry in value.items()
+                f"{key}={f'{entry:g}' if type(entry) in (int, float) else str(entry).lower()}"
+                for key, entry in value.items()
             )
         table.add_row(f"  {row['name']}", str(value), " ".join(row["about"].split()))
     return table
