@@ -42,6 +42,7 @@ def test_trainings_are_one_row_beside_their_expert_and_people(folder: Path) -> N
         assert low < gain < high < gain + 1.0
     assert row["beyond people [s]"].startswith("-2")
     assert row["flow beyond people [veh/h]"].startswith("+25")
-    assert row["drivable"] == "follows below 0.8 s"
+    assert row["drivable"] == "9 of 10"
+    assert table.loc[LONGER, "drivable"] == "yes"
     assert table.loc[TUNED, f"beyond {TUNED} [s]"] == "–"
     assert table.loc[PEOPLE, "smallest headway [s]"] == "–"

@@ -14,6 +14,7 @@ import pandas as pd
 
 from unjam.controller import make_driver
 from unjam.files import to_json, write_whole
+from unjam.measures.drivable import DRIVABLE
 from unjam.measures.statistics import estimate_on_shared_seeds
 from unjam.measures.table import PEOPLE, cell_of
 from unjam.scenarios.on_ramp import ON_RAMP
@@ -72,8 +73,13 @@ def _row(found: dict[str, Any], label: str, members: Sequence[str]) -> dict[str,
         "flow beyond people [veh/h]": beyond(PEOPLE, FLOW, 0),
         "smallest headway [s]": closest,
         "people beyond 4.5 m/s²": f"{of(members, BRAKING).mean():.0f}",
-        "drivable": in_a_word(found[each]["drivable"] for each in members),
+        "drivable": _drivable([found[each]["drivable"] for each in members]),
     }
+
+
+def _drivable(said: Sequence[str]) -> str:
+    """Return a verdict in a word, or of how many trainings it is drivable."""
+    return in_a_word(said) if len(said) == 1 else f"{said.count(DRIVABLE)} of {len(said)}"
 
 
 def ramp_trained(variants: Mapping[str, str]) -> Study:
