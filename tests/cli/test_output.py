@@ -55,11 +55,17 @@ def test_a_driver_by_itself_is_compared_with_nobody(monkeypatch: pytest.MonkeyPa
     assert printed(monkeypatch, 120, ("pi",))[0].split() == ["metric", "unit", "pi"]
 
 
-def test_of_several_roads_the_one_is_named_on_which_a_training_gains_least(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+@pytest.fixture
+def aside(monkeypatch: pytest.MonkeyPatch) -> StringIO:
+    """What is said beside a verb's output."""
     text = StringIO()
-    monkeypatch.setattr(output, "aside", Console(file=text, width=200))
+    monkeypatch.setattr(output, "aside", Console(file=text, width=400))
+    return text
+
+
+def test_of_several_roads_the_one_is_named_on_which_a_training_gains_least(
+    aside: StringIO, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(sys.modules[_Progress.__module__], "aside", output.aside)
     row = {"iteration": 1, "actual_steps": 10, "return_mean": 5.0, "return_expert": 4.0}
     roads = {"ring": {"return_validation": 9.0, "return_expert": 3.0}, "eight": {"return_validation": 1.0}}
@@ -68,27 +74,21 @@ def test_of_several_roads_the_one_is_named_on_which_a_training_gains_least(
         shown.iteration({**row, "return_validation": 6.0, "tasks": roads})
         shown.iteration({**row, "iteration": 11, "return_validation": None, "tasks": {}})
     said = "return 5, validation 6 (expert 4; least beyond it on eight: -3)"
-    assert [line.partition("steps, ")[2] for line in text.getvalue().splitlines()] == [said, said]
+    assert [line.partition("steps, ")[2] for line in aside.getvalue().splitlines()] == [said, said]
 
 
-def test_after_a_training_of_several_roads_it_is_the_whole_run_that_goes_on(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    text = StringIO()
-    monkeypatch.setattr(output, "aside", Console(file=text, width=200))
+def test_after_a_training_of_several_roads_it_is_the_whole_run_that_goes_on(aside: StringIO) -> None:
     output.after_training(Path("runs/all/ring"), estimate([0.0, 0.0]), 100, Path("runs/all"), over=False)
-    assert "unjam train --resume runs/all --steps 200" in text.getvalue()
+    assert "unjam train --resume runs/all --steps 200" in aside.getvalue()
 
 
 def test_a_training_that_is_over_is_shipped_where_it_gained_and_not_trained_on_where_it_did_not(
-    monkeypatch: pytest.MonkeyPatch,
+    aside: StringIO,
 ) -> None:
-    text = StringIO()
-    monkeypatch.setattr(output, "aside", Console(file=text, width=200))
     output.after_training(Path("runs/one"), estimate([0.0, 0.0]), 100, Path("runs/one"), over=True)
-    assert text.getvalue() == ""
+    assert aside.getvalue() == ""
     output.after_training(Path("runs/one"), estimate([5.0, 6.0, 7.0]), 100, Path("runs/one"), over=True)
-    assert text.getvalue() == "ship it: unjam export runs/one --to one.unjam\n"
+    assert aside.getvalue() == "ship it: unjam export runs/one --to one.unjam\n"
 
 
 @pytest.mark.parametrize(
@@ -110,12 +110,10 @@ def test_a_training_that_is_over_is_shipped_where_it_gained_and_not_trained_on_w
     ],
 )
 def test_what_is_proposed_after_a_drive_is_for_the_same_road(
-    drivers: list[str], changes: dict[str, Any], words: str, monkeypatch: pytest.MonkeyPatch
+    drivers: list[str], changes: dict[str, Any], words: str, aside: StringIO
 ) -> None:
-    text = StringIO()
-    monkeypatch.setattr(output, "aside", Console(file=text, width=400))
     output.after_drive("ring", drivers, changes, "eq16")
-    proposed = text.getvalue().strip().partition(": ")[2]
+    proposed = aside.getvalue().strip().partition(": ")[2]
     assert proposed == words
     asked = shlex.split(proposed)
     told = [word for option, word in pairwise(asked) if option == "--set"]
@@ -123,9 +121,9 @@ def test_what_is_proposed_after_a_drive_is_for_the_same_road(
     assert given == changes
 
 
-def test_the_judgement_after_a_training_shows_how_far_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
-    text = StringIO()
-    monkeypatch.setattr(output, "aside", Console(file=text, width=200))
+def test_the_judgement_after_a_training_shows_how_far_it_is(
+    aside: StringIO, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(sys.modules[_Progress.__module__], "aside", output.aside)
     monkeypatch.setattr(output, "LINE_SECONDS", -1.0)
     monkeypatch.setattr(evaluate, "steps_to_judge", lambda config, folder: 3000)
@@ -134,4 +132,4 @@ def test_the_judgement_after_a_training_shows_how_far_it_is(monkeypatch: pytest.
             shown.judging(episode, steps)
     words = "evaluating on held-out seeds"
     counted = [f"{words}: {steps} of 3,000 steps" for steps in ("500", "1,000", "2,000")]
-    assert text.getvalue().splitlines() == [words, *counted]
+    assert aside.getvalue().splitlines() == [words, *counted]

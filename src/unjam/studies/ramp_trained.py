@@ -72,7 +72,6 @@ def _row(found: dict[str, Any], label: str, members: Sequence[str]) -> dict[str,
         "beyond people [s]": beyond(PEOPLE, TIME, 1),
         "flow beyond people [veh/h]": beyond(PEOPLE, FLOW, 0),
         "smallest headway [s]": closest,
-        "people beyond 4.5 m/s²": f"{of(members, BRAKING).mean():.0f}",
         "drivable": _drivable([found[each]["drivable"] for each in members]),
     }
 

@@ -161,8 +161,8 @@ class ClosedTraffic(Traffic[ClosedRoad]):
             simulation.replace_speeds(self._human_ids, compress(speeds, self._human_mask))
         self.speeds = speeds
         self._log_speeds.fromlist(speeds)
-        if simulation.colliding():
-            self._touched.update(simulation.colliding())
+        if colliding := simulation.colliding():
+            self._touched.update(colliding)
             self.crashed = True
 
     def _expect_all(self) -> None:

@@ -201,9 +201,10 @@ def _cav_layer(scenario: Scenario) -> Attributes:
 
 
 def lane_change_parameters(scenario: Scenario) -> dict[str, str]:
-    """Return what of how a vehicle changes lanes is another thing once it is a CAV, as SUMO's LC2013 has it.
+    """Return what changes of how a vehicle changes lanes once it is a CAV, by the names of SUMO's LC2013.
 
-    A type that a vehicle gets later does not change that: https://sumo.dlr.de/docs/TraCI/Change_Vehicle_State.html
+    The type that it gets then changes nothing of that. Source:
+    https://sumo.dlr.de/docs/Definition_of_Vehicles,_Vehicle_Types,_and_Routes.html#lane-changing_models
     """
     if scenario.actuation != "cruise":
         return {}

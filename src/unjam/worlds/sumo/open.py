@@ -1,7 +1,6 @@
 """Traffic on roads with ends: vehicles come and go, and each stay of a CAV is a trajectory of its own."""
 
 from collections.abc import Sequence
-from itertools import product
 from math import inf
 from typing import Any
 
@@ -241,8 +240,9 @@ class OpenTraffic(Traffic[OpenKind]):
             new = [name for name in new if name not in self._taken]
             self._taken.update(new)
             simulation.take_control(new, scenario.actuation, scenario.right_of_way, self._cav_type)
-            for name, (key, value) in product(new, lane_change_parameters(scenario).items()):
-                simulation.set_parameter(name, key, value)
+            for name in new:
+                for key, value in lane_change_parameters(scenario).items():
+                    simulation.set_parameter(name, key, value)
         names, self.speeds = self._everybody()
         self._note_moment()
         self._log.note(names, self.speeds)
