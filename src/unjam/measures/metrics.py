@@ -27,6 +27,7 @@ from unjam.worlds.audit import BEYOND, SHIELD_ROUNDING
 from unjam.worlds.earned import CELLS_AT_ONCE, earned
 from unjam.worlds.record import Episode, Floats
 from unjam.worlds.reward import eq16
+from unjam.worlds.trips import TRAVEL_CLASSES
 
 STEADY_STEPS = 1000
 """decisions at the end of an episode that count as steady state; of one that is no longer, its second half"""
@@ -227,7 +228,10 @@ def travel_time(episode: Episode) -> float:
 
     The integral over time of who is on the road or waits to be, over how many wanted to enter: nobody gains
     by keeping vehicles out. Who is under way at the end counts with the time so far, at a collision with all.
+    On a network of the user's own it is the mean over SUMO's trips: `duration` and `departDelay`.
     """
+    if episode.trips.vehicle_ids and episode.status != "collision":
+        return float(episode.trips.travel_time.mean())
     if not len(episode.waiting):
         return float("nan")
     under_way = (~np.isnan(episode.speeds)).sum(axis=1) + episode.waiting
@@ -237,8 +241,21 @@ def travel_time(episode: Episode) -> float:
 
 
 def delay(episode: Episode) -> float:
-    """Travel time beyond that of a free road, waiting included [s]; NaN where that one is not known."""
-    return travel_time(episode) - episode.free_time
+    """Mean delay of a trip [s]: SUMO's `timeLoss` and `departDelay` on a network of the user's own, elsewhere
+    travel time beyond that on a free road; NaN where neither is known.
+    """
+    trips = episode.trips
+    return float(trips.delay.mean()) if trips.vehicle_ids else travel_time(episode) - episode.free_time
+
+
+def travel_time_of(group: str) -> Callable[[Episode], float]:
+    """Return the metric that is the travel time of one group of vehicles, waiting included [s]."""
+
+    def mean(episode: Episode) -> float:
+        return episode.trips.mean_travel_time(group)
+
+    mean.__doc__ = f"Mean travel time of {group} alone on a network of the user's own, waiting included [s]."
+    return mean
 
 
 def backlog_veh(episode: Episode) -> float:
@@ -305,6 +322,10 @@ METRICS: dict[str, Metric] = {
     "fuel_ml_per_km": Metric(fuel_ml_per_km, "fuel", "ml/km", 1),
     "throughput_veh_per_h": Metric(throughput_veh_per_h, "flow", "veh/h", 0),
     "travel_time": Metric(travel_time, "travel time, waiting included", "s", 1),
+    **{
+        f"travel_time_{group}": Metric(travel_time_of(group), f"travel time of {group}", "s", 1)
+        for group in TRAVEL_CLASSES
+    },
     "delay": Metric(delay, "delay, waiting included", "s", 1, SIGNED),
     "backlog_veh": Metric(backlog_veh, "vehicles waiting to enter", "", 0),
 }

@@ -86,6 +86,8 @@ def table_of(rows_by_driver: Rows, baseline: str) -> list[TableRow]:
         cells = [*(Cell("") for _ in rows_by_driver), *(cell_of(each, 2) for each in found)]
         table.append(TableRow("probability of improvement", "in return", about, cells))
     for name, metric in METRICS.items():
+        if not any(estimate_of(rows, name).count for rows in rows_by_driver.values()):
+            continue  # it is not defined on this road
         cells = [
             cell_of(estimate_of(rows, name), metric.digits, len(rows)) for rows in rows_by_driver.values()
         ]

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from unjam.drivers.local_state import LocalState
 from unjam.physics.arrays import Floats
 from unjam.worlds.audit import Audit
+from unjam.worlds.trips import Trips
 from unjam.worlds.world import Driven
 
 FRAMES = 200
@@ -191,6 +192,8 @@ class Episode:
     terms: dict[str, Floats] = field(default_factory=dict)
     """terms of the reward by name, shape (T,)"""
     trajectories: tuple[Trajectory, ...] = ()
+    trips: Trips = field(default_factory=Trips)
+    """of all vehicles, on a network of the user's own; empty elsewhere"""
     audit: Audit = field(default_factory=Audit)
 
     @property

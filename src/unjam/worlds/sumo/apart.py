@@ -155,8 +155,8 @@ def _do(simulation: Simulation, name: str, arguments: list[Any]) -> Any:
     if name == "load":
         files = arguments[0]
         named = {option: tuple(map(Path, paths)) for option, paths in files["named"].items()}
-        to_copy = frozenset(map(Path, files["to_copy"]))
-        arguments[0] = Files(tuple(files["options"]), named, files["traffic"], files["option"], to_copy)
+        parts = {"options": tuple(files["options"]), "named": named}
+        arguments[0] = Files(**{**files, **parts, "to_copy": frozenset(map(Path, files["to_copy"]))})
     return getattr(simulation, name)(*arguments)
 
 

@@ -11,9 +11,10 @@ from unjam.worlds.sumo.networks import Attributes, document, element, network_fi
 
 CAV_COLOUR = "215,38,61"
 """red, in SUMO's window"""
-CAV_TYPES = "cav_of_{}"
+CAV_PREFIX, DRIVER_SUFFIX = "cav_of_", "_of_driver_"
+CAV_TYPES = CAV_PREFIX + "{}"
 """the type of a CAV whose own type is `{}`"""
-CALIBRATED_TYPES = "{}_of_driver_{}"
+CALIBRATED_TYPES = "{}" + DRIVER_SUFFIX + "{}"
 """the type of a car whose own type is `{}`, driven by a calibrated person of that number"""
 KEPT = (
     *("vClass", "length", "width", "height", "maxSpeed", "speedFactor", "guiShape", "emissionClass"),
@@ -35,6 +36,8 @@ class Files(NamedTuple):
     """by which SUMO takes the traffic"""
     to_copy: frozenset[Path] = frozenset()
     """files that SUMO must not read themselves, but in a harmless copy"""
+    records_trips: bool = False
+    """whether SUMO records all trips: see `Simulation.end_with_trips`"""
 
 
 def files_of(scenario: Scenario, road: Road) -> Files:
@@ -61,7 +64,7 @@ def _own_files(scenario: Scenario, road: OwnRoad) -> Files:
         "--route-files": files.route_files,
     }
     traffic = _own_types_xml(scenario, road)
-    return Files(tuple(options), named, traffic, "--additional-files", files.to_copy)
+    return Files(tuple(options), named, traffic, "--additional-files", files.to_copy, records_trips=True)
 
 
 def _traffic_xml(scenario: Scenario, road: BuiltRoad) -> str:
@@ -128,6 +131,12 @@ def _own_types_xml(scenario: Scenario, road: OwnRoad) -> str:
         calm = {"id": CAV_TYPES.format(name), "sigma": 0.0, "speedDev": 0.0}
         types.append({**_kept(attributes, KEPT), **calm, **_cav_layer(scenario)})
     return document("additional", "vType", types)
+
+
+def base_type(name: str) -> str:
+    """Return the user's vehicle type from which the type of that name was made, for a CAV or a driver."""
+    of_one_vehicle = name.partition("@")[0]  # as SUMO names a type of which one vehicle has a changed copy
+    return of_one_vehicle.partition(DRIVER_SUFFIX)[0].removeprefix(CAV_PREFIX)
 
 
 def _kept(attributes: Attributes, names: Sequence[str]) -> Attributes:

@@ -3,6 +3,7 @@
 import hashlib
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import accumulate
 from typing import Any
 
@@ -12,14 +13,15 @@ from numpy.typing import NDArray
 from unjam.drivers.local_state import LARGEST_GAP, LocalState
 from unjam.drivers.roadside import Messages
 from unjam.drivers.safety import Ahead
+from unjam.scenarios.own_network import PASSENGER
 from unjam.scenarios.road import OwnRoad
-from unjam.worlds.record import Floats
+from unjam.worlds.record import Episode, Floats
 from unjam.worlds.sumo.files import CALIBRATED_TYPES, CAV_TYPES
 from unjam.worlds.sumo.lanes import Followed, LaneTraffic
 from unjam.worlds.sumo.networks import edge_lengths, lane_counts, network_lines
 from unjam.worlds.sumo.sections import RoadAhead
 from unjam.worlds.sumo.simulation import Neighbours
-from unjam.worlds.world import OnProgress
+from unjam.worlds.world import Driven, OnProgress
 
 FILTER_SEES = 400.0
 """how far a safety filter looks ahead [m]: what a car at 60 m/s needs"""
@@ -160,6 +162,14 @@ class OwnTraffic(LaneTraffic[OwnRoad]):
         if self._service is not None:
             names, speeds = self._everybody()
             self._service.measure(self._places_of(names), speeds)
+
+    def record(self, driven: Driven) -> Episode:
+        """Return what happened since the start, with all trips; SUMO ends with it."""
+        episode = super().record(driven)
+        files, scenario = self.road.files, self.scenario
+        classes = {name: attributes.get("vClass", PASSENGER) for name, attributes in files.types.items()}
+        start = files.begin + scenario.warmup * scenario.simulation_step
+        return replace(episode, trips=self._simulation.end_with_trips(classes, start))
 
     def _places_of(self, names: Sequence[str]) -> list[tuple[str, float]]:
         """Return in which lane vehicles are, and how far along it [m]; SUMO is asked once in a step."""

@@ -23,6 +23,8 @@ from unjam.sumo_files import copy_harmless, stamp_of
 from unjam.worlds.sumo.files import Files
 from unjam.worlds.sumo.library import Backend, close, function_of, library
 from unjam.worlds.sumo.networks import said_in, sumo_program
+from unjam.worlds.sumo.tripinfo import read_trips, trip_options
+from unjam.worlds.trips import Trips
 
 SPEED_MODES = {"shielded": 31, "raw": 30, "flow": 25, "cruise": 31}
 """SUMO's speed mode bits for each way of actuation: bit 0 is the check for a safe speed."""
@@ -86,6 +88,7 @@ class Simulation:
         self._copies: dict[Path, tuple[tuple[int, int] | None, Path]] = {}
         """of users' own files, with the stamps of those"""
         self._running = False
+        self._trips = Path(self._folder.name) / "trips.xml"
         self._printed = Path(self._folder.name) / "printed.log" if alone else None
         """what SUMO says before it has a log"""
         if backend == "libsumo":
@@ -149,6 +152,8 @@ class Simulation:
         named.setdefault(files.option, []).append(str(traffic))
         inputs = [f"{option}={','.join(paths)}" for option, paths in named.items() if paths]
         options = [*inputs, *files.options, *self._options(step, seed)]
+        if files.records_trips:
+            options += trip_options(self._trips)
         try:
             with printed_to(self._printed) if self._printed else nullcontext():
                 if self._running:
@@ -303,6 +308,11 @@ class Simulation:
         for name in ids:
             self._sumo.vehicle.setType(name, types.format(self._sumo.vehicle.getTypeID(name)))
             self._sumo.vehicle.setSpeedMode(name, mode)
+
+    def end_with_trips(self, classes: dict[str, str], after: float) -> Trips:
+        """End the episode, so that SUMO writes its last records, and return what `read_trips` finds."""
+        self._end()
+        return read_trips(self._trips, classes, after)
 
     def close(self) -> None:
         """End the simulation and remove its files; may be called twice."""

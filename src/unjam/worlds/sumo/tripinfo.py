@@ -1,0 +1,43 @@
+"""Reads SUMO's trip records (`tripinfo-output`), which cost no measurable time while a simulation runs."""
+
+from pathlib import Path
+from xml.parsers import expat
+
+import numpy as np
+
+from unjam.worlds.sumo.files import base_type
+from unjam.worlds.trips import Trips
+
+NOT_ARRIVED = -1.0
+"""what SUMO writes for the time of an arrival that has not happened"""
+CHUNK = 1 << 20
+"""bytes that are read at once"""
+
+
+def trip_options(path: Path) -> list[str]:
+    """Return the options by which SUMO writes all trips to a file, those that have not ended included."""
+    unfinished = ("--tripinfo-output.write-unfinished", "--tripinfo-output.write-undeparted")
+    return ["--tripinfo-output", str(path), *(word for option in unfinished for word in (option, "true"))]
+
+
+def read_trips(path: Path, classes: dict[str, str], after: float) -> Trips:
+    """Return the trips in a file that SUMO has closed, in SUMO's order.
+
+    `classes` has the vehicle class of each vehicle type. Trips that ended before the time `after` [s], during
+    a warm-up, are left out.
+    """
+    found: list[tuple[str, str, float, float, float, float]] = []
+
+    def start(tag: str, attributes: dict[str, str]) -> None:
+        if tag == "tripinfo" and not NOT_ARRIVED < (arrival := float(attributes["arrival"])) <= after:
+            times = (float(attributes[name]) for name in ("departDelay", "duration", "timeLoss"))
+            found.append((attributes["id"], classes[base_type(attributes["vType"])], *times, arrival))
+
+    parser = expat.ParserCreate()
+    parser.StartElementHandler = start
+    with path.open("rb") as file:
+        while chunk := file.read(CHUNK):
+            parser.Parse(chunk)
+    ids, classes, *columns = zip(*found, strict=True) if found else ((),) * 6
+    depart_delay, duration, time_loss, arrival = (np.array(column, np.float64) for column in columns)
+    return Trips(ids, classes, depart_delay, duration, time_loss, arrival != NOT_ARRIVED)

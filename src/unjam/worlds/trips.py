@@ -1,0 +1,55 @@
+"""Trips on a road with ends, as SUMO's own trip records have them."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from unjam.physics.arrays import Floats
+
+TRAVEL_CLASSES = {
+    "cars": ("passenger", "private", "hov", "taxi", "evehicle", "custom1", "custom2"),
+    "trucks": ("truck", "trailer", "delivery"),
+    "buses": ("bus", "coach"),
+}
+"""SUMO's vehicle classes whose travel times are reported separately, by the name of the group"""
+
+
+def _no_times() -> Floats:
+    return np.zeros(0)
+
+
+@dataclass(frozen=True)
+class Trips:
+    """The trips of all n vehicles that were to depart in an episode; arrays have shape (n,).
+
+    A trip that has not ended counts with what it has taken so far. Source:
+    https://sumo.dlr.de/docs/Simulation/Output/TripInfo.html
+    """
+
+    vehicle_ids: tuple[str, ...] = ()
+    vehicle_classes: tuple[str, ...] = ()
+    """SUMO's vehicle class of each"""
+    depart_delay: Floats = field(default_factory=_no_times)
+    """time for which each waited for its insertion, `departDelay` [s]"""
+    duration: Floats = field(default_factory=_no_times)
+    """time since its insertion [s]; 0 of a vehicle that was not inserted"""
+    time_loss: Floats = field(default_factory=_no_times)
+    """time lost by driving below its desired speed, `timeLoss` [s]"""
+    arrived: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, bool))
+    """whether it has reached the end of its route"""
+
+    @property
+    def delay(self) -> Floats:
+        """Delay of each trip: `timeLoss` and `departDelay` [s]."""
+        return self.time_loss + self.depart_delay
+
+    @property
+    def travel_time(self) -> Floats:
+        """Travel time of each trip, with the time for which it waited for its insertion [s]."""
+        return self.duration + self.depart_delay
+
+    def mean_travel_time(self, group: str) -> float:
+        """Return the mean travel time of a group of `TRAVEL_CLASSES` [s]; NaN where it has no vehicles."""
+        chosen = np.isin(self.vehicle_classes, TRAVEL_CLASSES[group])
+        return float(self.travel_time[chosen].mean()) if chosen.any() else float("nan")
