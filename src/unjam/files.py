@@ -8,6 +8,7 @@ import shutil
 import sys
 import zipfile
 import zlib
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -17,6 +18,8 @@ from safetensors import SafetensorError
 
 from unjam.errors import DISK_ERRNOS, DiskError, InputError, disk_error
 
+LONGEST_INTEGER = 20
+"""characters of an integer of 64 bits"""
 SHIPPED = "unjam:"
 """what the names of controllers and of people that are part of the package begin with"""
 DAMAGED = (
@@ -159,6 +162,46 @@ def make_folder(path: Path) -> None:
 
 def _disk(error: OSError, path: Path, *more: int) -> OSError | DiskError:
     return disk_error(error, path) if error.errno in (*DISK_ERRNOS, *more) else error
+
+
+def parse_json(content: bytes | str) -> Any:
+    """Return the document in strict JSON.
+
+    Raises:
+        ValueError: it is none in UTF-8, nested too deep, names a key twice, or has a number that is not
+            finite, or an integer of more than 64 bits.
+    """
+    text = content.decode() if isinstance(content, bytes) else content
+    try:
+        return json.loads(
+            text,
+            object_pairs_hook=_unique_keys,
+            parse_float=_finite_number,
+            parse_int=_short_integer,
+            parse_constant=_finite_number,
+        )
+    except RecursionError:
+        raise ValueError("it is nested too deep") from None
+
+
+def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    table = dict(pairs)
+    if len(table) < len(pairs):
+        ((key, _),) = Counter(key for key, _ in pairs).most_common(1)
+        raise ValueError(f"it names {key[:50]!r} twice")
+    return table
+
+
+def _finite_number(text: str) -> float:
+    if not math.isfinite(value := float(text)):
+        raise ValueError(f"the number {text[:20]} is not finite")
+    return value
+
+
+def _short_integer(text: str) -> int:
+    if len(text) > LONGEST_INTEGER or not -(2**63) <= (value := int(text)) < 2**63:
+        raise ValueError(f"the integer {text[:20]}... has more than 64 bits")
+    return value
 
 
 def to_json(value: Any, indent: int | None = None) -> str:

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from unjam.controller.verify import Verified
+from unjam.controller.verify import PartCheck
 from unjam.errors import UnjamError
 from unjam.processes import bound
 from unjam.trust import FLAG
@@ -19,8 +19,10 @@ from unjam.trust import FLAG
 
 def verify_controller(
     path: Path | str, trust_code: bool = False, signer: Path | str | None = None
-) -> list[Verified]:
-    """Return what was checked of a `.unjam` file, or of a run folder; no code runs that is not trusted.
+) -> list[PartCheck]:
+    """Return what is known of each part of a `.unjam` file or a run folder; only trusted code runs.
+
+    Each is `checked`, `absent`, or `stated` by the maker alone; no part that is there is left unchecked.
 
     It is read as `unjam verify` reads it: in a process of its own, with little memory and time, which may
     neither write nor reach the network where the kernel sees to it.
@@ -32,11 +34,12 @@ def verify_controller(
 
     Raises:
         InputError: the first thing that is wrong, in one line; also where there is code that is not trusted,
-            or somebody else has signed it, or nobody.
+            or it is not signed by `signer`.
+        MissingPartError: a part could not be checked, as a package is not installed.
     """
     options = [*([FLAG] if trust_code else []), *([] if signer is None else [f"--signer={signer}"])]
-    found = _answer("verify", *options, "--", str(path))["verified"]
-    return [Verified(name, words) for name, words in found.items()]
+    found = _answer("verify", *options, "--", str(path))["parts"]
+    return [PartCheck(**each) for each in found]
 
 
 def write_report(folders: Sequence[Path | str], target: Path | str) -> Path:

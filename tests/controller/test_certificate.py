@@ -24,7 +24,7 @@ from unjam.controller.file import (
     unpack_parts,
 )
 from unjam.controller.verify import verify_controller
-from unjam.drivers import IDM, Driver, LocalState, PISaturation
+from unjam.drivers import IDM, Driver, FollowerStopper, LocalState, PISaturation
 from unjam.drivers.car_following import Constant
 from unjam.drivers.safety import SafetyFilter
 from unjam.drivers.wrappers import Filtered
@@ -114,7 +114,7 @@ def test_a_certificate_becomes_a_part_of_the_file_and_is_tried_again(tmp_path: P
     found = certificate_of(controller)
     add_certificate(file, controller, found)
     assert json.loads(read_controller(file).parts[CERTIFICATE]) == json.loads(json.dumps(found))
-    (said,) = [each.found for each in verify_controller(file) if each.name == "certificate"]
+    (said,) = [each.detail for each in verify_controller(file) if each.part == "certificate"]
     assert "0 contacts" in said
     write_certificate(file.name, filtered(PISaturation()), found, tmp_path / "page.html")
     assert "No contact in" in (tmp_path / "page.html").read_text()
@@ -132,8 +132,35 @@ def test_a_certificate_that_was_changed_is_refused_even_with_a_right_hash(tmp_pa
     manifest = json.loads(parts.pop(MANIFEST))
     manifest["sha256"] = {name: hash_of(part) for name, part in parts.items()}
     file.write_bytes(pack_parts({MANIFEST: json.dumps(manifest).encode(), **parts}))
-    with pytest.raises(InputError, match="its certificate says of itself"):
+    with pytest.raises(InputError, match="its certificate says of comfort: nothing"):
         verify_controller(file)
+
+
+def test_the_certificate_of_another_controller_is_refused_even_with_a_right_hash(tmp_path: Path) -> None:
+    file = written(tmp_path, filtered(FollowerStopper()))
+    other = certificate_of(read_controller(file))
+    file = written(tmp_path)
+    own = certificate_of(read_controller(file))
+    assert own["worst"]["contacts"] == other["worst"]["contacts"], "both say that nothing was touched"
+    for copied in (other, {**own, "worst": other["worst"]}):
+        add_certificate(written(tmp_path), read_controller(file), copied)
+        with pytest.raises(InputError, match="its certificate says of "):
+            verify_controller(file)
+
+
+def test_counts_and_answers_of_a_certificate_are_compared_exactly(tmp_path: Path) -> None:
+    file = written(tmp_path)
+    for change in (
+        lambda found: found["worst"].update(steps=found["worst"]["steps"] + 1),
+        lambda found: found["worst"].update(contacts=False),
+        lambda found: found["comfort"].update(within_iso_15622=int(found["comfort"]["within_iso_15622"])),
+        lambda found: found.update(another=1),
+    ):
+        found = certificate_of(read_controller(written(tmp_path)))
+        change(found)
+        add_certificate(file, read_controller(file), found)
+        with pytest.raises(InputError, match="its certificate says of "):
+            verify_controller(file)
 
 
 @pytest.mark.parametrize("driver", [PISaturation(), filtered(PISaturation(), active=False)])

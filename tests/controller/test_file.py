@@ -17,7 +17,8 @@ from safetensors.numpy import save
 
 from tests.conftest import random_network
 from unjam.controller import controller_bytes, load_controller
-from unjam.controller.file import FORMAT, MANIFEST, WEIGHTS
+from unjam.controller.file import MANIFEST, WEIGHTS
+from unjam.controller.manifest import FORMAT
 from unjam.drivers import IDM, FollowerStopper, PISaturation, ResidualDriver
 from unjam.drivers.check import random_state
 from unjam.drivers.driver import Driver
@@ -32,7 +33,7 @@ from unjam.trust import trusting_code
 ALL_PARTS: tuple[FeatureName, ...] = (
     *("local", "expert_acceleration", "expert_memory", "loop_length", "place", "route_position"),
 )
-ABOUT = {"scenario": "ring", "iteration": 3}
+ABOUT = {"scenario": {"kind": "ring"}, "iteration": 3}
 
 
 def residual(
@@ -136,7 +137,7 @@ def test_the_same_driver_has_the_same_bytes(tmp_path: Path) -> None:
 def test_the_manifest_says_what_it_is() -> None:
     manifest, weights = parts_of(controller_bytes(residual(IDM()), ABOUT))
     assert manifest["format"] == FORMAT
-    assert manifest["scenario"] == "ring"
+    assert manifest["scenario"] == {"kind": "ring"}
     assert manifest["iteration"] == 3
     assert manifest["driver"]["expert"]["name"] == "idm"
     assert manifest["sha256"] == {WEIGHTS: hashlib.sha256(weights).hexdigest()}
@@ -270,19 +271,6 @@ def test_a_memory_that_would_fill_the_machine_is_refused(tmp_path: Path) -> None
         load_controller(written(tmp_path, content))
 
 
-def test_the_first_format_can_be_read(tmp_path: Path) -> None:
-    driver = residual(IDM())
-    old = ("format", "unjam", "driver", "sha256")
-
-    def forget(manifest: dict[str, Any]) -> None:
-        for key in manifest.keys() - set(old):
-            del manifest[key]
-        manifest["format"] = 1
-
-    content = with_weights(save(recipe_of(driver)[1]), forget)
-    np.testing.assert_array_equal(actions(load_controller(written(tmp_path, content))), actions(driver))
-
-
 @settings(max_examples=60)
 @given(place=st.floats(0, 1, exclude_max=True), bits=st.integers(1, 255))
 def test_a_changed_byte_is_refused_or_changes_nothing(place: float, bits: int) -> None:
@@ -367,10 +355,53 @@ def test_a_manifest_that_is_none_is_refused(tmp_path: Path, manifest: str) -> No
     refused(written(tmp_path, content))
 
 
-@pytest.mark.parametrize("number", [0, 4, "1", None, [1]])
-def test_another_format_is_refused(tmp_path: Path, number: object) -> None:
+@pytest.mark.parametrize("number", [0, 1, 2, 4, -3])
+def test_another_format_is_refused_with_the_version_that_wrote_it(tmp_path: Path, number: int) -> None:
+    content = with_manifest(lambda manifest: manifest.update(format=number, unjam="9.8.7"))
+    line = refused(written(tmp_path, content))
+    assert f"format {number}, written by unjam '9.8.7', is not allowed; allowed: format {FORMAT}, " in line
+
+
+@pytest.mark.parametrize("number", [True, 2.0, 3.0, "3", None, [3], {}], ids=str)
+def test_a_format_that_is_no_integer_is_refused(tmp_path: Path, number: object) -> None:
     content = with_manifest(lambda manifest: manifest.update(format=number))
-    assert f"format {number!r} is unknown" in refused(written(tmp_path, content))
+    assert f"manifest.format: {number!r} is not allowed" in refused(written(tmp_path, content))
+
+
+DEEP = '"driver": ' + "[" * 100_000 + "]" * 100_000
+NO_STRICT_JSON = {
+    "a key twice": ('"format": 3', "it names 'format' twice"),
+    "a nested key twice": ('"scenario": {"kind": "ring", "kind": "merge"}', "it names 'kind' twice"),
+    "NaN": ('"time_step": NaN', "the number NaN is not finite"),
+    "infinity": ('"time_step": -Infinity', "the number -Infinity is not finite"),
+    "a float that overflows": ('"time_step": 1e999', "the number 1e999 is not finite"),
+    "a huge integer": (f'"iteration": {2**63}', "has more than 64 bits"),
+    "a number of many digits": (f'"iteration": {"9" * 5000}', "has more than 64 bits"),
+    "nesting": (DEEP, "it is nested too deep"),
+    "no UTF-8": ('"about": "\udcff"', "'utf-8' codec"),
+}
+
+
+@pytest.mark.parametrize("name", NO_STRICT_JSON)
+def test_a_manifest_in_loose_json_is_refused(tmp_path: Path, name: str) -> None:
+    text, words = NO_STRICT_JSON[name]
+    manifest, weights = parts_of(controller_bytes(residual(IDM()), {}))
+    part = f"{json.dumps(manifest)[:-1]}, {text}}}".encode(errors="surrogateescape")
+    assert words in refused(written(tmp_path, archive_of(manifest=part, weights=weights)))
+
+
+def test_a_manifest_that_is_too_large_is_not_read(tmp_path: Path) -> None:
+    content = with_manifest(lambda manifest: manifest.update(about="x" * 2**20))
+    assert "part 'manifest.json' has " in refused(written(tmp_path, content))
+
+
+@pytest.mark.parametrize("key", ["time_step", "action_limit"])
+def test_statements_that_contradict_the_scenario_are_refused(tmp_path: Path, key: str) -> None:
+    scenario = {"simulation_step": 0.1, "steps_per_decision": 5, "action_limit": 2.0}
+    about = {"scenario": scenario, "time_step": 0.5, "action_limit": 2.0}
+    load_controller(written(tmp_path, controller_bytes(residual(IDM()), about)))
+    content = controller_bytes(residual(IDM()), {**about, key: 0.25})
+    assert f"manifest.{key}: 0.25 is not allowed; allowed: " in refused(written(tmp_path, content))
 
 
 @pytest.mark.parametrize(

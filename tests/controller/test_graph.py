@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tests.controller.test_sample import perceived
-from unjam.controller.verify import check_graph, run_graph
+from unjam.controller.graph import FIELDS, check_graph, run_graph
 from unjam.drivers import LACC, Constant
 from unjam.drivers.local_state import EVERYWHERE
 from unjam.errors import InputError, MissingPartError
@@ -67,32 +67,171 @@ def foreign(model: Any) -> None:
     model.graph.node[0].domain = "com.evil"
 
 
-def outside(model: Any) -> None:
+def external() -> Any:
+    """A tensor whose values lie in another file."""
     tensor = helper.make_tensor("far", TensorProto.DOUBLE, [1], [0.0])
     tensor.data_location = TensorProto.EXTERNAL
     tensor.external_data.add(key="location", value="/etc/passwd")
-    model.graph.initializer.append(tensor)
+    return tensor
 
 
-def outside_in_a_node(model: Any) -> None:
-    outside(model)
-    node = helper.make_node("Constant", [], ["far"], value=model.graph.initializer.pop())
-    model.graph.node.insert(0, node)
+def sparse() -> Any:
+    tensor = onnx.SparseTensorProto(dims=[3])
+    tensor.values.CopyFrom(external())
+    tensor.indices.CopyFrom(external())
+    return tensor
 
 
-def function(model: Any) -> None:
-    model.functions.add(name="f", domain="own")
+def subgraph() -> Any:
+    inner = helper.make_graph([], "inner", [], [])
+    inner.initializer.append(external())
+    return inner
 
 
+def constant(**attribute: Any) -> Change:
+    """A node `Constant` with an attribute."""
+
+    def change(model: Any) -> None:
+        node = model.graph.node.add(op_type="Constant", output=["made"])
+        node.attribute.append(helper.make_attribute(*attribute.popitem()))
+
+    return change
+
+
+def attribute_of(node: int, **fields: Any) -> Change:
+    """An attribute, field by field, of the first node."""
+    return lambda model: model.graph.node[node].attribute.add(**fields)
+
+
+def with_type(change: Callable[[Any], object]) -> Change:
+    """Another type of a value within the graph."""
+    return lambda model: change(model.graph.value_info.add(name="inner").type)
+
+
+def unknown_field(model: Any) -> None:
+    model.graph.node[0].MergeFromString(b"\xf2\x3f\x03abc")
+
+
+def initialized_input(model: Any) -> None:
+    model.graph.initializer.append(helper.make_tensor("speed", TensorProto.DOUBLE, [1], [0.0]))
+
+
+def training(model: Any) -> None:
+    model.training_info.add().algorithm.CopyFrom(subgraph())
+
+
+INT, TENSOR, GRAPH = (getattr(onnx.AttributeProto, kind) for kind in ("INT", "TENSOR", "GRAPH"))
 WRONG: dict[str, tuple[Change, str]] = {
     "other inputs": (rename, "velocity"),
     "an output more": (lambda model: model.graph.output.append(model.graph.input[0]), "not allowed"),
+    "inputs of float32": (
+        lambda model: setattr(model.graph.input[0].type.tensor_type, "elem_type", TensorProto.FLOAT),
+        "of another type",
+    ),
+    "an input with a value": (initialized_input, "graph: initializer: 'speed'"),
     "a loop": (loop, "operator 'Loop' is not allowed"),
-    "an operator from elsewhere": (foreign, "operator 'Sub' is not allowed"),
-    "weights in another file": (outside, "weights in another file"),
-    "weights of a node in another file": (outside_in_a_node, "weights in another file"),
-    "functions": (function, "functions and sparse weights"),
+    "an operator from elsewhere": (foreign, "operator 'com.evil.Sub' is not allowed"),
+    "an operator of a function": (lambda model: setattr(model.graph.node[0], "overload", "f"), "overload"),
+    "functions": (lambda model: model.functions.add(name="f", domain="own"), "ModelProto.functions"),
+    "training": (training, "ModelProto.training_info"),
+    "metadata": (lambda model: model.metadata_props.add(key="k", value="v"), "ModelProto.metadata_props"),
+    "metadata of a node": (
+        lambda model: model.graph.node[0].metadata_props.add(key="k", value="v"),
+        "NodeProto.metadata_props",
+    ),
+    "metadata of a value": (
+        lambda model: model.graph.output[0].metadata_props.add(key="k", value="v"),
+        "ValueInfoProto.metadata_props",
+    ),
+    "a text": (lambda model: setattr(model, "doc_string", "text"), "ModelProto.doc_string"),
+    "another domain": (lambda model: setattr(model, "domain", "com.evil"), "ModelProto.domain"),
+    "other operators' versions": (
+        lambda model: model.opset_import.add(domain="com.evil", version=1),
+        "graph: opset_import: ",
+    ),
+    "another version of operators": (
+        lambda model: setattr(model.opset_import[0], "version", 19),
+        "graph: opset_import: ",
+    ),
+    "no version of operators": (lambda model: model.ClearField("opset_import"), "graph: opset_import: "),
+    "an old ir_version": (lambda model: setattr(model, "ir_version", 3), "graph: ir_version: 3 is not"),
+    "a new ir_version": (lambda model: setattr(model, "ir_version", 99), "graph: ir_version: 99 is not"),
+    "unknown bytes": (unknown_field, "bytes that ONNX does not know"),
+    "quantization": (
+        lambda model: model.graph.quantization_annotation.add(tensor_name="speed"),
+        "GraphProto.quantization_annotation",
+    ),
+    "external initializer": (lambda model: model.graph.initializer.append(external()), "TensorProto."),
+    "external data that is not said to be": (
+        lambda model: model.graph.initializer.add(name="far").external_data.add(key="location", value="x"),
+        "TensorProto.external_data",
+    ),
+    "a place without external data": (
+        lambda model: model.graph.initializer.add(name="far", data_location=TensorProto.EXTERNAL),
+        "TensorProto.data_location",
+    ),
+    "sparse initializer": (lambda model: model.graph.sparse_initializer.append(sparse()), "sparse_init"),
+    "a segment": (lambda model: model.graph.initializer.add(name="s").segment.SetInParent(), "segment"),
+    "texts": (lambda model: model.graph.initializer.add(name="s", string_data=[b"x"]), "string_data"),
+    "external constant": (constant(value=external()), "TensorProto."),
+    "sparse constant": (constant(sparse_value=sparse()), "AttributeProto.sparse_tensor"),
+    "text as a constant": (constant(value_string="x"), "attribute of Constant: 'value_string'"),
+    "texts as a constant": (constant(value_strings=["x"]), "AttributeProto.strings"),
+    "numbers as a constant": (constant(value_floats=[1.0]), "AttributeProto.floats"),
+    "tensors": (constant(value=[external(), external()]), "AttributeProto.tensors"),
+    "sparse tensors": (constant(value=[sparse(), sparse()]), "AttributeProto.sparse_tensors"),
+    "subgraph": (constant(value=subgraph()), "AttributeProto.g"),
+    "subgraphs": (constant(value=[subgraph(), subgraph()]), "AttributeProto.graphs"),
+    "a type": (attribute_of(0, name="t", tp=onnx.TypeProto()), "AttributeProto.tp"),
+    "types": (attribute_of(0, name="t", type_protos=[onnx.TypeProto()]), "AttributeProto.type_protos"),
+    "a reference": (attribute_of(0, name="axis", ref_attr_name="other"), "AttributeProto.ref_attr_name"),
+    "an attribute of another operator": (attribute_of(0, name="axis", i=1, type=INT), "attribute of Sub"),
+    "a sequence": (with_type(lambda kind: kind.sequence_type.SetInParent()), "TypeProto.sequence_type"),
+    "a map": (with_type(lambda kind: kind.map_type.SetInParent()), "TypeProto.map_type"),
+    "a sparse type": (
+        with_type(lambda kind: kind.sparse_tensor_type.SetInParent()),
+        "TypeProto.sparse_tensor_type",
+    ),
+    "an optional type": (with_type(lambda kind: kind.optional_type.SetInParent()), "optional_type"),
 }
+"""one for each place where a file, code, an operator or a text could hide, and what the refusal names"""
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [
+        [{"name": "value", "type": TENSOR}],
+        [{"name": "value", "type": TENSOR, "i": 1}],
+        [{"name": "value", "type": INT, "t": helper.make_tensor("v", 11, [1], [0.0])}],
+        [{"name": "value", "type": GRAPH, "t": helper.make_tensor("v", 11, [1], [0.0])}],
+        [{"name": "value", "type": TENSOR, "t": helper.make_tensor("v", 11, [1], [0.0])}] * 2,
+        [{"name": "", "type": TENSOR, "t": helper.make_tensor("v", 11, [1], [0.0])}],
+    ],
+    ids=["no value", "another value", "type of a number", "type of a graph", "twice", "no name"],
+)
+def test_an_attribute_has_one_value_of_its_type(fields: list[dict[str, Any]]) -> None:
+    def change(model: Any) -> None:
+        node = model.graph.node.add(op_type="Constant", output=["made"])
+        for each in fields:
+            node.attribute.add(**each)
+
+    with pytest.raises(InputError, match=r"graph: (attribute|type) of Constant"):
+        check_graph(graph(change), Constant())
+
+
+def test_every_field_of_onnx_that_is_not_listed_is_refused() -> None:
+    """Fields of messages that later versions of ONNX add are refused without being named here."""
+    seen, left = set[str](), [onnx.ModelProto.DESCRIPTOR]
+    while left:
+        kind = left.pop()
+        seen.add(kind.name)
+        allowed = FIELDS[kind.name]
+        assert allowed <= {*kind.fields_by_name}, kind.name
+        kinds = {kind.fields_by_name[name].message_type for name in allowed} - {None}
+        left += [each for each in kinds if each.name not in seen]
+    assert seen == FIELDS.keys(), "the list names what cannot be reached"
+    names = {"external_data", "data_location", "sparse_tensor", "g", "functions", "training_info"}
+    assert not names & set().union(*FIELDS.values())
 
 
 @pytest.mark.parametrize("name", WRONG)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from tests.controller.test_file import ALL_PARTS, residual
-from unjam.controller.file import description
+from unjam.controller.manifest import description
 from unjam.drivers import IDM, Driver, FollowerStopper, LocalState, Pacer, PISaturation
 from unjam.drivers.check import random_state
 from unjam.drivers.from_file import FileDriver

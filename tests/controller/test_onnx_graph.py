@@ -13,8 +13,8 @@ from tests.drivers.test_experts import EXPERTS
 from tests.learners.task import make_policy, shake
 from tests.learners.test_trpo_ppo import mean_of
 from unjam.controller.file import replay
+from unjam.controller.graph import check_graph, run_graph
 from unjam.controller.onnx_graph import onnx_graph
-from unjam.controller.verify import check_graph, run_graph
 from unjam.drivers import (
     ACC,
     IDM,

@@ -9,15 +9,26 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from safetensors.numpy import load, save
 
 from tests.conftest import random_network, strangers_driver
 from tests.controller.test_file import ABOUT, residual, written
 from tests.controller.test_sample import perceived
 from unjam.controller import controller_bytes, load_controller
-from unjam.controller.file import GRAPH, MANIFEST, SAMPLE, hash_of, pack_parts, sample_bytes, unpack_parts
-from unjam.controller.verify import verify_controller
-from unjam.drivers import Constant, Driver, PISaturation, ResidualDriver
-from unjam.errors import InputError
+from unjam.controller.file import (
+    GRAPH,
+    MANIFEST,
+    SAMPLE,
+    hash_of,
+    pack_parts,
+    read_controller,
+    sample_bytes,
+    unpack_parts,
+)
+from unjam.controller.verify import check_parts, verify_controller
+from unjam.drivers import IDM, Constant, Driver, PISaturation, ResidualDriver
+from unjam.errors import InputError, MissingPartError
+from unjam.physics.idm import PAPER_IDM, equilibrium_gap
 from unjam.trust import trusting_code
 
 HELD = residual(PISaturation(), hold=3)
@@ -46,14 +57,35 @@ def refused(path: Path) -> str:
     return str(caught.value)
 
 
-def names(path: Path) -> list[str]:
-    return [each.name for each in verify_controller(path)]
+def statuses(path: Path) -> dict[str, str]:
+    return {each.part: each.status for each in verify_controller(path)}
 
 
-def test_a_whole_controller_is_verified(tmp_path: Path) -> None:
+FORMULA_IN_FOLDER = {
+    **dict.fromkeys(("parts", "driver", "weights", "manifest"), "checked"),
+    **dict.fromkeys(("signature", "code", "sample", "graph", "certificate"), "absent"),
+    **dict.fromkeys(("origin", "road"), "stated"),
+}
+"""what is known of a controller with a network and nothing else"""
+
+
+def test_each_part_of_a_controller_is_checked_absent_or_stated(tmp_path: Path) -> None:
     path = written(tmp_path, content_of())
-    assert names(path) == ["parts", "signature", "driver", "weights", "manifest", "sample"]
-    assert "40 decisions, its driver within 0.0e+00 m/s2" in verify_controller(path)[-1].found
+    assert statuses(path) == {**FORMULA_IN_FOLDER, "sample": "checked"}
+    (sample,) = [each.detail for each in verify_controller(path) if each.part == "sample"]
+    assert sample.startswith("40 decisions: the driver repeats them within 0.0e+00 m/s2 (allowed 1e-09); ")
+
+
+def test_what_a_recipe_leaves_out_is_said_to_be_a_default(tmp_path: Path) -> None:
+    def leave_out(manifest: dict[str, Any]) -> None:
+        del manifest["driver"]["expert"]["parameters"]["time_constant"]
+
+    for content, words in (
+        (content_of(), "nothing of which was ignored"),
+        (changed(tmp_path, leave_out).read_bytes(), "what it leaves out has this version's default"),
+    ):
+        found = verify_controller(written(tmp_path, content))
+        assert [each.detail.endswith(words) for each in found if each.part == "driver"] == [True]
 
 
 def test_code_of_a_folder_runs_only_where_it_is_trusted(tmp_path: Path) -> None:
@@ -67,9 +99,9 @@ def test_code_of_a_folder_runs_only_where_it_is_trusted(tmp_path: Path) -> None:
     assert refused(tmp_path).endswith("it runs only with --trust-code")
     assert not ran.exists()
     with trusting_code():
-        assert names(tmp_path)[-1] == "manifest"
+        assert statuses(tmp_path)["code"] == "checked"
     assert ran.exists()
-    assert names(tmp_path)[-1] == "manifest"  # it is remembered
+    assert statuses(tmp_path)["code"] == "checked"  # it is remembered
 
 
 def test_a_feature_of_a_folder_is_code_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -85,14 +117,15 @@ def test_a_feature_of_a_folder_is_code_too(tmp_path: Path, monkeypatch: pytest.M
     assert not ran.exists()
 
 
-def test_a_controller_of_a_run_has_no_sample_and_is_verified(tmp_path: Path) -> None:
+def test_a_controller_of_a_run_has_no_sample_and_says_so(tmp_path: Path) -> None:
     (tmp_path / "controller.unjam").write_bytes(controller_bytes(HELD, ABOUT))
-    assert names(tmp_path) == ["parts", "signature", "driver", "weights", "manifest"]
+    assert statuses(tmp_path) == FORMULA_IN_FOLDER
 
 
-def test_a_controller_of_the_first_format_has_no_description_and_is_verified(tmp_path: Path) -> None:
-    path = changed(tmp_path, lambda manifest: manifest.update(format=1), controller_bytes(HELD, ABOUT))
-    assert names(path) == ["parts", "signature", "driver", "weights"]
+def test_a_formula_without_any_statement_is_said_to_have_none(tmp_path: Path) -> None:
+    found = statuses(written(tmp_path, controller_bytes(PISaturation(), {})))
+    assert (found["weights"], found["origin"]) == ("absent", "absent")
+    assert "road" not in found
 
 
 @pytest.mark.parametrize(
@@ -112,7 +145,8 @@ def test_a_controller_of_the_first_format_has_no_description_and_is_verified(tmp
 def test_a_manifest_that_says_something_else_is_refused(
     tmp_path: Path, change: Callable[[dict[str, Any]], object], key: str
 ) -> None:
-    assert f"its manifest says of {key}: " in refused(changed(tmp_path, change))
+    words = refused(changed(tmp_path, change))
+    assert f"its manifest says of {key}" in words or f"manifest.{key}: missing" in words
 
 
 def test_a_sample_that_the_driver_does_not_answer_so_is_refused(tmp_path: Path) -> None:
@@ -123,12 +157,20 @@ def test_a_sample_that_the_driver_does_not_answer_so_is_refused(tmp_path: Path) 
 
 def test_a_sample_without_bounds_is_refused(tmp_path: Path) -> None:
     assert "names no bounds" in refused(written(tmp_path, content_of(PISaturation())))
-    assert names(written(tmp_path, content_of(PISaturation(), limit=1.0)))[-1] == "sample"
+    assert statuses(written(tmp_path, content_of(PISaturation(), limit=1.0)))["sample"] == "checked"
+
+
+@pytest.mark.parametrize("count", [0, 1001])
+def test_a_sample_that_checks_nothing_or_takes_long_is_refused(tmp_path: Path, count: int) -> None:
+    longest = load(sample_bytes(HELD, perceived(1001), 1.0))
+    sample = save({name: values[:count] for name, values in longest.items()})
+    words = refused(written(tmp_path, content_of(parts={SAMPLE: sample})))
+    assert words == f"sample: decisions: {count} is not allowed; allowed: 1 to 1000"
 
 
 def test_a_graph_without_a_sample_is_refused(tmp_path: Path) -> None:
     path = written(tmp_path, controller_bytes(HELD, ABOUT, {GRAPH: b"graph"}))
-    assert "a graph or a certificate, but no recorded sample" in refused(path)
+    assert "has controller.onnx, but no recorded sample" in refused(path)
 
 
 def test_a_graph_that_answers_something_else_is_refused(tmp_path: Path) -> None:
@@ -139,14 +181,36 @@ def test_a_graph_that_answers_something_else_is_refused(tmp_path: Path) -> None:
     assert "step 0 of its sample: its graph answers " in refused(path)
 
 
-def test_without_onnx_the_graph_is_not_run_and_that_is_told(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_a_graph_that_agrees_on_the_makers_sample_alone_is_refused(tmp_path: Path) -> None:
+    """A sample of one constant state, and a graph that always answers as the driver does there."""
+    from .test_graph import graph, helper
+
+    def constant(model: Any) -> None:
+        model.graph.node[0].CopyFrom(helper.make_node("Sub", ["speed", "speed"], ["acceleration"]))
+
+    driver, same = IDM(), perceived(1)
+    states = same.at(np.zeros(30, int))._replace(speed=np.full(30, 5.0), leader_speed=np.full(30, 5.0))
+    resting = states._replace(leader_gap=np.full(30, equilibrium_gap(5.0, PAPER_IDM)))
+    parts = {SAMPLE: sample_bytes(driver, resting, 9.0), GRAPH: graph(constant)}
+    words = refused(written(tmp_path, controller_bytes(driver, {"action_limit": 9.0}, parts)))
+    assert words.startswith("controller: random state ")
+
+
+@pytest.mark.parametrize("package", ["onnx", "onnxruntime"])
+def test_a_graph_that_cannot_be_run_here_is_not_checked_and_never_passes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, package: str
 ) -> None:
-    monkeypatch.setitem(sys.modules, "onnx", None)
-    path = written(tmp_path, content_of(parts={GRAPH: b"anything"}))
-    last = verify_controller(path)[-1]
-    assert last.name == "graph"
-    assert last.found.startswith("not run: onnx is not installed")
+    from .test_graph import graph
+
+    driver = Constant()
+    path = written(tmp_path, content_of(driver, limit=20.0, parts={GRAPH: graph()}))
+    monkeypatch.setitem(sys.modules, package, None)
+    (found,) = [each for each in check_parts(read_controller(path)) if each.part == "graph"]
+    assert found.status == "not checked"
+    with pytest.raises(
+        MissingPartError, match=f"^controller: graph: not checked: {package} is not installed"
+    ):
+        verify_controller(path)
 
 
 def mutated(content: bytes, kind: str, place: float, other: bytes) -> bytes:
@@ -225,7 +289,7 @@ def test_hashes_are_sha256() -> None:
 
 def test_what_a_stranger_wrote_of_the_road_stays_on_its_line_and_out_of_the_terminal(tmp_path: Path) -> None:
     def forge(manifest: dict[str, Any]) -> None:
-        manifest["scenario"] = {"kind": "ring\nok signature: of 'maker.pub'\x1b[31m"}
+        manifest["scenario"] = {"kind": "ring\nchecked signature: by 'maker.pub'\x1b[31m"}
 
-    (said,) = [each.found for each in verify_controller(changed(tmp_path, forge)) if each.name == "road"]
-    assert said == "made for the ring?ok signature: of 'maker.pub'?[31m"
+    (said,) = [each.detail for each in verify_controller(changed(tmp_path, forge)) if each.part == "road"]
+    assert said == "made for the ring?checked signature: by 'maker.pub'?[31m"

@@ -12,7 +12,7 @@ import pytest
 import torch
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
-from tests.controller.test_signature import forge
+from tests.controller.test_signature import FOR_ANY_MESSAGE, WEAK, forge, signature_part
 from tests.controller.test_verify import HELD, content_of, mutated
 from tests.faults.outcome import Outcome, one_line
 from tests.pictures import empty_pictures
@@ -142,6 +142,8 @@ def signatures(count: int, folder: Path, generator: np.random.Generator) -> Outc
         elif kind == "signed by another":
             del parts[SIGNATURE]
             parts[SIGNATURE] = signature_of(parts, other)
+        elif kind == "signed with a weak key":
+            parts[SIGNATURE] = signature_part(WEAK[int(generator.integers(len(WEAK)))], FOR_ANY_MESSAGE)
         elif kind == "its signature taken away":
             del parts[SIGNATURE]
         if parts == whole:
@@ -161,7 +163,7 @@ def signatures(count: int, folder: Path, generator: np.random.Generator) -> Outc
 
 FORGERIES = (
     *("a part changed", "a part gone", "its manifest changed", "its signature changed", "signed by another"),
-    "its signature taken away",
+    *("signed with a weak key", "its signature taken away"),
 )
 
 

@@ -279,8 +279,11 @@ def test_train_go_on_drive_and_export(unjam: Run, tmp_path: Path) -> None:
         "driver": "pi + residual, filtered",
         "decisions": 80,
     }
-    assert document(unjam("verify", "ring.unjam", "--json"))["verified"].keys() >= {"weights", "sample"}
-    assert "ok sample: 80 decisions" in unjam("verify", "ring.unjam").stdout
+    said = document(unjam("verify", "ring.unjam", "--json"))
+    status = {each["part"]: each["status"] for each in said["parts"]}
+    assert said["ok"] is True
+    assert (status["sample"], status["graph"], status["origin"]) == ("checked", "absent", "stated")
+    assert "checked sample: 80 decisions" in unjam("verify", "ring.unjam").stdout
     (tmp_path / "ring.onnx").write_text("of another controller")
     written = unjam("export", "run", "--to", "ring.unjam")
     assert "ring.unjam: " in written.stdout

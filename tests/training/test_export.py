@@ -8,11 +8,11 @@ import pytest
 from tests.pictures import empty_pictures
 from tests.training.test_run import small_config
 from unjam.controller import load_controller, shipped_file
-from unjam.controller.file import GRAPH, MANIFEST, SAMPLE, WEIGHTS, read_sample, unpack_parts
+from unjam.controller.file import GRAPH, LONGEST_SAMPLE, MANIFEST, SAMPLE, WEIGHTS, read_sample, unpack_parts
 from unjam.drivers import PISaturation, ResidualDriver
 from unjam.drivers.wrappers import Filtered
 from unjam.errors import InputError
-from unjam.training.export import SAMPLED, export_controller
+from unjam.training.export import export_controller
 from unjam.training.train import train
 
 
@@ -78,7 +78,7 @@ def test_a_driver_by_itself_gets_step_and_bounds_of_its_road(tmp_path: Path) -> 
     assert load_controller(done.file) == PISaturation(window=30, time_step=1.0)
     said = manifest_of(done.file)
     assert (said["time_step"], said["action"]["high"]) == (1.0, 1.0)
-    assert done.decisions <= SAMPLED
+    assert done.decisions <= LONGEST_SAMPLE
     again = export_controller(done.file, tmp_path / "again.unjam", scenario="merge")
     assert load_controller(again.file) == load_controller(done.file)
 
@@ -154,4 +154,4 @@ def test_a_controllers_file_keeps_its_road_and_origin(tmp_path: Path) -> None:
     for name in ("scenario", "tuned", "expert", "versions"):
         assert again[name] == shipped[name]
     states, _ = read_sample(unpack_parts(tmp_path / "again.unjam")[SAMPLE])
-    assert len(states.speed) == SAMPLED
+    assert len(states.speed) == LONGEST_SAMPLE

@@ -257,9 +257,11 @@ def verify(
     ] = None,
     json: JsonOption = False,
 ) -> None:
-    """Check a controller: hashes, shapes, names, its signature, that its forms agree on its recorded sample.
+    """Check each part of a controller: hashes, signature, driver, and that its forms agree on its sample.
 
-    Exit code 2 and one line where something is wrong, or where a folder names Python code that is not yours.
+    Each line says that a part was checked and how, that it is absent, or that only its maker states it. Exit
+    code 2 and one line where something is wrong, or where a folder names Python code that is not trusted;
+    exit code 3 where a part could not be checked, as a package is not installed.
 
     Examples:
 
@@ -273,14 +275,18 @@ def verify(
 
     go_on_limited(f"controller: {str(file)!r}")
     from unjam.controller.file import read_controller
-    from unjam.controller.verify import verify as check
+    from unjam.controller.verify import check_parts, require_complete
 
     controller = read_controller(file)
-    verified = {each.name: each.found for each in check(controller, signer)}
+    checks = check_parts(controller, signer)
     if json:
         wanted = None if signer is None else str(signer)
         who = {"signed_by": controller.signed_by, "signer": wanted}
-        print_json({"file": str(file), "ok": True, **who, "verified": verified})
-        return
-    for name, found in verified.items():
-        console.print(f"[green]ok[/green] {name}: {escape(found)}", markup=True)
+        ok = all(each.status != "not checked" for each in checks)
+        print_json({"file": str(file), "ok": ok, **who, "parts": [asdict(each) for each in checks]})
+    else:
+        colors = {"checked": "green", "not checked": "red", "absent": "yellow", "stated": "cyan"}
+        for each in checks:
+            status = f"[{colors[each.status]}]{each.status}[/]"
+            console.print(f"{status} {each.part}: {escape(each.detail)}", markup=True)
+    require_complete(checks)

@@ -14,7 +14,7 @@ from unjam.controller.file import CERTIFICATE, Controller, read_controller
 from unjam.drivers.driver import Driver
 from unjam.drivers.local_state import LocalState
 from unjam.errors import InputError
-from unjam.files import NONE_OF_OURS
+from unjam.files import NONE_OF_OURS, parse_json
 from unjam.parameters import build, flat
 from unjam.worlds.record import Episode
 
@@ -126,7 +126,7 @@ def outside_domain(controller: Controller, states: LocalState) -> float:
     if CERTIFICATE not in controller.parts:
         return 0.0
     try:
-        domain = build(Domain, json.loads(controller.parts[CERTIFICATE])["domain"], "certificate: domain")
+        domain = build(Domain, parse_json(controller.parts[CERTIFICATE])["domain"], "certificate: domain")
     except (*NONE_OF_OURS, InputError):  # `unjam verify` says so; what was driven is not lost for it
         return 0.0
     return float(1.0 - np.mean(domain.holds(states)))

@@ -2,7 +2,6 @@
 
 import hashlib
 import io
-import json
 import os
 import stat
 import zipfile
@@ -14,14 +13,14 @@ import numpy as np
 from safetensors.numpy import load, save
 
 from unjam import __version__
+from unjam.controller.manifest import FORMAT, description, read_manifest
 from unjam.drivers.command import Limits
 from unjam.drivers.driver import Driver
-from unjam.drivers.local_state import COLUMNS, EVERYWHERE, STATE_UNITS, LocalState
+from unjam.drivers.local_state import COLUMNS, EVERYWHERE, LocalState
 from unjam.drivers.registry import code_of, driver_from_recipe, recipe_of
-from unjam.errors import InputError
+from unjam.errors import InputError, wrong
 from unjam.files import NONE_OF_OURS, to_json, write_whole
 from unjam.physics.arrays import Floats
-from unjam.tree import leaves
 from unjam.trust import check_trusted
 from unjam.worlds.drive import drive
 from unjam.worlds.world import RecordedWorld
@@ -30,11 +29,6 @@ if TYPE_CHECKING:
     from unjam.controller.signature import Ed25519PrivateKey
 
 SUFFIX = ".unjam"
-FORMAT = 3
-"""schema version of the manifest"""
-READABLE = (1, 2, FORMAT)
-"""versions that can be read; the first had no description, sample or graph, the second other names of what is
-remembered"""
 MANIFEST, WEIGHTS = "manifest.json", "weights.safetensors"
 SAMPLE, GRAPH, CERTIFICATE = "sample.safetensors", "controller.onnx", "certificate.json"
 SIGNATURE = "signature.json"
@@ -43,6 +37,10 @@ PARTS = (MANIFEST, WEIGHTS, SAMPLE, GRAPH, CERTIFICATE, SIGNATURE)
 was certified, the signature where it was signed: in this order then"""
 LARGEST_PART = 64 * 2**20
 """bytes of one part"""
+LARGEST_TEXTS = {MANIFEST: 2**20, CERTIFICATE: 2**20, SIGNATURE: 10_000}
+"""bytes of parts in JSON, which takes many times its size to be read"""
+LONGEST_SAMPLE = 1000
+"""decisions in a recorded sample"""
 
 UNIX = 3
 """of the systems that an archive can name"""
@@ -129,9 +127,7 @@ def read_controller(path: Path | str) -> Controller:
         raise InputError(f"controller: {str(file)!r} does not exist")
     try:
         parts = unpack_parts(file)
-        manifest = json.loads(parts[MANIFEST])
-        if manifest["format"] not in READABLE:
-            raise InputError(f"controller {file.name}: format {manifest['format']!r} is unknown")
+        manifest = read_manifest(file.name, parts[MANIFEST])
         _check_hashes(file.name, manifest["sha256"], parts)
         signed_by = _signed_by(file, parts) if SIGNATURE in parts else None
         _check_code(file.name, manifest["driver"], path.is_dir())
@@ -219,8 +215,8 @@ def unpack_parts(file: Path) -> dict[str, bytes]:
         for entry in archive.infolist():
             if entry.filename in parts:
                 raise InputError(f"controller {file.name}: has {entry.filename} twice")
-            if wrong := _what_is_wrong(entry):
-                raise InputError(f"controller {file.name}: part {entry.filename!r} {wrong}")
+            if reason := _what_is_wrong(entry):
+                raise InputError(f"controller {file.name}: part {entry.filename!r} {reason}")
             parts[entry.filename] = archive.read(entry)
     for name in (MANIFEST, WEIGHTS):
         if name not in parts:
@@ -237,50 +233,10 @@ def _what_is_wrong(entry: zipfile.ZipInfo) -> str:
     stored = entry.compress_type == zipfile.ZIP_STORED and entry.compress_size == entry.file_size
     if not stored or entry.flag_bits & 1:
         return "is compressed or encrypted; allowed: neither"
-    if entry.file_size > LARGEST_PART:
-        return f"has {entry.file_size} bytes; allowed: at most {LARGEST_PART}"
+    largest = LARGEST_TEXTS.get(entry.filename, LARGEST_PART)
+    if entry.file_size > largest:
+        return f"has {entry.file_size} bytes; allowed: at most {largest}"
     return ""
-
-
-def description(driver: Driver, action_limit: float | None = None) -> dict[str, Any]:
-    """Return what whoever runs a controller must know beside the recipe of its driver, as JSON.
-
-    `action_limit` is that of the road it is for [m/s2], where the driver has none of its own.
-
-    Returns:
-        `observation`: what it is given at each decision, in order, in SI units; `networks`: what each of its
-        networks sees, in order, by the prefix of its weights: each number is divided by its scale;
-        `memory`: what it remembers of each CAV, with its value before the first decision, null where that
-        is NaN; `action`: the acceleration that it answers, clipped to these bounds; `hold`: decisions for
-        which a residual is held.
-    """
-    low, high = driver.limits or (None if action_limit is None else -action_limit, action_limit)
-    remembered = leaves(driver.initial_memory(1))
-    return {
-        "observation": [{"name": name, "unit": STATE_UNITS[name]} for name in driver.perceives],
-        "networks": _networks(driver),
-        "memory": [_remembered(name, value[0]) for name, value in remembered],
-        "action": {"name": "acceleration", "unit": "m/s2", "low": low, "high": high},
-        "hold": driver.hold,
-    }
-
-
-def _networks(driver: Driver, prefix: str = "") -> dict[str, list[dict[str, Any]]]:
-    shown = driver.shown
-    own = {} if shown is None else {prefix: [number._asdict() for number in shown]}
-    return own | {
-        name: seen
-        for below, held in driver.inner.items()
-        for name, seen in _networks(held, f"{prefix}{below}.").items()
-    }
-
-
-def _remembered(name: str, value: Any) -> dict[str, Any]:
-    """Return the name, shape and first value of what is remembered of one CAV."""
-    values = np.asarray(value, np.float64)
-    different = np.unique(values)  # NaN is one value
-    first = different[0].item() if len(different) == 1 else values.tolist()
-    return {"name": name, "shape": list(values.shape), "first": None if first != first else first}
 
 
 def sample_bytes(driver: Driver, states: LocalState, limit: float) -> bytes:
@@ -294,19 +250,22 @@ def read_sample(part: bytes) -> tuple[LocalState, Floats]:
     """Return the states of a sample and the recorded accelerations [m/s2], all of shape (T,).
 
     Raises:
-        InputError: an array is missing, unknown, of another shape or type, or an acceleration is not finite.
+        InputError: an array is missing, unknown, of another shape or type, or an acceleration is not finite;
+            or there are no decisions, or more than `LONGEST_SAMPLE`.
     """
     arrays: dict[str, Any] = load(part)
     needed, known = {*EVERYWHERE, ANSWER}, {*LocalState._fields, ANSWER}
-    wrong = (needed - arrays.keys()) | (arrays.keys() - known)
-    if wrong:
-        first = min(wrong)
+    unfit = (needed - arrays.keys()) | (arrays.keys() - known)
+    if unfit:
+        first = min(unfit)
         raise InputError(f"sample: {first!r} is {'missing' if first in needed else 'unknown'}")
     answers = arrays.pop(ANSWER)
     for name, values in {**arrays, ANSWER: answers}.items():
         shape = (len(values), COLUMNS[name]) if name in COLUMNS else answers.shape
         if values.ndim != len(shape) or values.shape != shape or values.dtype != np.float64:
             raise InputError(f"sample: {name!r} has shape {values.shape} of {values.dtype}; allowed: numbers")
+    if not 1 <= len(answers) <= LONGEST_SAMPLE:
+        raise wrong("sample: decisions", len(answers), f"1 to {LONGEST_SAMPLE}")
     if not np.isfinite(answers).all():
         raise InputError("sample: a recorded acceleration is not finite")
     return LocalState(**arrays), answers

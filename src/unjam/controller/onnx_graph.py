@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from unjam.controller.verify import graph_names, needed
+from unjam.controller.graph import OPSET, graph_names, needed
 from unjam.drivers.command import Limits
 from unjam.drivers.driver import Driver, Memory
 from unjam.drivers.local_state import LocalState, like_ones
@@ -20,8 +20,6 @@ from unjam.drivers.speed_history import WrittenRows
 from unjam.errors import InputError
 from unjam.tree import leaves, rebuilt
 
-OPSET = 20
-"""version of ONNX's operators"""
 ROWS = 2
 """of the example that the graph is drawn from; it takes any number of CAVs"""
 
@@ -112,7 +110,10 @@ def onnx_graph(driver: Driver, limit: float) -> bytes:
             verbose=False,
         )
     _simplify(program.model)
-    return program.model_proto.SerializeToString()
+    proto = program.model_proto
+    for value in (*proto.graph.input, *proto.graph.output, *proto.graph.value_info):
+        value.ClearField("metadata_props")  # the pass clears those of nodes alone
+    return proto.SerializeToString()
 
 
 def _simplify(model: Any) -> None:

@@ -37,6 +37,13 @@ ITS_OWNERS, EVERYBODYS = 0o600, 0o644
 """who may read a file"""
 LARGEST_KEY = 10_000
 """bytes of a key's file"""
+FIELD_PRIME = 2**255 - 19
+GROUP_ORDER = 2**252 + 27742317777372353535851937790883648493
+_ORDER_8 = 0x05FC536D880238B13933C6D305ACDFD5F098EFF289F4C345B027B2C28F95E826
+SMALL_ORDER = {0, 1, FIELD_PRIME - 1, _ORDER_8, FIELD_PRIME - _ORDER_8}
+"""y coordinates of the eight points whose order divides 8: with such a key one signature fits any message.
+Source: RFC 8032, section 5.1; Chalkias et al. 2020, Taming the many EdDSAs"""
+WEAK = "a weak Ed25519 key, for which anybody can sign,"
 SIGNED = "unjam controller, signature 1"
 """the first line of what is signed: nothing else that is signed with the same key can be taken for it"""
 
@@ -88,6 +95,8 @@ def read_private_key(file: Path) -> Ed25519PrivateKey:
         raise wrong("key", str(file), PRIVATE_KEY) from None
     if not isinstance(key, Ed25519PrivateKey):
         raise wrong("key", str(file), PRIVATE_KEY)
+    if is_weak(key.public_key().public_bytes_raw()):
+        raise InputError(f"key: {str(file)!r}: {WEAK} is not allowed; allowed: {PRIVATE_KEY}")
     return key
 
 
@@ -100,7 +109,15 @@ def read_public_key(file: Path) -> str:
         raise wrong("signer", str(file), PUBLIC_KEY) from None
     if not isinstance(key, Ed25519PublicKey):
         raise wrong("signer", str(file), PUBLIC_KEY)
+    if is_weak(key.public_bytes_raw()):
+        raise InputError(f"signer: {str(file)!r}: {WEAK} is not allowed; allowed: {PUBLIC_KEY}")
     return fingerprint_of(key)
+
+
+def is_weak(point: bytes) -> bool:
+    """Return whether the encoding of a point is not canonical, or the point is of small order."""
+    y = int.from_bytes(point, "little") & (2**255 - 1)  # without the sign of x
+    return y >= FIELD_PRIME or y in SMALL_ORDER
 
 
 def fingerprint_of(key: Ed25519PublicKey) -> str:
@@ -119,7 +136,8 @@ def signer_of(name: str, parts: dict[str, bytes], part: bytes) -> str:
     """Return the fingerprint of the key that signed `parts`, as `part` says, of the controller `name`.
 
     Raises:
-        InputError: it is not a signature, or it does not fit.
+        InputError: it is not a signature, it does not fit, or it is of a weak key or malleable: a second
+            encoding of another signature.
     """
     none_of_ours = InputError(f"controller {name}: its signature is not one that unjam writes")
     try:
@@ -130,6 +148,10 @@ def signer_of(name: str, parts: dict[str, bytes], part: bytes) -> str:
         raise none_of_ours from None
     if part != _written(key, raw, signature):  # something else stands there too
         raise none_of_ours
+    if is_weak(raw):
+        raise InputError(f"controller {name}: it is signed by {WEAK} which is not allowed")
+    if is_weak(signature[:32]) or int.from_bytes(signature[32:], "little") >= GROUP_ORDER:
+        raise forged(name)
     try:
         key.verify(signature, _message(parts, raw))
     except InvalidSignature:

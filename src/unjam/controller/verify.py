@@ -1,23 +1,21 @@
-"""Is a controller whole, is it what it says, and do its forms agree: `unjam verify`.
+"""Is a controller undamaged, does it do what it says, and do its forms agree: `unjam verify`.
 
 Its forms are its driver, a recorded sample (what a CAV perceived in an episode, and what the controller
-answers to it) and an ONNX graph, which is looked at before it is run.
+answers to it), an ONNX graph and a certificate. Each part of a controller gets one line, which says how it
+was checked, that it is absent, that it is a statement of the maker, or that it could not be checked here.
 """
 
 import json
 from dataclasses import dataclass
-from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 from unjam.controller.certificate import certificate_of
-from unjam.controller.domain import road_of
+from unjam.controller.domain import other_step, road_of
 from unjam.controller.file import (
-    ANSWER,
     CERTIFICATE,
-    FORMAT,
     GRAPH,
     MANIFEST,
     SAMPLE,
@@ -25,16 +23,18 @@ from unjam.controller.file import (
     WEIGHTS,
     Controller,
     Floats,
-    description,
+    hash_of,
     read_controller,
     read_sample,
     replay,
 )
-from unjam.drivers.driver import Driver
+from unjam.controller.graph import check_graph, run_graph
+from unjam.controller.manifest import STATEMENTS, description, first_difference, shown
+from unjam.drivers.check import random_state
 from unjam.drivers.local_state import LocalState
+from unjam.drivers.registry import code_of, recipe_of
 from unjam.errors import InputError, MissingPartError
-from unjam.files import reading, to_json
-from unjam.tree import leaves
+from unjam.files import parse_json, reading, to_json
 
 REPEATS_TO = 1e-9
 """how far the recorded accelerations may be from those of this machine [m/s2]"""
@@ -42,215 +42,247 @@ CERTIFIED_TO = 1e-6
 """how far a certificate's numbers may be from those of this machine"""
 PARITY = 1e-6
 """how far the graph may be from the driver [m/s2]"""
-OPERATORS = {
-    *("Abs", "Add", "And", "Cast", "Clip", "Concat", "Constant", "Cos", "Div", "Equal", "Expand", "Floor"),
-    *("Gather", "GatherElements", "GatherND", "Gemm", "Greater", "GreaterOrEqual", "Identity", "IsNaN"),
-    *("Less", "LessOrEqual", "MatMul", "Max", "Min", "Mod", "Mul", "Neg", "Not", "Or", "Pow", "Relu"),
-    *("Reciprocal", "ReduceMean"),
-    *("Reshape", "ScatterElements", "Shape", "Sin", "Slice", "Sqrt", "Squeeze", "Sub", "Tanh", "Transpose"),
-    *("Unsqueeze", "Where"),
-}
-"""all that the graph of a controller is made of: arithmetic, without loops and without files"""
+DRAWN = 200
+"""random states on which graph and driver are compared, besides the maker's sample"""
+
+Status = Literal["checked", "absent", "stated", "not checked"]
 
 
 @dataclass(frozen=True)
-class Verified:
-    """What was found of one thing that a controller was checked for."""
+class PartCheck:
+    """What is known of one part of a controller."""
 
-    name: str
-    found: str
+    part: str
+    status: Status
+    """`checked`: it was, and is right; `absent`: the controller has no such part; `stated`: only its maker
+    can know it; `not checked`: it could not be checked on this machine"""
+    detail: str
+    """how it was checked, or what it means that it was not"""
 
 
-def verify_controller(path: Path | str, signer: Path | str | None = None) -> list[Verified]:
-    """Return what was checked of a `.unjam` file, or of a run folder; no code runs that is not trusted.
+def verify_controller(path: Path | str, signer: Path | str | None = None) -> list[PartCheck]:
+    """Return what is known of each part of a `.unjam` file or a run folder; only trusted code runs.
 
     Args:
         path: the file, or the folder.
-        signer: file of the public key that must have signed it; None where anybody may have, or nobody.
+        signer: file of the public key that must have signed it; None allows any key, and no signature.
 
     Raises:
         InputError: the first thing that is wrong, in one line; also where there is code that is not trusted.
+        MissingPartError: a part could not be checked, as a package is not installed.
     """
-    return verify(read_controller(path), signer)
+    checks = check_parts(read_controller(path), signer)
+    require_complete(checks)
+    return checks
 
 
-def verify(controller: Controller, signer: Path | str | None = None) -> list[Verified]:
-    """Return what was checked of a controller that was read; arguments and errors as `verify_controller`."""
+def require_complete(checks: list[PartCheck]) -> None:
+    """Raise `MissingPartError` where a part of a controller could not be checked."""
+    if missed := [
+        f"{each.part}: not checked: {each.detail}" for each in checks if each.status == "not checked"
+    ]:
+        raise MissingPartError(f"controller: {'; '.join(missed)}")
+
+
+def check_parts(controller: Controller, signer: Path | str | None = None) -> list[PartCheck]:
+    """Return what is known of each part of a controller; arguments and errors as `verify_controller`.
+
+    A part that cannot be checked on this machine is no error here: its status says so.
+    """
     with reading("verify"):
-        return _verified(controller, signer)
+        signature = _check_signer(controller.signed_by, signer)
+        without_sample = (
+            {GRAPH, CERTIFICATE} & controller.parts.keys() if SAMPLE not in controller.parts else ()
+        )
+        if without_sample:
+            raise InputError(f"controller: has {min(without_sample)}, but no recorded sample to try it on")
+        return [
+            _describe_archive(controller),
+            signature,
+            _check_recipe(controller),
+            _describe_code(controller),
+            _describe_weights(controller),
+            _check_description(controller),
+            *_describe_origin(controller),
+            _check_sample(controller),
+            _check_graph(controller),
+            _check_certificate(controller),
+        ]
 
 
-def _verified(controller: Controller, signer: Path | str | None) -> list[Verified]:
-    signature = _check_signer(controller.signed_by, signer)
-    driver, manifest = controller.driver, controller.manifest
+def _describe_archive(controller: Controller) -> PartCheck:
+    """Return the parts of the archive; their hashes were compared as it was read."""
     parts = {name: part for name, part in controller.parts.items() if name not in (MANIFEST, SIGNATURE)}
     sizes = ", ".join(f"{name} {len(part):,} bytes" for name, part in parts.items())
-    weights = f"finite, of the shapes that the driver needs; SHA-256 {manifest['sha256'][WEIGHTS]}"
-    verified = [
-        Verified("parts", f"{sizes}; each has the hash that the manifest names"),
-        Verified("signature", signature),
-        Verified("driver", driver.describe()),
-        *([Verified("road", f"made for the {road}")] if (road := road_of(manifest)) else []),
-        Verified("weights", weights),
-    ]
-    if manifest["format"] > 1:
-        for key, value in description(driver, manifest.get("action_limit")).items():
-            named_otherwise = key == "memory" and manifest["format"] < FORMAT
-            if manifest.get(key) != value and not named_otherwise:
-                said, allowed = _short(manifest.get(key)), _short(value)
-                raise InputError(f"controller: its manifest says of {key}: {said}; allowed: {allowed}")
-        seen = "what it observes, remembers and answers is what its driver does"
-        verified.append(Verified("manifest", seen))
-    if SAMPLE in parts:
-        verified += _check_sample(controller)
-    elif GRAPH in parts or CERTIFICATE in parts:
-        raise InputError("controller: has a graph or a certificate, but no recorded sample to try it on")
-    if CERTIFICATE in parts:
-        verified.append(Verified("certificate", _check_certificate(controller)))
-    return verified
+    return PartCheck("parts", "checked", f"{sizes}: each has the SHA-256 that the manifest names")
 
 
-def _check_signer(found: str | None, signer: Path | str | None) -> str:
-    """Return what is told of who signed a controller; raise `InputError` where it was not `signer`."""
+def _check_signer(found: str | None, signer: Path | str | None) -> PartCheck:
+    """Return who signed a controller; raise `InputError` where that is not `signer`."""
+    over = "it fits the manifest and every other part"
     if signer is None:
-        known = "compare that with what its maker told you, or give a public key (--signer)"
-        return "none: who made it is not said" if found is None else f"of the key {found}: {known}"
-    from unjam.controller.signature import read_public_key  # which takes its time, and few need
+        if found is None:
+            unknown = "its maker is unknown, and a change together with all hashes is not noticed"
+            return PartCheck("signature", "absent", f"nothing shows who made the controller: {unknown}")
+        owner = "whose key that is was not checked: give the maker's public key (--signer)"
+        return PartCheck("signature", "checked", f"{over}, by the key {found}; {owner}")
+    from unjam.controller.signature import read_public_key  # it loads cryptography, which few need
 
     wanted = read_public_key(Path(signer))
     if found != wanted:
         how = "it is not signed" if found is None else f"it is signed by another key, {found}"
         raise InputError(f"controller: {how}; allowed: signed by {str(signer)!r}, {wanted}")
-    return f"of {str(signer)!r}, the key {found}"
+    return PartCheck("signature", "checked", f"{over}, by {str(signer)!r}, the key {found}")
 
 
-def _short(value: Any) -> str:
-    text = repr(value)
-    return text if len(text) < 200 else f"{text[:200]}..."
-
-
-def _check_sample(controller: Controller) -> list[Verified]:
-    """Compare the driver, and the graph where there is one, with the recorded sample."""
-    low, high = (controller.manifest["action"][end] for end in ("low", "high"))
-    if low is None or high is None:
-        raise InputError("controller: has a recorded sample, but its manifest names no bounds of its action")
-    limit = max(-low, high)
-    states, recorded = read_sample(controller.parts[SAMPLE])
-    answers = replay(controller.driver, states, limit)
-    verified = [Verified("sample", _compare("its driver", answers, recorded, REPEATS_TO))]
-    if GRAPH in controller.parts and controller.manifest["format"] < FORMAT:
-        verified.append(Verified("graph", "not run: an older version of unjam made it, with other names"))
-    elif GRAPH in controller.parts:
-        try:
-            check_graph(controller.parts[GRAPH], controller.driver)
-            found = run_graph(controller.parts[GRAPH], controller.driver, states)
-        except MissingPartError as error:
-            return [*verified, Verified("graph", f"not run: {error}")]
-        verified.append(Verified("graph", _compare("its graph", found, recorded, PARITY)))
-    return verified
-
-
-def _check_certificate(controller: Controller) -> str:
-    """Try the controller again, and compare with its certificate number by number."""
-    said = json.loads(controller.parts[CERTIFICATE])
-    found = json.loads(to_json(certificate_of(controller)))
-    for name, (written, again) in _numbers(said, found).items():
-        if not (again == written or abs(again - written) <= CERTIFIED_TO * max(1.0, abs(again))):
-            raise InputError(f"controller: its certificate says of {name}: {written}; allowed: {again}")
-    worst = found["worst"]
-    return (
-        f"{worst['steps']:,} steps behind leaders that brake and attack, {worst['contacts']} contacts, "
-        f"smallest gap {worst['smallest_gap']:.2f} m: as certified"
+def _check_recipe(controller: Controller) -> PartCheck:
+    """Compare the recipe of the manifest with that of the driver which was made of it."""
+    said, found = controller.manifest["driver"], _as_json(recipe_of(controller.driver)[0])
+    _require_same("manifest", first_difference(said, found, defaults=True, name="driver"))
+    left_out = first_difference(said, found)
+    defaults = "; what it leaves out has this version's default" if left_out else ""
+    driver = controller.driver.describe()
+    return PartCheck(
+        "driver", "checked", f"{driver}: made of its recipe, nothing of which was ignored{defaults}"
     )
 
 
-def _numbers(said: Any, found: Any, name: str = "") -> dict[str, tuple[Any, Any]]:
-    """Return all leaves of two JSON trees, by name; raise `InputError` where they are not alike."""
-    if isinstance(found, dict) and isinstance(said, dict) and said.keys() == found.keys():
-        pairs = [(said[key], found[key], f"{name}.{key}".strip(".")) for key in found]
-    elif isinstance(found, list) and isinstance(said, list) and len(said) == len(found):
-        pairs = [(one, two, f"{name}[{i}]") for i, (one, two) in enumerate(zip(said, found, strict=True))]
-    elif isinstance(found, int | float) and isinstance(said, int | float):
-        return {name: (said, found)}
-    else:
-        raise InputError(f"controller: its certificate says of {name or 'itself'}: {_short(said)}")
-    return {key: pair for one, two, below in pairs for key, pair in _numbers(one, two, below).items()}
+def _describe_code(controller: Controller) -> PartCheck:
+    """Return which Python code a controller runs; hash and trust were checked before it was read."""
+    files = sorted({each["path"] for each in code_of(controller.manifest["driver"])})
+    if not files:
+        return PartCheck("code", "absent", "the controller is data: none of it is Python code")
+    named = ", ".join(shown(path) for path in files)
+    unchanged = "it is trusted here, with the SHA-256 that the manifest names; what it imports or does is not"
+    return PartCheck("code", "checked", f"{named}: {unchanged} checked")
 
 
-def _compare(who: str, found: np.ndarray, recorded: np.ndarray, tolerance: float) -> str:
+def _describe_weights(controller: Controller) -> PartCheck:
+    """Return that there are weights; their shapes and values were checked as the driver was made."""
+    part, arrays = controller.parts[WEIGHTS], controller.driver.arrays()
+    if not arrays:
+        return PartCheck("weights", "absent", f"the driver has no network; SHA-256 {hash_of(part)}")
+    fit = "finite, of the shapes that the driver needs, none left over"
+    return PartCheck("weights", "checked", f"{len(arrays)} arrays, {fit}; SHA-256 {hash_of(part)}")
+
+
+def _check_description(controller: Controller) -> PartCheck:
+    """Compare what the manifest says of the driver with what the driver says of itself."""
+    found = _as_json(description(controller.driver, controller.manifest.get("action_limit")))
+    said = {name: controller.manifest[name] for name in found}
+    _require_same("manifest", first_difference(said, found))
+    return PartCheck("manifest", "checked", f"{', '.join(found)}: as the driver describes itself")
+
+
+def _describe_origin(controller: Controller) -> list[PartCheck]:
+    """Return what only the maker of a controller can know."""
+    manifest = controller.manifest
+    stated = [name for name in STATEMENTS if name in manifest]
+    if not stated:
+        return [PartCheck("origin", "absent", "the manifest does not say where the controller comes from")]
+    nobody = "the maker's statement: nothing in the file can prove it"
+    checks = [
+        PartCheck("origin", "stated", f"{', '.join(stated)}, and unjam {shown(manifest['unjam'])}: {nobody}")
+    ]
+    if road := road_of(manifest):
+        once = {"simulation_step": manifest.get("time_step", 0.0), "steps_per_decision": 1}
+        other = other_step(controller.driver, once) if "time_step" in manifest else ""
+        checks.append(PartCheck("road", "stated", f"made for the {road}{other and f'; the driver {other}'}"))
+    return checks
+
+
+def _check_sample(controller: Controller) -> PartCheck:
+    """Compare the driver with the recorded sample."""
+    if SAMPLE not in controller.parts:
+        why = "a run folder and `unjam tune` record none"
+        return PartCheck(
+            "sample", "absent", f"no recorded accelerations to repeat; {why}, `unjam export` does"
+        )
+    states, recorded = read_sample(controller.parts[SAMPLE])
+    answers = replay(controller.driver, states, _action_limit(controller))
+    off = _largest_error("its driver", answers, recorded, REPEATS_TO)
+    again = f"the driver repeats them within {off:.1e} m/s2 (allowed {REPEATS_TO:g})"
+    return PartCheck(
+        "sample", "checked", f"{len(recorded):,} decisions: {again}; their states are the maker's"
+    )
+
+
+def _check_graph(controller: Controller) -> PartCheck:
+    """Compare the graph with the recorded sample, and with the driver on states that no maker can choose."""
+    if GRAPH not in controller.parts:
+        return PartCheck("graph", "absent", "no ONNX graph; `unjam export --onnx` draws one")
+    part, driver = controller.parts[GRAPH], controller.driver
+    states, recorded = read_sample(controller.parts[SAMPLE])
+    try:
+        check_graph(part, driver)
+        off = _largest_error("its graph", run_graph(part, driver, states), recorded, PARITY)
+        drawn = _drawn_states(part, states)
+        answers = replay(driver, drawn, _action_limit(controller))
+        off_drawn = _largest_error(
+            "its graph", run_graph(part, driver, drawn), answers, PARITY, "random state"
+        )
+    except MissingPartError as error:
+        return PartCheck("graph", "not checked", str(error))
+    found = f"within {off:.1e} m/s2 of the sample and {off_drawn:.1e} of the driver on {DRAWN} random states"
+    return PartCheck("graph", "checked", f"arithmetic alone; {found} (allowed {PARITY:g})")
+
+
+def _drawn_states(part: bytes, states: LocalState) -> LocalState:
+    """Return random states, the same for the same graph; what none are drawn of is as in the sample."""
+    generator = np.random.default_rng(int(hash_of(part), 16))
+    drawn, rows = random_state(generator, DRAWN, told=True), generator.integers(len(states.speed), size=DRAWN)
+    return LocalState(
+        *(
+            values if values is None else values[rows] if random is None else random
+            for values, random in zip(states, drawn, strict=True)
+        )
+    )
+
+
+def _check_certificate(controller: Controller) -> PartCheck:
+    """Try the controller again, and compare with its certificate number by number."""
+    if CERTIFICATE not in controller.parts:
+        return PartCheck("certificate", "absent", "no worst cases were tried; `unjam certify` does")
+    said = parse_json(controller.parts[CERTIFICATE])
+    found = _as_json(certificate_of(controller))
+    _require_same("certificate", first_difference(said, found, CERTIFIED_TO))
+    worst = found["worst"]
+    tried = f"{worst['steps']:,} steps behind leaders that brake and attack, {worst['contacts']} contacts"
+    gap = f"smallest gap {worst['smallest_gap']:.2f} m"
+    return PartCheck("certificate", "checked", f"{tried}, {gap}: tried again with this driver, as certified")
+
+
+def _action_limit(controller: Controller) -> float:
+    """Return how large an acceleration may be [m/s2]."""
+    low, high = (controller.manifest["action"][end] for end in ("low", "high"))
+    if low is None or high is None:
+        raise InputError("controller: has a recorded sample, but its manifest names no bounds of its action")
+    return max(-low, high)
+
+
+def _as_json(value: Any) -> Any:
+    """Return a document as it is once it was written and read."""
+    return json.loads(to_json(value))
+
+
+def _require_same(what: str, difference: tuple[str, Any, Any] | None) -> None:
+    """Raise `InputError` where a document says something else than is found."""
+    if difference is not None:
+        name, said, found = difference
+        allowed = f"{shown(said)}; allowed: {shown(found)}"
+        raise InputError(f"controller: its {what} says of {name or 'itself'}: {allowed}")
+
+
+def _largest_error(
+    which: str, found: Floats, recorded: Floats, tolerance: float, step_of: str = "step"
+) -> float:
+    """Return how far accelerations are from those wanted [m/s2]; raise `InputError` above the tolerance."""
     off = np.abs(found - recorded)
     if not (off <= tolerance).all():  # NaN is not either
         step = int(np.argmax(~(off <= tolerance)))
+        place = f"{step_of} {step}" if step_of != "step" else f"step {step} of its sample"
         raise InputError(
-            f"controller: step {step} of its sample: {who} answers {found[step]:.9g} m/s2; "
+            f"controller: {place}: {which} answers {found[step]:.9g} m/s2; "
             f"allowed: {recorded[step]:.9g} to {tolerance:g}"
         )
-    return f"{len(found):,} decisions, {who} within {off.max(initial=0.0):.1e} m/s2 of what was recorded"
-
-
-def graph_names(driver: Driver) -> tuple[list[str], list[str]]:
-    """Return the names of a graph's inputs (state, memory) and outputs (acceleration, memory after it)."""
-    remembered = [name for name, _ in leaves(driver.initial_memory(1))]
-    inputs = [*driver.perceives, *(f"memory.{name}" for name in remembered)]
-    return inputs, [ANSWER, *(f"next.{name}" for name in remembered)]
-
-
-def check_graph(part: bytes, driver: Driver) -> None:
-    """Raise `InputError` unless a graph has a controller's inputs and outputs, and only arithmetic between.
-
-    Raises:
-        MissingPartError: onnx is not installed.
-    """
-    onnx = needed("onnx")
-    try:
-        model = onnx.load_model_from_string(part)
-    except Exception as error:  # protobuf's own kinds of error
-        raise InputError(f"graph: cannot be read: {error}") from None
-    graph, wanted = model.graph, graph_names(driver)
-    found = [value.name for value in graph.input], [value.name for value in graph.output]
-    if found != wanted:
-        raise InputError(f"graph: inputs and outputs {found} are not allowed; allowed: {wanted}")
-    if model.functions or graph.sparse_initializer:
-        raise InputError("graph: functions and sparse weights are not allowed")
-    tensors = list(graph.initializer)
-    for node in graph.node:
-        if node.domain not in ("", "ai.onnx") or node.op_type not in OPERATORS:
-            raise InputError(f"graph: operator {node.op_type!r} is not allowed; allowed: arithmetic")
-        tensors += [attribute.t for attribute in node.attribute if attribute.HasField("t")]
-    if any(tensor.external_data or tensor.data_location for tensor in tensors):
-        raise InputError("graph: weights in another file are not allowed")
-
-
-def run_graph(part: bytes, driver: Driver, states: LocalState) -> Floats:
-    """Return what a checked graph answers when it perceives `states` one after the other [m/s2].
-
-    It begins with the first memory of `driver`, whose graph it is; all arrays have the shape (T,).
-
-    Raises:
-        InputError: onnxruntime refuses it.
-        MissingPartError: onnxruntime is not installed.
-    """
-    runtime = needed("onnxruntime")
-    options = runtime.SessionOptions()
-    options.intra_op_num_threads = options.inter_op_num_threads = 1
-    options.log_severity_level = 4
-    (inputs, _), answers = graph_names(driver), np.zeros(len(states.speed))
-    memory: list[Any] = [rows for _, rows in leaves(driver.initial_memory(1))]
-    try:
-        session = runtime.InferenceSession(part, options, providers=["CPUExecutionProvider"])
-        for step in range(len(answers)):
-            now = states.at(slice(step, step + 1))
-            seen = [getattr(now, name) for name in driver.perceives]
-            acceleration, *memory = session.run(None, dict(zip(inputs, [*seen, *memory], strict=True)))
-            answers[step] = acceleration[0]
-    except Exception as error:  # the runtime's own kinds of error
-        raise InputError(f"graph: cannot be run: {error}") from None
-    return answers
-
-
-def needed(name: str) -> Any:
-    """Return a package that only graphs need; raise `MissingPartError` where it is not installed."""
-    try:
-        return import_module(name)
-    except ImportError:
-        raise MissingPartError(f"{name} is not installed; install it: pip install 'unjam[train]'") from None
+    return float(off.max())

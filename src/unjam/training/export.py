@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from unjam.controller import SUFFIX, controller_bytes, file_of, make_driver
-from unjam.controller.file import GRAPH, SAMPLE, read_controller, sample_bytes
+from unjam.controller.file import GRAPH, LONGEST_SAMPLE, SAMPLE, read_controller, sample_bytes
+from unjam.controller.manifest import STATEMENTS
 from unjam.controller.verify import verify_controller
 from unjam.drivers.driver import Driver
 from unjam.drivers.local_state import LocalState
@@ -30,13 +31,6 @@ if TYPE_CHECKING:
     from unjam.learners.learner import Tensors
 
 Kind = Literal["best", "kept"]
-SAMPLED = 1000
-"""most decisions of the recorded sample"""
-KNOWN = (
-    *("about", "scenario", "time_step", "action_limit", "expert", "versions"),
-    *("run", "iteration", "actual_steps", "metrics", "tuned"),
-)
-"""what a controller's manifest says of where it comes from"""
 
 
 class KeptControllers:
@@ -109,7 +103,7 @@ def export_controller(source: str | Path, to: str | Path, onnx: bool = False, sc
 
     Raises:
         InputError: there is no such controller, or it is Python code, or, with `onnx`, cannot be drawn.
-        MissingPartError: with `onnx`, it is not installed.
+        MissingPartError: with `onnx`, a package that draws or runs graphs is not installed.
     """
     source, to = Path(source), Path(to)
     if to.suffix != SUFFIX:
@@ -183,7 +177,7 @@ def _of_driver(text: str, scenario: str) -> tuple[Scenario, Driver, dict[str, An
     file = None if scenario else file_of(text)
     if file is not None:
         found = read_controller(file)
-        about = {name: found.manifest[name] for name in KNOWN if name in found.manifest}
+        about = {name: found.manifest[name] for name in STATEMENTS if name in found.manifest}
         road = scenario_from_recipe(about["scenario"]) if "scenario" in about else example_of("ring")
         return road, found.driver, about
     road = example_of(scenario or "ring")
@@ -211,6 +205,6 @@ def _perceived(road: Scenario, driver: Driver) -> LocalState:
         (episode,) = workers.run([EpisodeTask(road, driver, held_out_seeds(1)[0])])
     raise_failure([measure(episode)] if not episode.ok else [])
     longest = max(episode.trajectories, key=lambda trajectory: len(trajectory.applied))
-    decisions = min(len(longest.applied), SAMPLED)
+    decisions = min(len(longest.applied), LONGEST_SAMPLE)
     seen = longest.states.at(slice(decisions))
     return LocalState(**{name: values for name, values in seen._asdict().items() if name in driver.perceives})

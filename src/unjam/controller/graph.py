@@ -1,0 +1,167 @@
+"""The ONNX graph of a controller: its inputs and outputs, what it may consist of, and how it is run.
+
+A graph of others is data only as long as it is arithmetic: ONNX knows loops, functions, operators of other
+domains, and tensors that lie in other files. So whatever is not listed here is refused, at any depth.
+"""
+
+from importlib import import_module
+from typing import Any
+
+import numpy as np
+
+from unjam.controller.file import ANSWER
+from unjam.drivers.driver import Driver
+from unjam.drivers.local_state import LocalState
+from unjam.errors import InputError, MissingPartError, wrong
+from unjam.physics.arrays import Floats
+from unjam.tree import leaves
+
+OPSET = 20
+"""version of ONNX's operators"""
+IR_VERSIONS = range(10, 14)
+"""versions of ONNX's format in which a graph of this opset is written"""
+OPERATORS: dict[str, dict[str, str]] = {
+    **{
+        name: {}
+        for name in (
+            *("Abs", "Add", "And", "Clip", "Cos", "Div", "Equal", "Expand", "Floor", "Greater"),
+            *("GreaterOrEqual", "Identity", "IsNaN", "Less", "LessOrEqual", "MatMul", "Max", "Min", "Mul"),
+            *("Neg", "Not", "Or", "Pow", "Reciprocal", "Relu", "Sin", "Slice", "Sqrt", "Squeeze", "Sub"),
+            *("Tanh", "Unsqueeze", "Where"),
+        )
+    },
+    "Cast": {"to": "i"},
+    "Concat": {"axis": "i"},
+    "Constant": {"value": "t"},
+    "Gather": {"axis": "i"},
+    "GatherElements": {"axis": "i"},
+    "GatherND": {"batch_dims": "i"},
+    "Gemm": {"alpha": "f", "beta": "f", "transA": "i", "transB": "i"},
+    "Mod": {"fmod": "i"},
+    "ReduceMean": {"keepdims": "i", "noop_with_empty_axes": "i"},
+    "Reshape": {"allowzero": "i"},
+    "ScatterElements": {"axis": "i", "reduction": "s"},
+    "Shape": {"end": "i", "start": "i"},
+    "Transpose": {"perm": "ints"},
+}
+"""all operators of a graph: arithmetic, without subgraphs; with the field that each attribute is in"""
+FIELDS = {
+    "ModelProto": {"ir_version", "producer_name", "producer_version", "opset_import", "graph"},
+    "OperatorSetIdProto": {"domain", "version"},
+    "GraphProto": {"name", "node", "initializer", "input", "output", "value_info"},
+    "NodeProto": {"name", "op_type", "domain", "input", "output", "attribute"},
+    "AttributeProto": {"name", "type", "i", "f", "s", "t", "ints"},
+    "TensorProto": {"name", "dims", "data_type", "raw_data", "double_data", "float_data", "int64_data"}
+    | {"int32_data"},
+    "ValueInfoProto": {"name", "type"},
+    "TypeProto": {"tensor_type"},
+    "Tensor": {"elem_type", "shape"},
+    "TensorShapeProto": {"dim"},
+    "Dimension": {"dim_param", "dim_value"},
+}
+"""all fields that a graph's messages may set: no function, subgraph, sparse or external tensor, metadata"""
+
+
+def graph_names(driver: Driver) -> tuple[list[str], list[str]]:
+    """Return the names of a graph's inputs (state, memory) and outputs (acceleration, memory after it)."""
+    remembered = [name for name, _ in leaves(driver.initial_memory(1))]
+    inputs = [*driver.perceives, *(f"memory.{name}" for name in remembered)]
+    return inputs, [ANSWER, *(f"next.{name}" for name in remembered)]
+
+
+def check_graph(part: bytes, driver: Driver) -> None:
+    """Raise `InputError` unless a graph has a controller's inputs and outputs, and only arithmetic between.
+
+    Raises:
+        MissingPartError: onnx is not installed.
+    """
+    onnx = needed("onnx")
+    try:
+        model = onnx.load_model_from_string(part)
+    except Exception as error:  # protobuf's own kinds of error
+        raise InputError(f"graph: cannot be read: {error}") from None
+    _check_fields(model)
+    model.DiscardUnknownFields()
+    if model.ByteSize() != len(part):
+        raise InputError("graph: it holds bytes that ONNX does not know; allowed: what `unjam export` writes")
+    if model.ir_version not in IR_VERSIONS:
+        raise wrong("graph: ir_version", model.ir_version, f"{IR_VERSIONS[0]} to {IR_VERSIONS[-1]}")
+    imported = [(each.domain, each.version) for each in model.opset_import]
+    if imported != [("", OPSET)]:
+        raise wrong("graph: opset_import", imported, f"{[('', OPSET)]}")
+    graph, wanted = model.graph, graph_names(driver)
+    found = [value.name for value in graph.input], [value.name for value in graph.output]
+    if found != wanted:
+        raise InputError(f"graph: inputs and outputs {found} are not allowed; allowed: {wanted}")
+    kinds = {value.type.tensor_type.elem_type for value in (*graph.input, *graph.output)}
+    if kinds != {onnx.TensorProto.DOUBLE}:
+        raise InputError("graph: inputs and outputs of another type are not allowed; allowed: float64")
+    if fixed := {each.name for each in graph.initializer} & {*found[0]}:
+        raise wrong("graph: initializer", min(fixed), "constants, not inputs")
+    for node in graph.node:
+        _check_node(node, onnx.AttributeProto)
+
+
+def _check_fields(message: Any) -> None:
+    """Raise `InputError` where a message, or one nested in it, sets a field that no graph of ours has."""
+    kind = message.DESCRIPTOR.name
+    for each, value in message.ListFields():
+        if each.name not in FIELDS.get(kind, ()):
+            allowed = ", ".join(sorted(FIELDS.get(kind, ()))) or "nothing of this kind"
+            raise InputError(f"graph: {kind}.{each.name} is not allowed; allowed: {allowed}")
+        if each.message_type is not None:
+            for inner in (value,) if hasattr(value, "ListFields") else value:
+                _check_fields(inner)
+
+
+def _check_node(node: Any, types: Any) -> None:
+    """Raise `InputError` unless a node is an operator of the list with attributes of the list."""
+    if node.domain or node.op_type not in OPERATORS:
+        operator = f"{node.domain}.{node.op_type}" if node.domain else node.op_type
+        raise InputError(f"graph: operator {operator!r} is not allowed; allowed: arithmetic")
+    allowed, seen = OPERATORS[node.op_type], set[str]()
+    types_of = {"i": types.INT, "f": types.FLOAT, "s": types.STRING, "t": types.TENSOR, "ints": types.INTS}
+    for attribute in node.attribute:
+        held = allowed.get(attribute.name)
+        fields = {each.name for each, _ in attribute.ListFields()}
+        if held is None or attribute.name in seen or fields != {"name", "type", held}:
+            names = ", ".join(allowed) or "none"
+            raise wrong(f"graph: attribute of {node.op_type}", attribute.name, f"{names}, each once")
+        if attribute.type != types_of[held]:
+            raise wrong(f"graph: type of {node.op_type}.{attribute.name}", attribute.type, types_of[held])
+        seen.add(attribute.name)
+
+
+def run_graph(part: bytes, driver: Driver, states: LocalState) -> Floats:
+    """Return what a checked graph answers when it perceives `states` one after the other [m/s2].
+
+    It begins with the first memory of `driver`, whose graph it is; all arrays have the shape (T,).
+
+    Raises:
+        InputError: onnxruntime refuses it.
+        MissingPartError: onnxruntime is not installed.
+    """
+    runtime = needed("onnxruntime")
+    options = runtime.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    options.log_severity_level = 4
+    (inputs, _), answers = graph_names(driver), np.zeros(len(states.speed))
+    memory: list[Any] = [rows for _, rows in leaves(driver.initial_memory(1))]
+    try:
+        session = runtime.InferenceSession(part, options, providers=["CPUExecutionProvider"])
+        for step in range(len(answers)):
+            now = states.at(slice(step, step + 1))
+            seen = [getattr(now, name) for name in driver.perceives]
+            acceleration, *memory = session.run(None, dict(zip(inputs, [*seen, *memory], strict=True)))
+            answers[step] = acceleration[0]
+    except Exception as error:  # the runtime's own kinds of error
+        raise InputError(f"graph: cannot be run: {error}") from None
+    return answers
+
+
+def needed(name: str) -> Any:
+    """Return a package that only graphs need; raise `MissingPartError` where it is not installed."""
+    try:
+        return import_module(name)
+    except ImportError:
+        raise MissingPartError(f"{name} is not installed; install it: pip install 'unjam[train]'") from None
