@@ -211,6 +211,45 @@ def test_a_users_file_is_run_in_one_place() -> None:
     assert found == {"drivers/from_file.py"}
 
 
+PROCESS_WIDE = {
+    *("redirect_stdout", "redirect_stderr", "os.dup2", "os.chdir", "os.umask", "gc.freeze", "gc.disable"),
+    *("warnings.catch_warnings", "warnings.simplefilter", "warnings.filterwarnings", "logging.basicConfig"),
+    *("signal.signal", "signal.alarm", "torch.set_num_threads", "torch.manual_seed", "np.random.seed"),
+    *("os.environ.update", "os.environ.pop", "os.environ.setdefault", "sys.path.insert", "sys.path.append"),
+}
+"""calls that change what other threads of the process, and the user's code in it, see"""
+CHANGES_THE_PROCESS = {
+    "processes": "functions for processes of unjam",
+    "sandbox": "functions for processes of unjam",
+    "kernels": "when unjam is imported",
+    "trust": "for the length of a block that the user writes, under a lock",
+    "drivers/from_file": "while a user's file is loaded, under a lock",
+    "training/generators": "for the length of a training, under a lock, and restored",
+    "learners/algorithm_1": "within training/generators",
+    "training/executors": "in the process of a training",
+    "training/batch_speed": "in the command line",
+    "training/model_facts": "within training/generators, or in the command line",
+    "training/speed": "in the command line",
+    "following/networks": "in the command line",
+    "studies/theory": "in the command line",
+    "worlds/worker": "in a worker",
+    "worlds/sumo/apart": "in a process that runs SUMO",
+    "cli/__init__": "in the command line",
+    "cli/results": "in the command line",
+}
+"""modules that make such calls, and when"""
+
+
+def test_what_holds_for_a_whole_process_is_changed_only_where_it_may_be() -> None:
+    found = {
+        module.removesuffix(".py")
+        for module, tree in MODULES.items()
+        for call in calls(tree)
+        if ast.unparse(call.func) in PROCESS_WIDE
+    }
+    assert found == set(CHANGES_THE_PROCESS)
+
+
 def test_a_file_can_be_read_at_one_sitting() -> None:
     lengths = {module: len((SOURCE / module).read_text().splitlines()) for module in MODULES}
     assert not {module: lines for module, lines in lengths.items() if lines > LONGEST}

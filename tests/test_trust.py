@@ -7,7 +7,7 @@ import pytest
 
 from unjam.drivers.from_file import FileReference
 from unjam.errors import InputError
-from unjam.trust import TRUSTED, check_trusted, check_values, remember, trusting_code
+from unjam.trust import TRUSTED, check_trusted, check_values, is_all_trusted, remember, trusting_code
 
 
 @pytest.fixture
@@ -64,6 +64,17 @@ def test_trust_ends_with_the_block_and_what_ran_in_it_is_remembered(code: Path) 
     with pytest.raises(InputError):
         check_trusted("run", other)
     assert TRUSTED not in os.environ
+
+
+def test_trust_ends_with_the_last_of_the_blocks_that_overlap() -> None:
+    """Blocks of two threads end in any order: the first to begin must not be the one that ends the trust."""
+    first, second = trusting_code(), trusting_code()
+    first.__enter__()
+    second.__enter__()
+    first.__exit__(None, None, None)
+    assert is_all_trusted()
+    second.__exit__(None, None, None)
+    assert not is_all_trusted()
 
 
 def test_what_code_imports_from_beside_it_is_trusted_as_it_was(code: Path) -> None:

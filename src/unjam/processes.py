@@ -11,7 +11,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, nullcontext, redirect_stdout, suppress
 from functools import cache
 from pathlib import Path
 
@@ -20,6 +20,8 @@ from unjam.sandbox import confine, limit
 
 PARENT = "UNJAM_PARENT"
 """the variable that tells a process by whose side it ends"""
+OTHER_TRACI = "LIBSUMO_AS_TRACI", "LIBTRACI_AS_TRACI"
+"""variables that make another library of traci, which says so on standard output"""
 LOCK = ".lock"
 """the file that holds a folder for who writes it"""
 HEARTBEAT, MISSED = 10.0, 6
@@ -32,11 +34,29 @@ LARGEST_MEMORY = 8 * 2**30
 """bytes that reading a file of others may take"""
 LONGEST_TIME = 600
 """seconds that it may take"""
+_is_own = False
 
 
 def bound(environment: Mapping[str, str]) -> dict[str, str]:
-    """Return the environment of a process that is to end with this one."""
-    return {**environment, PARENT: str(os.getpid())}
+    """Return the environment of a process of unjam that is to end with this one."""
+    kept = {name: value for name, value in environment.items() if name not in OTHER_TRACI}
+    return {**kept, PARENT: str(os.getpid())}
+
+
+def own_this_process() -> None:
+    """Note that this process is the command line's: its standard output is for results alone.
+
+    Only in such a process may unjam change what holds for all threads.
+    """
+    global _is_own
+    _is_own = True
+    for name in OTHER_TRACI:
+        os.environ.pop(name, None)
+
+
+def user_output() -> AbstractContextManager[object]:
+    """Return the block for loading code of users: the command line prints what it says to standard error."""
+    return redirect_stdout(sys.stderr) if _is_own else nullcontext()
 
 
 def end_with_parent(signum: int) -> None:

@@ -2,6 +2,7 @@
 
 import hashlib
 import os
+import threading
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -16,6 +17,9 @@ TRUSTED = "UNJAM_TRUSTED"
 """the variable that tells this process and its children what may run beside what is remembered"""
 ALL = "all"
 FLAG = "--trust-code"
+_lock = threading.Lock()
+_blocks: list[str | None] = []
+"""for each running block of `trusting_code` the variable before the first of them"""
 
 
 @contextmanager
@@ -23,16 +27,21 @@ def trusting_code() -> Iterator[None]:
     """Let the Python code that folders of others name run within the block; what runs is remembered.
 
     `with unjam.trusting_code(): unjam.drive("ring", "runs/downloaded")`
+
+    It holds for all threads of the process, and for the processes that they start, until the last of several
+    blocks ends.
     """
-    before = os.environ.get(TRUSTED)
-    os.environ[TRUSTED] = ALL
+    with _lock:
+        _blocks.append(_blocks[0] if _blocks else os.environ.get(TRUSTED))
+        os.environ[TRUSTED] = ALL
     try:
         yield
     finally:
-        if before is None:
-            del os.environ[TRUSTED]
-        else:
-            os.environ[TRUSTED] = before
+        with _lock:
+            before = _blocks.pop()
+            if not _blocks:
+                os.environ.pop(TRUSTED)
+                os.environ |= {} if before is None else {TRUSTED: before}
 
 
 def is_all_trusted() -> bool:
@@ -74,7 +83,8 @@ def remember(code: Path, imported: Iterable[Path] = ()) -> None:
         _folder().mkdir(parents=True, exist_ok=True)
         write_whole(_folder() / key, b"\n".join(lines) + b"\n")
     except (OSError, DiskError):
-        os.environ[TRUSTED] = " ".join([*_told(), key])
+        with _lock:
+            os.environ[TRUSTED] = " ".join([*_told(), key])
 
 
 def _files_within(text: str) -> Iterable[Path]:

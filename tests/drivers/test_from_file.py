@@ -106,11 +106,16 @@ def test_a_list_of_accelerations_will_do(tmp_path: Path) -> None:
     np.testing.assert_allclose(driver.act(state, driver.initial_memory(3))[0], 0.25)
 
 
-def test_what_a_file_prints_as_it_is_loaded_is_no_answer_of_ours(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize(("is_own", "expected"), [(True, ("", "loading\n")), (False, ("loading\n", ""))])
+def test_only_the_command_line_keeps_what_a_file_prints_off_its_results(
+    is_own: bool,
+    expected: tuple[str, str],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    monkeypatch.setattr("unjam.processes._is_own", is_own)
     path = tmp_path / "loud.py"
     path.write_text("print('loading')\n\ndef gentle(state):\n    return 0.0 * state.speed\n")
     FileReference(path, "gentle").load()
-    said = capsys.readouterr()
-    assert (said.out, said.err) == ("", "loading\n")
+    assert tuple(capsys.readouterr()) == expected

@@ -12,6 +12,7 @@ import unjam
 from tests.worlds.sumo.own_roads import straight
 from unjam.drivers import Constant
 from unjam.environments.single import Step
+from unjam.environments.threads import CopyableLock
 from unjam.errors import InputError
 from unjam.scenarios import make_scenario
 from unjam.worlds.episode import run_episode
@@ -178,7 +179,7 @@ def test_a_vehicle_that_comes_back_is_no_agent_again() -> None:
     class Road:
         """Its second CAV leaves in the first decision, and is back after the second."""
 
-        traffic = SimpleNamespace(cavs=there[0])
+        lock, traffic = CopyableLock(), SimpleNamespace(cavs=there[0])
 
         def step(self, actions: list[float]) -> Step:
             before, now = there[len(told)], there[len(told) + 1]

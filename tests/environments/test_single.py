@@ -2,8 +2,9 @@ import re
 import subprocess
 import sys
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import closing
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from unjam.drivers import IDM, Constant
 from unjam.drivers.registry import named_driver
 from unjam.environments.single import RoadEnv
 from unjam.errors import InputError, MissingPartError, UnjamError
+from unjam.processes import has_display
 from unjam.scenarios import make_scenario
 from unjam.worlds.episode import run_episode
 
@@ -48,7 +50,7 @@ def test_passes_the_checks_of_gymnasium_and_stable_baselines3_without_warnings(
         warnings.filterwarnings("default", "another simulation is open")  # a picture is drawn by another one
         if make_scenario(NAMES[environment.spec.id if environment.spec else ""]).action_limit != 1:
             warnings.filterwarnings("ignore", ".*symmetric and normalized")  # m/s2, as the road has them
-        check_env(environment.unwrapped)
+        check_env(environment.unwrapped, skip_render_check=not has_display())
         check_env_of_sb3(environment.unwrapped)
 
 
@@ -133,7 +135,7 @@ def test_on_an_own_network_the_first_that_the_share_picks_is_driven(tmp_path: Pa
     file = str(straight(tmp_path, flow, length=200.0))
     expected = run_episode(make_scenario(file, {**road, "cavs": 1}), Constant(acceleration=-0.1), (2,))
     environment = gymnasium.make(OWN, scenario=file, **road)
-    check_env(environment.unwrapped)
+    check_env(environment.unwrapped, skip_render_check=not has_display())
     environment.reset(seed=2)
     speeds, done = [], False
     while not done:
@@ -174,7 +176,7 @@ def test_environments_of_one_process_do_not_disturb_each_other() -> None:
     other, third = RoadEnv(**SHORT), RoadEnv("figure-eight", **SHORT)
     alone.reset(seed=0)
     for environment in (other, third):
-        with pytest.warns(UserWarning, match="runs over TraCI"):
+        with pytest.warns(UserWarning, match="runs in a process of its own"):
             environment.reset(seed=0)
     for _ in range(40):
         third.step(np.zeros(1))
@@ -196,10 +198,15 @@ def test_nothing_is_said_as_a_process_ends_with_environments_open() -> None:
     assert (ran.stdout, ran.stderr) == ("", "")
 
 
-def test_a_window_without_a_display_is_refused_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("make", [RoadEnv, partial(gymnasium.make, "unjam/Ring-v0")])
+def test_a_window_without_a_display_is_refused_in_one_line(
+    make: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("unjam.environments.single.has_display", lambda: False)
-    with pytest.raises(MissingPartError, match="without one: 'rgb_array'"):
-        RoadEnv(render_mode="human")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        with pytest.raises(MissingPartError, match="without one: 'rgb_array'"):
+            make(render_mode="human")
 
 
 def test_one_number_is_a_range_of_one() -> None:

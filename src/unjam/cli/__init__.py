@@ -21,7 +21,7 @@ from unjam.cli.sign import keys, sign
 from unjam.cli.train import reproduce, search, train
 from unjam.cli.tune import tune
 from unjam.errors import DISK_ERRNOS, InputError, UnjamError, disk_error, without_train, wrong
-from unjam.processes import end_with_parent
+from unjam.processes import end_with_parent, own_this_process
 
 INTERRUPTED = 130
 
@@ -70,6 +70,7 @@ def _terminate(signum: int, frame: FrameType | None) -> None:
 
 def main() -> None:
     """Run the command line; every error that a user can mend is one line and an exit code."""
+    own_this_process()
     for name in ("SIGTERM", "SIGHUP"):  # Windows has no SIGHUP, and under nohup nobody wants to be told
         signum = getattr(signal, name, None)
         if signum is not None and signal.getsignal(signum) != signal.SIG_IGN:

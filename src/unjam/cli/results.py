@@ -1,5 +1,7 @@
 """What a run is worth: `unjam evaluate`, `unjam model`, `unjam report`; and shipped: `export`, `verify`."""
 
+import logging
+import warnings
 from contextlib import nullcontext
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -191,6 +193,9 @@ def export(
     """
     from unjam.training.export import export_controller
 
+    if onnx:  # what the exporter says of itself is of no use to users
+        warnings.simplefilter("ignore")
+        logging.getLogger("torch.onnx").setLevel(logging.ERROR)
     done = export_controller(source, to, onnx, scenario)
     if json:
         files = {"file": str(done.file), "onnx": str(done.graph) if done.graph else None}

@@ -1,10 +1,6 @@
 """A whole controller as an ONNX graph: what is perceived and remembered in, acceleration and memory out."""
 
-import io
-import logging
-import warnings
 from collections.abc import Callable
-from contextlib import redirect_stdout
 from functools import partial
 from typing import Any
 
@@ -94,11 +90,9 @@ def onnx_graph(driver: Driver, limit: float) -> bytes:
     if asks is not None:
         raise InputError(f"onnx: {driver.describe()} is not allowed: a graph asks for no time headways")
     rows = torch.export.Dim("cavs")
-    with torch.no_grad(), warnings.catch_warnings(), redirect_stdout(io.StringIO()):
-        warnings.simplefilter("ignore")
-        logging.getLogger("torch.onnx").setLevel(logging.ERROR)
+    with torch.no_grad():
         program: Any = torch.onnx.export(
-            Whole(driver, limit),
+            Whole(driver, limit).eval(),
             arrays,
             input_names=inputs,
             output_names=outputs,

@@ -9,9 +9,9 @@ import inspect
 import os
 import sys
 from collections.abc import Callable
-from contextlib import redirect_stdout
 from dataclasses import dataclass, field
 from pathlib import Path
+from threading import RLock
 from traceback import extract_tb
 from types import ModuleType
 from typing import Any, Protocol
@@ -23,7 +23,11 @@ from unjam.drivers.driver import Driver, Memory, Recipe, labelled
 from unjam.drivers.local_state import LocalState
 from unjam.errors import InputError
 from unjam.physics.arrays import Array
+from unjam.processes import user_output
 from unjam.trust import remember
+
+_loading = RLock()
+"""held while a file runs: it finds its neighbours through `sys.path`, of which a process has one"""
 
 
 def is_file_reference(text: str) -> bool:
@@ -76,20 +80,21 @@ class FileReference:
             raise InputError(f"driver file: {str(path)!r} is not a Python file")
         remember(path)  # what a folder names was checked before it comes here
         module = importlib.util.module_from_spec(spec)
-        sys.modules[module_name] = module
-        before = set(sys.modules)
-        sys.path.insert(0, str(path.parent))  # so that the file may import its neighbours
-        try:
-            with redirect_stdout(sys.stderr):  # what is printed there is no answer of ours
-                spec.loader.exec_module(module)
-        except (Exception, SystemExit) as error:  # whatever the user's code raises is the user's to mend
-            raise InputError(f"{path.name}: {type(error).__name__} when loading it: {error}") from error
-        finally:
-            sys.path.remove(str(path.parent))
-            new = set(sys.modules) - before
-            neighbours = [name for name in new if _lies_in(sys.modules[name], path.parent)]
-            # Another folder's file may have neighbours of these names.
-            remember(path, [Path(str(sys.modules.pop(name).__file__)) for name in neighbours])
+        with _loading:
+            sys.modules[module_name] = module
+            before = set(sys.modules)
+            sys.path.insert(0, str(path.parent))  # so that the file may import its neighbours
+            try:
+                with user_output():
+                    spec.loader.exec_module(module)
+            except (Exception, SystemExit) as error:  # whatever the user's code raises is the user's to mend
+                raise InputError(f"{path.name}: {type(error).__name__} when loading it: {error}") from error
+            finally:
+                sys.path.remove(str(path.parent))
+                new = set(sys.modules) - before
+                neighbours = [name for name in new if _lies_in(sys.modules[name], path.parent)]
+                # Another folder's file may have neighbours of these names.
+                remember(path, [Path(str(sys.modules.pop(name).__file__)) for name in neighbours])
         if not hasattr(module, self.name):
             public = ", ".join(key for key in vars(module) if not key.startswith("_")) or "nothing"
             raise InputError(f"{path.name}: has no {self.name!r}; it has: {public}")

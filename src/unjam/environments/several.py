@@ -10,6 +10,7 @@ from pettingzoo import ParallelEnv
 
 from unjam.drivers.observation import FeatureName
 from unjam.environments.single import SteppedRoad
+from unjam.environments.threads import one_thread_at_a_time
 from unjam.errors import InputError
 
 
@@ -53,6 +54,7 @@ class ParallelRoad(ParallelEnv[str, Any, Any]):
         """Return the action space of one CAV."""
         return self.action_spaces[agent]  # pyright: ignore[reportReturnType]
 
+    @one_thread_at_a_time
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -63,6 +65,7 @@ class ParallelRoad(ParallelEnv[str, Any, Any]):
         self.agents = self._named(self._road.traffic.cavs)
         return dict(zip(self.agents, observations, strict=True)), {agent: {} for agent in self.agents}
 
+    @one_thread_at_a_time
     def step(self, actions: dict[str, Any]) -> tuple[dict[str, Any], ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Make one decision of every CAV."""
         if not self.agents:
@@ -106,6 +109,7 @@ class ParallelRoad(ParallelEnv[str, Any, Any]):
     def render(self) -> None:
         """Draw nothing."""
 
+    @one_thread_at_a_time
     def close(self) -> None:
         """End SUMO; may be called twice."""
         self._road.close()

@@ -15,6 +15,7 @@ from unjam.drivers.command import Command, Limits
 from unjam.drivers.driver import Decision, Driver, Memory, Noise
 from unjam.drivers.local_state import LocalState
 from unjam.drivers.observation import FeatureName, Seen, asked_by, check_features, observation_size, observe
+from unjam.environments.threads import CopyableLock, one_thread_at_a_time
 from unjam.errors import EpisodeError, InputError, MissingPartError, UnjamError, wrong, wrong_name
 from unjam.processes import has_display
 from unjam.scenarios import make_scenario
@@ -129,6 +130,8 @@ class SteppedRoad:
         self._seed: int | None = None
         self._episodes = 0
         """started since that seed was given"""
+        self.lock = CopyableLock()
+        """held while the environment is called"""
 
     def reset(self, seed: int | None, generator: np.random.Generator) -> Observations:
         """Start an episode, run its warm-up, and return the first observations.
@@ -141,6 +144,8 @@ class SteppedRoad:
             self._seed = int(generator.integers(2**31))
         numbers = (self._seed, self._episodes) if self._episodes else (self._seed,)
         self._episodes += 1
+        if self._simulation is not None and self._simulation.is_lost:
+            self.close()
         if self._simulation is None:
             own = self._backend == "libsumo"
             self._simulation = simulation_for(self.scenario) if own else Simulation(self._backend)
@@ -190,9 +195,12 @@ class SteppedRoad:
 
         Raises:
             UnjamError: there is none.
+            LostError: other code in this process has started, stepped or closed a simulation through libsumo.
         """
         if self._traffic is None:
             raise UnjamError("no episode is running: call reset first")
+        assert self._simulation is not None
+        self._simulation.check()
         return self._traffic
 
     def _look(self) -> Observations:
@@ -232,13 +240,14 @@ class RoadEnv(gymnasium.Env[Observations, NDArray[Any]]):
     Time step    one decision: 0.1 s, on the merge 1 s
     ===========  ===================================================================================
 
-    libsumo runs one simulation in a process: a second environment there runs over TraCI, several times
-    slower, and a warning says so.
+    libsumo runs one simulation in a process: where the user or another environment has it, SUMO runs in a
+    process of its own, several times slower, and a warning says so. A second thread waits until the first
+    has returned.
     For several at once use ``gymnasium.make_vec("unjam/Ring-v0", num_envs=4, vectorization_mode="async")``.
     """
 
     metadata: ClassVar[dict[str, Any]] = {  # pyright: ignore[reportIncompatibleVariableOverride]
-        "render_modes": ["human", "rgb_array"] if has_display() else ["rgb_array"],
+        "render_modes": ["human", "rgb_array"],
         "render_fps": 10,
     }
 
@@ -278,6 +287,7 @@ class RoadEnv(gymnasium.Env[Observations, NDArray[Any]]):
         self.observation_space = self._road.observation_space
         self.action_space = self._road.action_space
 
+    @one_thread_at_a_time
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observations, dict[str, Any]]:
@@ -286,6 +296,7 @@ class RoadEnv(gymnasium.Env[Observations, NDArray[Any]]):
         observations = self._road.reset(seed, self.np_random)
         return observations[0], {"drawn": dict(self._road.traffic.road.drawn)}
 
+    @one_thread_at_a_time
     def step(self, action: Any) -> tuple[Observations, float, bool, bool, dict[str, Any]]:
         """Make one decision."""
         done = self._road.step(np.asarray(action, np.float64).reshape(1))
@@ -293,6 +304,7 @@ class RoadEnv(gymnasium.Env[Observations, NDArray[Any]]):
         truncated = done.truncated or (bool(done.left) and not done.terminated)
         return observation, done.reward, done.terminated, truncated, {"terms": done.terms}
 
+    @one_thread_at_a_time
     def render(self) -> Any:
         """Return the picture of this moment, shape (640, 640, 3); SUMO's window draws itself."""
         if self.render_mode != "rgb_array":
@@ -304,6 +316,7 @@ class RoadEnv(gymnasium.Env[Observations, NDArray[Any]]):
         fastest = 2.0 * limit if np.isfinite(limit) else self._road.scenario.top_speed  # of your own: unknown
         return np.asarray(draw_road(traffic.scene(), fastest, f"mean {np.mean(traffic.speeds):.1f} m/s"))
 
+    @one_thread_at_a_time
     def close(self) -> None:
         """End SUMO; may be called twice."""
         self._road.close()

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from unjam.controller import controller_bytes
 from unjam.drivers.driver import Driver
@@ -41,6 +40,7 @@ from unjam.training.folder import (
     save_checkpoint,
     start_folder,
 )
+from unjam.training.generators import exclusive_generators
 from unjam.training.model_facts import why_no_facts, write_model_facts
 from unjam.training.sampling import Sampler, episodes_of, iterations_ahead
 from unjam.training.seeds import VALIDATE
@@ -93,7 +93,7 @@ def train(
     roads (`config.tasks`) is judged on each of them, in a folder with the road's name.
 
     Where NumPy was imported before unjam, it trains in a process of its own, so that the result is the same:
-    see `unjam.kernels`.
+    see `unjam.kernels`. Elsewhere it uses the global generators of NumPy and torch, and restores them.
 
     Args:
         config: what to do; see `unjam.load_config`.
@@ -106,6 +106,7 @@ def train(
     Raises:
         InputError: the folder holds something else, another process trains into it, or the driver or reward
             are at fault.
+        UnjamError: another training runs in this process.
         DiskError: the disk is full; the last checkpoint is whole.
     """
     folder = Path(folder)
@@ -118,6 +119,7 @@ def train(
     return TrainResult(folder, {}, None, results) if config.tasks else results[""]
 
 
+@exclusive_generators()
 def train_here(
     config: RunConfig,
     folder: Path,
@@ -144,7 +146,6 @@ def _train_owned(
 ) -> dict[str, Rows]:
     """Train into a folder that no other process writes."""
     (continue_folder if resume else start_folder)(folder, config)
-    torch.set_num_threads(1)  # more threads would fight with the workers for the cores
     with ExitStack() as held, Workers(config.workers) as workers:
         for place in [folder / name for name in config.roads() if name]:  # others may evaluate one alone
             make_folder(place)

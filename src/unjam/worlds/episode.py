@@ -10,7 +10,7 @@ import numpy as np
 from unjam.drivers.driver import Driver
 from unjam.drivers.from_file import DriverLike, as_driver
 from unjam.drivers.observation import feature
-from unjam.errors import InputError, NoCavError, wrong
+from unjam.errors import InputError, NoCavError, UnjamError, wrong
 from unjam.scenarios.scenario import Scenario
 from unjam.worlds.drive import drive
 from unjam.worlds.earned import earned
@@ -60,13 +60,16 @@ def run_episode(
         explore: by how much a residual driver's exploration noise counts: 1, -1 for the opposite, or 0.
         full: whether fuel is recorded and, on roads with ends, where on the plane vehicles are (it costs a
             tenth of the speed).
-        simulation: an open one to use again; without it, one is opened and closed, on a network of your
-            own in a process that may neither write nor listen.
+        simulation: an open one to use again; without it, one is opened and closed. It runs in a process of
+            its own on a network of your own, which may neither write nor listen, and, with a warning, where
+            libsumo already holds a simulation in this process, yours or unjam's.
         progress: called now and then with the number of decisions made.
 
     Raises:
         InputError: driver or reward answer something that is not finite, or of a wrong shape.
-        EpisodeError: SUMO cannot run the scenario.
+        EpisodeError: SUMO cannot run the scenario, or other code in this process has started, stepped or
+            closed a simulation through libsumo meanwhile (`LostError`).
+        UnjamError: another episode runs in `simulation`.
     """
     driver, seed = as_driver(driver), as_seed(seed)
     check_can_drive(driver, scenario)
@@ -74,8 +77,16 @@ def run_episode(
     if simulation is None:
         with simulation_for(scenario) as simulation:
             return run_episode(scenario, driver, seed, reward, explore, full, simulation, progress)
-    traffic = make_traffic(scenario, seed, simulation, driver.plain_numbers, full, driver.asks)
-    episode = drive(traffic, driver, explore, on_progress=progress)
+    if not simulation.in_use.acquire(blocking=False):
+        raise UnjamError("simulation: an episode is running in it; allowed: one at a time")
+    try:
+        traffic = make_traffic(scenario, seed, simulation, driver.plain_numbers, full, driver.asks)
+        episode = drive(traffic, driver, explore, on_progress=progress)
+    except Exception:
+        simulation.check()  # or other code's changes would be reported as an error of SUMO
+        raise
+    finally:
+        simulation.in_use.release()
     check_cavs_drove(episode, driver)
     return rewarded(episode, paid)
 

@@ -1,7 +1,6 @@
 """Programs that drive on networks of their own: SUMO is confined, the driver is not."""
 
 import os
-import subprocess
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -98,16 +97,10 @@ def test_what_sumo_might_be_brought_to_do_the_kernel_refuses(
 @kept
 @pytest.mark.parametrize("option", WRITING)
 def test_sumo_as_a_child_of_its_own_and_its_window_write_nothing_either(
-    option: str, road: Scenario, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    option: str, road: Scenario, tmp_path: Path
 ) -> None:
     canary, files = tmp_path / "canary", files_of(road, road.of_seed((0,))[0])
     canary.write_text("as it was")
-
-    def start(command: list[str], label: str) -> None:
-        code = subprocess.run(command, capture_output=True, check=False).returncode
-        raise RuntimeError(f"code {code}")
-
-    monkeypatch.setattr("traci.start", start)
     told = (*files.options, option.format(canary))
     with Simulation("traci") as simulation, pytest.raises(EpisodeError, match="SUMO cannot start"):
         simulation.load(files._replace(options=told), road.simulation_step, 0)

@@ -14,6 +14,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache, partial
 from pathlib import Path
+from threading import Lock
 from typing import Any, Self, get_type_hints
 
 from unjam.errors import LostError, error_named, in_own_words
@@ -25,7 +26,8 @@ from unjam.tree import pack, unpack
 from unjam.worlds.messages import read_message, write_message
 from unjam.worlds.sumo.detectors import Loop, passages
 from unjam.worlds.sumo.files import Files
-from unjam.worlds.sumo.simulation import Simulation, is_open
+from unjam.worlds.sumo.library import InUseError
+from unjam.worlds.sumo.simulation import Simulation
 
 NETWORK_MEMORY = 16 * 2**30
 """bytes that a process may take once it drives on a network of the user's own"""
@@ -34,18 +36,20 @@ NETWORK_MEMORY = 16 * 2**30
 def simulation_for(*scenarios: Scenario) -> Simulation:
     """Open a simulation for episodes on these roads: a confined one where one is a network of the user's own.
 
-    Of others it runs in this process; over TraCI, with a warning, where libsumo runs one already.
+    Of others it runs in this process. Where libsumo holds one there already, unjam's or the user's, it runs
+    in a process of its own, with a warning: another thread may ask at the same time.
     """
-    if any(isinstance(scenario, OwnNetwork) for scenario in scenarios):
-        return SimulationApart()  # pyright: ignore[reportReturnType]  (it answers to the same names)
-    if not is_open():
-        return Simulation()
-    warnings.warn(
-        "another simulation is open in this process: this one runs over TraCI, with the same results but "
-        "several times slower; close the other, or use gymnasium.make_vec(..., vectorization_mode='async')",
-        stacklevel=2,
-    )
-    return Simulation("traci")
+    if not any(isinstance(scenario, OwnNetwork) for scenario in scenarios):
+        try:
+            return Simulation()
+        except InUseError:
+            warnings.warn(
+                "another simulation is open in this process, and libsumo holds one per process: this one "
+                "runs in a process of its own, with the same results but several times slower; close the "
+                "other, or use gymnasium.make_vec(..., vectorization_mode='async')",
+                stacklevel=2,
+            )
+    return SimulationApart()  # pyright: ignore[reportReturnType]  (it answers to the same names)
 
 
 @cache
@@ -61,6 +65,10 @@ def _starter(process: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(1)
 
 
+_starter_lock = Lock()
+"""a second thread that starts processes would end with its executor, and they with it"""
+
+
 class SimulationApart:
     """A `Simulation` in a confined process; what it is asked for, that process does and answers."""
 
@@ -68,7 +76,9 @@ class SimulationApart:
         """Start the process."""
         sweep_private_folders()
         self._folder = PrivateFolder()
-        start = _starter(os.getpid()).submit(
+        with _starter_lock:
+            starter = _starter(os.getpid())
+        start = starter.submit(
             subprocess.Popen[bytes],
             [sys.executable, "-m", "unjam.worlds.sumo.apart"],
             stdin=subprocess.PIPE,
@@ -77,6 +87,16 @@ class SimulationApart:
             start_new_session=True,  # an interrupt in the terminal is this process's to handle
         )
         self._process = start.result()
+        self.in_use = Lock()
+        """held by the episode that runs"""
+
+    @property
+    def is_lost(self) -> bool:
+        """Whether the process has ended: only a new one can go on."""
+        return self._process.poll() is not None
+
+    def check(self) -> None:
+        """Do nothing: no other code reaches the simulation."""
 
     def __getattr__(self, name: str) -> Callable[..., Any]:
         if name.startswith("_"):

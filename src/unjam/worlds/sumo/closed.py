@@ -115,6 +115,7 @@ class ClosedTraffic(Traffic[ClosedRoad]):
 
     def advance(self, command: Command | None) -> None:
         """Simulate one decision, held over its simulation steps; None: the CAVs stay human."""
+        self._simulation.check()
         wanted = self._told(command) if self._controlled else []
         self._log_wanted.fromlist(wanted)
         for _ in range(self.scenario.steps_per_decision):

@@ -1,15 +1,188 @@
-"""How SUMO is reached: the only module that imports libsumo or traci."""
+"""How SUMO is reached: the only module that imports libsumo or traci.
+
+Both libraries keep state of the whole process, in which the user may run a simulation of their own: it is
+never closed, stepped, or replaced, and the user's TraCI connection stays the active one.
+"""
 
 import importlib
-from collections.abc import Callable
+import socket
+import subprocess
+import threading
+import time
+import weakref
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
+from functools import partial
+from pathlib import Path
 from types import ModuleType
 from typing import Any, Literal
 
-from unjam.errors import MissingPartError
+from unjam.errors import LostError, MissingPartError, UnjamError
+from unjam.sandbox import keep_disk
 
 Backend = Literal["libsumo", "traci", "gui"]
 """`libsumo`: in this process; `traci`: SUMO as a child process; `gui`: the same, with its window."""
+MODULES = {"libsumo": "libsumo", "traci": "traci.main", "gui": "traci.main"}
+"""where each is; `import traci` would give what LIBSUMO_AS_TRACI or LIBTRACI_AS_TRACI make of it"""
+START_SECONDS = 600.0
+"""how long SUMO may take until it accepts a connection [s]: it reads the network first"""
+CONNECT_PAUSE = 0.02
+"""time between two attempts to connect [s]"""
+_libsumo_in_use = threading.Lock()
+"""held by the one simulation that runs on libsumo in this process; never waited for"""
+
+
+class InUseError(UnjamError):
+    """libsumo, which holds one simulation per process, already holds one."""
+
+
+class Libsumo:
+    """SUMO in this process, for one simulation; what other code does to that simulation is detected."""
+
+    def __init__(self) -> None:
+        """Claim libsumo.
+
+        Raises:
+            InUseError: another simulation, unjam's or the user's, is open in this process.
+        """
+        self.functions: Any = library("libsumo")
+        call = partial(function_of, self.functions)
+        self._is_loaded = call("simulation", "isLoaded")
+        self._time, self._step = call("simulation", "getTime"), call("simulation", "step")
+        self._time_step, self._option = call("simulation", "getDeltaT"), call("simulation", "getOption")
+        self._log: str | None = None
+        """the error log of the running simulation, which tells it from any other; None: it does not run"""
+        self._steps = 0
+        """simulated since the simulation was started"""
+        self._begin = 0.0
+        self._claimed = _libsumo_in_use.acquire(blocking=False)
+        if not self._claimed or self._is_loaded():
+            self.close()
+            raise InUseError("a simulation is already open in this process; close it, or use another")
+
+    @property
+    def is_running(self) -> bool:
+        """Whether the simulation has been started."""
+        return self._log is not None
+
+    @property
+    def is_lost(self) -> bool:
+        """Whether other code of this process has started, stepped or closed libsumo's simulation."""
+        if not self._is_own():
+            return True
+        return self.is_running and round((self._time() - self._begin) / self._time_step()) != self._steps
+
+    def check(self) -> None:
+        """Raise `LostError` where other code of this process has changed the simulation.
+
+        It costs less than a microsecond.
+        """
+        if self.is_lost:
+            raise LostError(
+                "SUMO was lost: other code in this process has started, stepped or closed a simulation "
+                "through libsumo; run the episode again"
+            )
+
+    def start(self, command: Sequence[str], log: Path) -> None:
+        """Start SUMO, which writes its errors to `log`."""
+        self._log = str(log)
+        self.functions.start([*command])
+        self._count_from_now()
+
+    def load(self, options: Sequence[str]) -> None:
+        """Start the simulation again with other options."""
+        self.functions.load([*options])
+        self._count_from_now()
+
+    def _count_from_now(self) -> None:
+        self._begin, self._steps = self._time(), 0
+
+    def step(self) -> None:
+        """Simulate one time step."""
+        self._step()
+        self._steps += 1
+
+    def end(self) -> None:
+        """End the simulation; one that is gone is no error, and one of other code goes on."""
+        if self._log is not None and self._is_own():
+            close(self.functions)
+        self._log = None
+
+    def close(self) -> None:
+        """Give libsumo back; may be called twice."""
+        if self._claimed:
+            self._claimed = False
+            _libsumo_in_use.release()
+
+    def _is_own(self) -> bool:
+        """Return whether libsumo holds this simulation, or none where it is not running."""
+        if self._log is None or not self._is_loaded():
+            return self._log is None and not self._is_loaded()
+        return self._option("error-log") == self._log
+
+
+class Traci:
+    """SUMO as a child process, over a connection that nobody else in this process is given."""
+
+    is_lost = False
+
+    def __init__(self) -> None:
+        """Import traci; nothing is started yet."""
+        self._traci = library("traci")
+        self.functions: Any = None
+        """the connection; None while there is none"""
+
+    @property
+    def is_running(self) -> bool:
+        """Whether SUMO has been started."""
+        return self.functions is not None
+
+    def check(self) -> None:
+        """Do nothing: no other code reaches the simulation."""
+
+    def start(self, command: Sequence[str], log: Path) -> None:
+        """Start SUMO, which may write only into the folder of `log`, and connect to it."""
+        with socket.socket() as free:
+            free.bind(("127.0.0.1", 0))
+            port = free.getsockname()[1]
+
+        def popen() -> subprocess.Popen[bytes]:
+            keep_disk(log.parent, Path("/dev"))  # screens and sockets it needs
+            return subprocess.Popen([*command, "--remote-port", str(port)], stdout=subprocess.DEVNULL)
+
+        # A thread that ends with it: what is forbidden to SUMO is forbidden to nothing else here.
+        with ThreadPoolExecutor(1) as confined:
+            process = confined.submit(popen).result()
+        deadline = time.monotonic() + START_SECONDS
+        while self.functions is None:
+            try:  # one attempt at a time: traci prints each of several
+                self.functions = self._traci.connect(port, numRetries=0, host="127.0.0.1", proc=process)
+            except self._traci.FatalTraCIError:
+                if time.monotonic() > deadline:
+                    process.kill()
+                    raise
+                time.sleep(CONNECT_PAUSE)
+        # An open connection would print an error when this process ends.
+        weakref.finalize(self, close, self.functions)
+        self._step = function_of(self.functions, "simulation", "step")
+
+    def load(self, options: Sequence[str]) -> None:
+        """Start the simulation again with other options."""
+        self.functions.load([*options])
+
+    def step(self) -> None:
+        """Simulate one time step."""
+        self._step()
+
+    def end(self) -> None:
+        """End SUMO; one that is gone is no error."""
+        if self.functions is not None:
+            close(self.functions)
+        self.functions = None
+
+    def close(self) -> None:
+        """Do nothing more."""
 
 
 def close(sumo: Any) -> None:
@@ -30,10 +203,10 @@ def function_of(sumo: Any, domain: str, name: str) -> Callable[..., Any]:
 
 def library(backend: Backend) -> ModuleType:
     """Return the library of a backend; raise `MissingPartError` where it is not installed."""
-    name = "libsumo" if backend == "libsumo" else "traci"
     try:
-        return importlib.import_module(name)
+        return importlib.import_module(MODULES[backend])
     except ImportError as error:
+        name = MODULES[backend].partition(".")[0]
         raise MissingPartError(
             f"{name} cannot be imported ({error}); install it: pip install {name}==1.28.0"
         ) from None

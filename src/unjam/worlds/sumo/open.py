@@ -137,6 +137,7 @@ class OpenTraffic(Traffic[OpenKind]):
 
     def advance(self, command: Command | None) -> None:
         """Simulate one decision, held over its simulation steps; None: the CAVs stay human."""
+        self._simulation.check()
         scenario, names = self.scenario, self.cavs
         step, obeys = scenario.simulation_step, scenario.actuation != "cruise"
         wanted = self._told(command) if self._controlled else []

@@ -1,27 +1,24 @@
 """SUMO: start, read, command, step."""
 
-import io
-import weakref
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import nullcontext, redirect_stdout
+from contextlib import nullcontext
 from functools import partial
-from itertools import count, starmap
+from itertools import starmap
 from pathlib import Path
 from tempfile import gettempdir
+from threading import Lock
 from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from unjam.errors import EpisodeError, RefusedError, UnjamError, wrong
+from unjam.errors import EpisodeError, RefusedError, wrong
 from unjam.processes import PrivateFolder, printed_to
-from unjam.sandbox import keep_disk
 from unjam.scenarios.scenario import Actuation
 from unjam.sumo_files import copy_harmless, stamp_of
 from unjam.worlds.sumo.files import Files
-from unjam.worlds.sumo.library import Backend, close, function_of, library
+from unjam.worlds.sumo.library import Backend, Libsumo, Traci, function_of
 from unjam.worlds.sumo.networks import said_in, sumo_program
 from unjam.worlds.sumo.tripinfo import read_trips, trip_options
 from unjam.worlds.trips import Trips
@@ -34,10 +31,6 @@ LIMITS_OF_ACCELERATION = 2 | 4
 """the bits by which vehicles keep to the acceleration and the braking of their type"""
 _exhaust = deque(maxlen=0).extend
 """runs through an iterator, in C: a loop would cost as much as the calls"""
-_open: "Simulation | None" = None
-"""the one simulation that libsumo runs in this process"""
-_labels = count()
-"""of connections over TraCI, of which a process may have many"""
 
 
 class Neighbours(NamedTuple):
@@ -64,8 +57,9 @@ class NetworkLane(NamedTuple):
 class Simulation:
     """One SUMO simulation, loaded anew for each episode.
 
-    libsumo holds one simulation per process and silently replaces the first by a second, so this class
-    refuses to open another while one is open. Over TraCI there may be several, each a process of its own.
+    libsumo holds one simulation per process and silently replaces the first by a second. So this class
+    refuses to open another while one is open, be it the user's own, and detects where other code in the
+    process starts, steps or closes one meanwhile. Over TraCI there may be several, each in its own process.
     """
 
     def __init__(
@@ -74,29 +68,34 @@ class Simulation:
         """Open a simulation; nothing runs before `load`.
 
         `gui_options` go to SUMO's window. `alone`: this process prints nothing else while SUMO starts.
+
+        Raises:
+            InUseError: libsumo already runs a simulation in this process.
         """
-        global _open
         if "," in (folder := gettempdir()):  # between the names of files that SUMO is given
             raise wrong("TMPDIR", folder, "a folder without , in its name")
-        if backend == "libsumo" and _open is not None:
-            raise UnjamError("a simulation is already open in this process; close it, or use another")
         self.backend = backend
         self._gui_options = gui_options
-        self._sumo: Any = library(backend)
+        self._library = Libsumo() if backend == "libsumo" else Traci()
+        self.check: Callable[[], None] = self._library.check
+        """raises `LostError` where other code of this process has changed the simulation"""
+        self.step: Callable[[], None] = self._library.step
+        """simulates one time step"""
         self._folder = PrivateFolder()
         self._error_log = Path(self._folder.name) / "error.log"
         self._copies: dict[Path, tuple[tuple[int, int] | None, Path]] = {}
         """of users' own files, with the stamps of those"""
-        self._running = False
         self._trips = Path(self._folder.name) / "trips.xml"
         self._printed = Path(self._folder.name) / "printed.log" if alone else None
         """what SUMO says before it has a log"""
+        self.in_use = Lock()
+        """held by the episode that runs"""
         if backend == "libsumo":
             self._bind()
-            _open = self
 
     def _bind(self) -> None:
         """Look up the functions that are called often."""
+        self._sumo: Any = self._library.functions
         call = partial(function_of, self._sumo)
         self._get_speed = call("vehicle", "getSpeed")
         self._get_distance = call("vehicle", "getDistance")
@@ -121,8 +120,6 @@ class Simulation:
         """whose front bumpers are on a lane"""
         self.vehicle_count: Callable[[], int] = call("vehicle", "getIDCount")
         """how many vehicles are on the road"""
-        self.step: Callable[[], object] = call("simulation", "step")
-        """simulates one time step"""
         self.departed: Callable[[], Sequence[str]] = call("simulation", "getDepartedIDList")
         """who entered the road in the last step"""
         self.arrived: Callable[[], Sequence[str]] = call("simulation", "getArrivedIDList")
@@ -142,8 +139,10 @@ class Simulation:
 
         Raises:
             RefusedError: SUMO refuses the files; the message holds its reason.
+            LostError: other code of this process has changed the simulation.
             EpisodeError: it cannot start for another one.
         """
+        self.check()
         traffic = Path(self._folder.name) / "traffic.rou.xml"
         traffic.write_text(files.traffic)
         named = {
@@ -156,15 +155,15 @@ class Simulation:
             options += trip_options(self._trips)
         try:
             with printed_to(self._printed) if self._printed else nullcontext():
-                if self._running:
-                    self._sumo.load(options)
+                if self._library.is_running:
+                    self._library.load(options)
                 else:
-                    program = "sumo-gui" if self.backend == "gui" else "sumo"
-                    self._start([sumo_program(program), *options, *self._gui_options])
-                    self._running = True
+                    program = sumo_program("sumo-gui" if self.backend == "gui" else "sumo")
+                    self._library.start([program, *options, *self._gui_options], self._error_log)
+                    self._bind()
                 self.step()  # the first step inserts the vehicles and moves none
         except Exception as error:
-            self._end()  # only then are SUMO's words in its log, and can the next episode start afresh
+            self._library.end()  # only then is SUMO's message in its log, and can the next episode start
             words = said_in(self._error_log) or (said_in(self._printed) if self._printed else "")
             kind = RefusedError if words or self.backend != "gui" else EpisodeError  # a window may be missing
             raise kind(f"SUMO cannot start: {words or ' '.join(str(error).split())}") from error
@@ -179,25 +178,6 @@ class Simulation:
             copy_harmless(path, copy)
             self._copies[path] = stamp_of(path), copy
         return str(copy)
-
-    def _start(self, command: list[str]) -> None:
-        if self.backend == "libsumo":
-            self._sumo.start(command)
-            return
-        label = f"unjam-{next(_labels)}"
-        traci = library("traci")
-
-        def start() -> None:
-            keep_disk(Path(self._folder.name), Path("/dev"))  # screens and sockets it needs
-            traci.start(command, label=label)
-
-        # A thread that ends with it: what is forbidden to SUMO is forbidden to nobody else here.
-        with redirect_stdout(io.StringIO()), ThreadPoolExecutor(1) as confined:
-            confined.submit(start).result()  # traci announces each of its attempts to connect
-        self._sumo = traci.getConnection(label)
-        # One that nobody closes would complain aloud of the lost connection as this process ends.
-        weakref.finalize(self, close, self._sumo)
-        self._bind()
 
     def _options(self, step: float, seed: int) -> list[str]:
         return [
@@ -311,30 +291,22 @@ class Simulation:
 
     def end_with_trips(self, classes: dict[str, str], after: float) -> Trips:
         """End the episode, so that SUMO writes its last records, and return what `read_trips` finds."""
-        self._end()
+        self._library.end()
         return read_trips(self._trips, classes, after)
+
+    @property
+    def is_lost(self) -> bool:
+        """Whether other code of this process has changed the simulation: only a new one can go on."""
+        return self._library.is_lost
 
     def close(self) -> None:
         """End the simulation and remove its files; may be called twice."""
-        global _open
-        if self._running:
-            self._end()
+        self._library.end()
+        self._library.close()
         self._folder.cleanup()
-        if _open is self:
-            _open = None
-
-    def _end(self) -> None:
-        """End SUMO; one that is gone already is no error."""
-        self._running = False
-        close(self._sumo)
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *error: object) -> None:
         self.close()
-
-
-def is_open() -> bool:
-    """Return whether libsumo runs a simulation in this process."""
-    return _open is not None

@@ -177,7 +177,8 @@ class Traffic(World[Episode], Generic[RoadKind]):
             raise EpisodeError(f"positions differ from SUMO's odometer by {error:.2g} m")
 
     def _facts(self) -> dict[str, Any]:
-        """Return what every record says."""
+        """Return what every record says; raise `LostError` where other code has changed the simulation."""
+        self._simulation.check()
         return {
             "seed": self.seed,
             "status": "collision" if self.crashed else "completed",

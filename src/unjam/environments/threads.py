@@ -1,0 +1,38 @@
+"""Environments that several threads call: one call at a time."""
+
+from collections.abc import Callable
+from functools import wraps
+from threading import RLock
+from typing import Concatenate, ParamSpec, Self, TypeVar
+
+P = ParamSpec("P")
+S = TypeVar("S")
+T = TypeVar("T")
+
+
+class CopyableLock:
+    """A lock that a thread may take again; copies of its owner get their own."""
+
+    def __init__(self) -> None:
+        """Make it; no thread holds it."""
+        self._lock = RLock()
+
+    def __enter__(self) -> None:
+        self._lock.acquire()
+
+    def __exit__(self, *error: object) -> None:
+        self._lock.release()
+
+    def __reduce__(self) -> tuple[type[Self], tuple[()]]:
+        return type(self), ()
+
+
+def one_thread_at_a_time(method: Callable[Concatenate[S, P], T]) -> Callable[Concatenate[S, P], T]:
+    """Return a method of an environment for which a second thread waits until the first has returned."""
+
+    @wraps(method)
+    def call(self: S, /, *arguments: P.args, **named: P.kwargs) -> T:
+        with self._road.lock:  # pyright: ignore[reportAttributeAccessIssue]
+            return method(self, *arguments, **named)
+
+    return call

@@ -1,0 +1,27 @@
+import numpy as np
+import pytest
+import torch
+
+from unjam.errors import UnjamError
+from unjam.training.generators import exclusive_generators
+
+
+def test_a_training_leaves_generators_and_threads_of_its_process_as_they_were() -> None:
+    torch.manual_seed(3)
+    np.random.seed(3)
+    threads, expected = torch.get_num_threads(), (torch.rand(2).tolist(), np.random.rand(2).tolist())
+    torch.manual_seed(3)
+    np.random.seed(3)
+    with exclusive_generators():
+        torch.manual_seed(8)
+        np.random.seed(8)
+        torch.set_num_threads(threads + 1)
+    assert (torch.rand(2).tolist(), np.random.rand(2).tolist()) == expected
+    assert torch.get_num_threads() == threads
+
+
+def test_a_second_training_in_the_same_process_is_refused() -> None:
+    refused = pytest.raises(UnjamError, match="another training runs in this process")
+    for _ in range(2):
+        with exclusive_generators(), refused, exclusive_generators():
+            raise AssertionError
