@@ -16,7 +16,7 @@ from unjam.drivers.driver import Driver, Recipe
 from unjam.drivers.follower_stopper import FollowerStopper
 from unjam.drivers.from_file import FileDriver, FileReference, is_file_reference
 from unjam.drivers.network import network_from_arrays
-from unjam.drivers.observation import FEATURES, FeatureName, observation_size
+from unjam.drivers.observation import FEATURES, FeatureName, observation_size, own_files
 from unjam.drivers.pi_saturation import PIFromGap, PISaturation
 from unjam.drivers.residual import EXPERT, ResidualDriver
 from unjam.drivers.road_experts import Cruise, GapMaker, JamAbsorber, JamAhead, Pacer
@@ -132,6 +132,10 @@ def _residual(recipe: Recipe, arrays: Arrays, held: Held) -> Driver:
     shown = observation_size(found.parts, expert)
     if network.inputs != shown:
         raise InputError(f"network: {network.inputs} inputs are not allowed; allowed: {shown}")
+    for file, listed in zip(own_files(found.parts), found.files, strict=False):
+        if file != listed:
+            allowed = "allowed: as it was when the driver was made"
+            raise InputError(f"driver recipe: the code {file['path']!r} of a feature has changed; {allowed}")
     return ResidualDriver(expert, network, found.action_limit, found.parts, found.hold)
 
 
