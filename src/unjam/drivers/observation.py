@@ -285,6 +285,21 @@ def observation_size(names: Sequence[str], expert: Driver) -> int:
     return observe(names, Seen(state, acceleration, expert, memory)).shape[1]
 
 
+def check_own_files(names: Sequence[str], files: Sequence[Recipe]) -> None:
+    """Load the users' own features anew where they were loaded from another code than `files` lists.
+
+    Raises:
+        InputError: their code is not what `files` lists.
+    """
+    if any(file not in files for file in own_files(names)):
+        _own_code.cache_clear()
+        _own_feature.cache_clear()
+    for file in own_files(names):
+        if file not in files:
+            allowed = "allowed: as it was when the driver was made"
+            raise InputError(f"driver recipe: the code {file['path']!r} of a feature has changed; {allowed}")
+
+
 def own_files(names: Sequence[str]) -> list[Recipe]:
     """Return where the code of the users' own features is, and the hash of what runs."""
     own = [name for name in names if name not in FEATURES]
