@@ -21,6 +21,7 @@ ORDER = (
 EVERYWHERE = {
     "",
     "adam",
+    "children",
     "errors",
     "files",
     "kernels",
@@ -30,6 +31,7 @@ EVERYWHERE = {
     "sandbox",
     "tree",
     "trust",
+    "user_code",
 }
 """what has no place in the order: it imports none of the layers"""
 ALLOWED = {
@@ -49,10 +51,11 @@ LAZY = {
         *("training", "trust", "worlds"),
     },
     "__main__": {"cli"},
-    "limited": {"controller", "errors", "processes", "trust"},
+    "limited": {"children", "controller", "errors", "trust"},
 }
 TORCH = {"torch", "stable_baselines3", "sb3_contrib"}
-LONGEST = 330
+LONGEST = 400
+EXECUTABLE = ("sys.executable", "sys._base_executable", "executable", "_base_executable")
 
 
 def imported(tree: ast.AST) -> Iterator[str]:
@@ -208,7 +211,22 @@ def test_a_users_file_is_run_in_one_place() -> None:
         for call in calls(tree)
         if name_of(call.func) == "exec_module"
     }
-    assert found == {"drivers/from_file.py"}
+    assert found == {"user_code.py"}
+
+
+def test_python_children_start_in_one_way() -> None:
+    """Another way could leave out what keeps the working folder off their import path."""
+    for module, tree in MODULES.items():
+        for node in ast.walk(tree):
+            named = isinstance(node, ast.Attribute) and ast.unparse(node) in EXECUTABLE
+            assert not named or module == "children.py", module
+            assert not isinstance(node, ast.alias) or node.name not in EXECUTABLE, module
+        called = {name_of(call.func) for call in calls(tree)}
+        assert "python_command" not in called or "child_environment" in called, module
+    started_by_a_library = importers({"multiprocessing", "ray"})
+    assert started_by_a_library == {"studies/parts.py", "training/executors.py"}
+    for module in started_by_a_library:
+        assert "isolated_start" in {name_of(call.func) for call in calls(MODULES[module])}
 
 
 PROCESS_WIDE = {
@@ -223,7 +241,7 @@ CHANGES_THE_PROCESS = {
     "sandbox": "functions for processes of unjam",
     "kernels": "when unjam is imported",
     "trust": "for the length of a block that the user writes, under a lock",
-    "drivers/from_file": "while a user's file is loaded, under a lock",
+    "children": "in the command line, and while Ray or multiprocessing starts processes",
     "training/generators": "for the length of a training, under a lock, and restored",
     "learners/algorithm_1": "within training/generators",
     "training/executors": "in the process of a training",

@@ -60,14 +60,27 @@ def test_elsewhere_than_in_a_checkout_there_is_no_commit(
 
 
 @pytest.mark.skipif(not shutil.which("git"), reason="no git")
-def test_a_package_installed_inside_somebody_elses_checkout_has_no_commit(
+def test_of_a_package_inside_another_repository_nothing_is_asked(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """The settings of a repository name programs that Git runs."""
     author = ["-c", "user.name=me", "-c", "user.email=me@here"]
-    for arguments in (["init"], [*author, "commit", "--allow-empty", "-m", "mine"]):
+    program, canary = tmp_path / "monitor", tmp_path / "canary"
+    program.write_text(f"#!/bin/sh\ntouch {canary}\n")
+    program.chmod(0o700)
+    for arguments in (
+        ["init"],
+        [*author, "commit", "--allow-empty", "-m", "mine"],
+        ["config", "core.fsmonitor", str(program)],
+    ):
         subprocess.run(["git", *arguments], cwd=tmp_path, capture_output=True, check=True)
-    monkeypatch.setattr(module, "__file__", str(tmp_path / "manifest.py"))
+    package = tmp_path / ".venv" / "lib" / "site-packages" / "unjam"
+    package.mkdir(parents=True)
+    monkeypatch.setattr(module, "__file__", str(package / "manifest.py"))
     assert manifest()["commit"] is None
+    assert not canary.exists()
+    subprocess.run(["git", "status"], cwd=package, capture_output=True, check=True)
+    assert canary.exists()  # Git itself, asked there, runs it
 
 
 def test_without_git_there_is_no_commit(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,13 +1,27 @@
 """Which code is trusted, and who is told."""
 
 import os
+import subprocess
 from pathlib import Path
 
 import pytest
 
-from unjam.drivers.from_file import FileReference
+from unjam.children import child_environment, python_command
+from unjam.controller import controller_bytes
+from unjam.controller import file as controller_file
+from unjam.controller.file import read_controller
+from unjam.drivers.from_file import FileDriver, FileReference
 from unjam.errors import InputError
-from unjam.trust import TRUSTED, check_trusted, check_values, is_all_trusted, remember, trusting_code
+from unjam.training.config import RunConfig, load_config, to_toml
+from unjam.trust import (
+    TRUSTED,
+    check_trusted,
+    check_values,
+    expecting_code,
+    is_all_trusted,
+    remember,
+    trusting_code,
+)
 
 
 @pytest.fixture
@@ -114,3 +128,68 @@ def test_the_state_of_programs_is_where_the_system_has_it(
     remember(code)
     check_trusted("run", code)
     assert [path.parent.name for path in tmp_path.rglob("trusted/*")] == ["trusted"]
+
+
+LATE = "def late():\n    import helper_later\n    return helper_later.value\n"
+
+
+@pytest.fixture
+def folder_with_code(code: Path) -> Path:
+    """Code that its user has run, with a module that it imports late, and a run folder that names it."""
+    code.write_text(LATE)
+    code.with_name("helper_later.py").write_text("value = 1\n")
+    assert FileReference(code, "late").load()() == 1
+    run = code.with_name("run")
+    run.mkdir()
+    (run / "config.toml").write_text(to_toml(RunConfig(expert=f"{code}:late")))
+    return run
+
+
+def test_what_code_imports_late_is_trusted_as_it_was(code: Path, folder_with_code: Path) -> None:
+    check_trusted("run", code)
+    code.with_name("helper_later.py").write_text("value = 2\n")
+    with pytest.raises(InputError, match="not as it is now"):
+        load_config(folder_with_code / "config.toml")
+
+
+@pytest.mark.parametrize("changed", ["code+1.py", "helper_later.py"])
+def test_code_that_changes_after_it_was_checked_does_not_run(
+    changed: str, code: Path, folder_with_code: Path
+) -> None:
+    canary = code.with_name("canary")
+    config = load_config(folder_with_code / "config.toml")
+    file = code.with_name(changed)
+    file.write_text(f"open({str(canary)!r}, 'w').close()\n{file.read_text()}")
+    with pytest.raises(InputError, match=r"^code\+1\.py: has changed since the configuration was checked"):
+        config.make_expert()
+    child = 'from unjam.drivers.from_file import FileReference; FileReference.of(f"{PATH}:late").load()()'
+    command = python_command("-c", f"PATH = {str(code)!r}; {child}")
+    ran = subprocess.run(command, env=child_environment(), capture_output=True, text=True, check=False)
+    assert "InputError: code+1.py: has changed since" in ran.stderr
+    assert not canary.exists()
+    with expecting_code():
+        pass
+    FileReference(code, "late").load()()  # its user names it anew
+    assert canary.exists()
+
+
+def test_code_that_changes_after_a_controller_was_checked_does_not_run(
+    code: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    helper, canary, run = code.with_name("helper_later.py"), code.with_name("canary"), code.with_name("run")
+    code.write_text(
+        "def gentle(state):\n    import helper_later\n    return helper_later.value * state.speed\n"
+    )
+    helper.write_text("value = 0.0\n")
+    run.mkdir()
+    (run / "controller.unjam").write_bytes(controller_bytes(FileDriver(code, "gentle"), {}))
+    read_controller(run)
+
+    def check(where: str, path: Path) -> None:
+        check_trusted(where, path)
+        helper.write_text(f"open({str(canary)!r}, 'w').close()\nvalue = 0.0\n")
+
+    monkeypatch.setattr(controller_file, "check_trusted", check)
+    with pytest.raises(InputError, match=r"code\+1\.py:gentle: its file has changed since"):
+        read_controller(run)
+    assert not canary.exists()

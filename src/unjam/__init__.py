@@ -8,6 +8,12 @@ With it Gymnasium knows `unjam/Ring-v0` and `unjam/FigureEight-v0`.
 The same on the command line: `unjam --help`.
 """
 
+import sys
+
+# `python -m unjam` searches the working folder first, which may be a downloaded one. `unjam` does not.
+if sys.argv[:1] == ["-m"] and sys.orig_argv[-len(sys.argv)].endswith("unjam") and not sys.flags.safe_path:
+    del sys.path[0]
+
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 

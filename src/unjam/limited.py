@@ -4,16 +4,14 @@ These are `unjam.verify_controller` and `unjam.write_report`.
 """
 
 import json
-import os
 import subprocess
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from unjam.children import child_environment, python_command
 from unjam.controller.verify import PartCheck
 from unjam.errors import UnjamError
-from unjam.processes import bound
 from unjam.trust import FLAG
 
 
@@ -58,8 +56,8 @@ def write_report(folders: Sequence[Path | str], target: Path | str) -> Path:
 
 def _answer(verb: str, *words: str) -> Any:
     """Return what a verb of the command line answers; raise its error where it ends with another code."""
-    command = [sys.executable, "-m", "unjam", verb, "--json", *words]
-    done = subprocess.run(command, capture_output=True, text=True, env=bound(os.environ), check=False)
+    command = python_command("-m", "unjam", verb, "--json", *words)
+    done = subprocess.run(command, capture_output=True, text=True, env=child_environment(), check=False)
     if done.returncode == 0:
         return json.loads(done.stdout)
     said = (done.stderr.strip().splitlines() or [f"unjam: {verb}: exit code {done.returncode}"])[-1]

@@ -43,11 +43,13 @@ def _version(package: str) -> str | None:
 
 def _commit() -> str | None:
     """Return the commit of the source tree that this runs from, `+` where it was changed; None elsewhere."""
-    here = Path(__file__).parent
+    root = Path(__file__).parents[2]
+    if not (root / ".git").exists():  # the settings of another repository can name programs
+        return None
     try:
         found = subprocess.run(
             ["git", "describe", "--always", "--abbrev=12", "--dirty=+"],
-            cwd=here,
+            cwd=root,
             capture_output=True,
             text=True,
             timeout=10,
@@ -55,5 +57,5 @@ def _commit() -> str | None:
         )
     except (OSError, subprocess.SubprocessError):
         return None
-    tracked = subprocess.run(["git", "ls-files", "--error-unmatch", __file__], cwd=here, capture_output=True)
+    tracked = subprocess.run(["git", "ls-files", "--error-unmatch", __file__], cwd=root, capture_output=True)
     return found.stdout.strip() if tracked.returncode == 0 else None

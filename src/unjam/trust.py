@@ -1,6 +1,7 @@
 """Which Python code that a folder names may run: what its user ran before, as it is and where it is."""
 
 import hashlib
+import json
 import os
 import threading
 from collections.abc import Iterable, Iterator
@@ -12,6 +13,7 @@ import platformdirs
 
 from unjam.errors import DiskError, InputError
 from unjam.files import write_whole
+from unjam.user_code import UserCode, read_code
 
 TRUSTED = "UNJAM_TRUSTED"
 """the variable that tells this process and its children what may run beside what is remembered"""
@@ -20,6 +22,9 @@ FLAG = "--trust-code"
 _lock = threading.Lock()
 _blocks: list[str | None] = []
 """for each running block of `trusting_code` the variable before the first of them"""
+EXPECTED = "UNJAM_EXPECTED_CODE"
+"""the variable that tells a child the hashes of code, by path, with which its configuration was checked"""
+_expected: dict[str, str] = json.loads(os.environ.get(EXPECTED, "{}"))
 
 
 @contextmanager
@@ -49,39 +54,67 @@ def is_all_trusted() -> bool:
     return ALL in _told()
 
 
-def check_trusted(where: str, code: Path) -> None:
-    """Raise `InputError` where code that `where` names has not run before as it is, nor may run unseen."""
-    if os.path.isfile(code) and not is_all_trusted() and not _is_known(_key(code)):
+def check_trusted(where: str, code: Path) -> str:
+    """Return the hash of code that `where` names; of what is no file nothing.
+
+    Raises:
+        InputError: it has not run before as it is, with what it imports from its folder, nor may run unseen.
+    """
+    if not os.path.isfile(code) or is_all_trusted():
+        return ""
+    sha256 = read_code(code).sha256
+    if not _is_known(_key(code, sha256)):
         why = "which you have not named yourself, or not as it is now"
         raise InputError(f"{where} names Python code ({str(code)!r}), {why}: it runs only with {FLAG}")
+    return sha256
 
 
 def check_values(where: str, values: Any) -> None:
-    """Raise `InputError` as `check_trusted` for all files that texts within `values` can name."""
+    """Check as `check_trusted` all files that texts within `values` can name, and expect them to stay so."""
     if isinstance(values, str):
         for code in _files_within(values):
-            check_trusted(where, code)
+            if sha256 := check_trusted(where, code):
+                _expected[str(code)] = sha256
     elif isinstance(values, dict | list):
         for value in values.values() if isinstance(values, dict) else values:
             check_values(where, value)
 
 
-def remember(code: Path, imported: Iterable[Path] = ()) -> None:
+def check_expected(code: UserCode) -> None:
+    """Raise `InputError` where code is another than when a configuration that names it was checked."""
+    if _expected.get(str(code.path), code.sha256) != code.sha256 and not is_all_trusted():
+        allowed = f"allowed: as it was then, or {FLAG}"
+        raise InputError(f"{code.path.name}: has changed since the configuration was checked; {allowed}")
+
+
+def expected_code() -> dict[str, str]:
+    """Return the variable that tells a child what code must be."""
+    return {EXPECTED: json.dumps(_expected)}
+
+
+@contextmanager
+def expecting_code() -> Iterator[None]:
+    """Forget at the end what code was expected to be: a program's user may change it, and name it again."""
+    try:
+        yield
+    finally:
+        _expected.clear()
+
+
+def remember(code: Path, sha256: str = "") -> None:
     """Keep for later, and for children, that this user runs this code; else, for children alone.
 
-    The place belongs to it: beside the same file elsewhere may lie other modules that it imports. Those that
-    it `imported` are kept with it.
+    The place belongs to it. Without a hash it is code as it is now.
     """
     try:
-        key, others = _key(code), {_key(each): each for each in imported}
+        key = _key(code, sha256 or read_code(code).sha256)
     except OSError:  # who loads it will be told
         return
-    if _is_known(key) and (key in _told() or others.keys() <= _kept(key).keys()):
+    if _is_known(key):
         return
-    lines = [os.fsencode(code), *(each.encode() + b" " + os.fsencode(path) for each, path in others.items())]
     try:
         _folder().mkdir(parents=True, exist_ok=True)
-        write_whole(_folder() / key, b"\n".join(lines) + b"\n")
+        write_whole(_folder() / key, os.fsencode(code) + b"\n")
     except (OSError, DiskError):
         with _lock:
             os.environ[TRUSTED] = " ".join([*_told(), key])
@@ -97,25 +130,14 @@ def _files_within(text: str) -> Iterable[Path]:
     return {Path(name).resolve() for name in found if os.path.isfile(name)}
 
 
-def _key(code: Path) -> str:
+def _key(code: Path, sha256: str) -> str:
     """Return the hash of where code is and of what it is."""
-    return hashlib.sha256(os.fsencode(code) + b"\0" + code.read_bytes()).hexdigest()
+    return hashlib.sha256(os.fsencode(code) + b"\0" + sha256.encode()).hexdigest()
 
 
 def _is_known(key: str) -> bool:
-    """Return whether code ran before, and what it imported then is as it was."""
-    if key in _told():
-        return True
-    try:
-        return all(_key(path) == kept for kept, path in _kept(key).items())
-    except OSError:
-        return False
-
-
-def _kept(key: str) -> dict[str, Path]:
-    """Return what code imported that ran before, by key; raise `OSError` where it never ran."""
-    others = (_folder() / key).read_bytes().splitlines()[1:]
-    return {line[:64].decode(): Path(os.fsdecode(line[65:])) for line in others}
+    """Return whether code ran before."""
+    return key in _told() or (_folder() / key).is_file()
 
 
 def _told() -> list[str]:

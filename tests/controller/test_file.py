@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from safetensors.numpy import save
+from safetensors.numpy import load, save
 
 from tests.conftest import random_network
 from unjam.controller import controller_bytes, load_controller
@@ -25,7 +25,7 @@ from unjam.drivers.driver import Driver
 from unjam.drivers.from_file import FileDriver
 from unjam.drivers.network import network_arrays
 from unjam.drivers.observation import FeatureName, observation_size
-from unjam.drivers.registry import recipe_of
+from unjam.drivers.registry import driver_from_recipe, recipe_of
 from unjam.drivers.wrappers import Mixed
 from unjam.errors import InputError
 from unjam.trust import trusting_code
@@ -223,6 +223,18 @@ def test_a_feature_whose_file_is_not_listed_is_never_run(
         f"driver recipe: part: '{code}:look' is not allowed; allowed: features whose files the recipe lists "
         f"with their hashes"
     )
+    assert not (tmp_path / "sprung").exists()
+
+
+def test_a_feature_that_changes_after_it_was_checked_is_never_run(
+    tmp_path: Path, seen_by_own: tuple[Path, dict[str, Any], bytes]
+) -> None:
+    code, manifest, weights = seen_by_own
+    code.write_text(f"{code.read_text()}# replaced\n")
+    with pytest.raises(
+        InputError, match=r"the code '.*eyes\.py' of a feature has changed; allowed: as it was"
+    ):
+        driver_from_recipe(manifest["driver"], load(weights))
     assert not (tmp_path / "sprung").exists()
 
 

@@ -4,7 +4,7 @@ from tests.faults.files import checkpoints, configurations, controllers, full_di
 from tests.faults.inputs import inputs
 from tests.faults.outcome import Fault
 from tests.faults.processes import hostile, killed_runs, lost_workers, networks, resets
-from tests.faults.trust import caches, cheats, codes, crash_points, lineages, locks, sandboxes
+from tests.faults.trust import caches, cheats, codes, crash_points, lineages, locks, replacements, sandboxes
 
 FAULTS: dict[str, Fault] = {
     "checkpoints": Fault(
@@ -69,5 +69,12 @@ FAULTS: dict[str, Fault] = {
         inputs,
         quick=11,
         long=200,
+    ),
+    "replaced code": Fault(
+        "user's Python file, or a module that it imports, replaced after it was read or trusted, or with "
+        "bytecode beside it",
+        replacements,
+        quick=12,
+        long=500,
     ),
 }

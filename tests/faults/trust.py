@@ -20,6 +20,7 @@ from tests.faults.outcome import Outcome, one_line
 from tests.system.test_code_of_others import VERBS
 from tests.test_processes import holder
 from tests.test_sandbox import TRIES
+from tests.test_user_code import LATE, plant_bytecode
 from tests.training.test_belonging import of_expert, of_network, of_reward, with_checkpoint
 from tests.training.test_crash_points import Moment, content_of, crash, run
 from tests.training.test_run import small_config
@@ -33,6 +34,7 @@ from unjam.cli import app
 from unjam.controller import controller_bytes
 from unjam.controller.verify import verify_controller
 from unjam.drivers import Driver, LocalState, PISaturation
+from unjam.drivers.from_file import FileReference
 from unjam.drivers.wrappers import Mixed, Remembering
 from unjam.errors import EpisodeError, InputError
 from unjam.processes import owned
@@ -40,6 +42,8 @@ from unjam.scenarios import Ring, make_scenario
 from unjam.training import folder as run_folder
 from unjam.training.belonging import belonging
 from unjam.training.folder import STATE, last_state, start_folder
+from unjam.trust import check_values, expecting_code, remember
+from unjam.user_code import read_code
 from unjam.worlds.episode import run_episode
 from unjam.worlds.sumo import networks
 from unjam.worlds.sumo.apart import SimulationApart
@@ -266,6 +270,43 @@ def _hidden(mine: Driver, generator: np.random.Generator) -> tuple[Driver, str]:
         (Remembering(mine, 0.1), "a driver that another holds"),
     )
     return choices[int(generator.integers(len(choices)))]
+
+
+def replacements(count: int, folder: Path, generator: np.random.Generator) -> Outcome:
+    """Replace a user's file, or a module that it imports, or put bytecode beside it, at any moment."""
+    outcome = Outcome()
+    for number in range(count):
+        place = folder / str(number)
+        (place / "package").mkdir(parents=True)
+        main = place / "main.py"
+        for name in ("neighbor", "later", "package/inner"):
+            (place / f"{name}.py").write_text("value = 'good'\n")
+        main.write_text(LATE)
+        file = place / f"{generator.choice(['main', 'neighbor', 'later', 'package/inner'])}.py"
+        evil = f"open({str(place / 'ran')!r}, 'w').close()\n{file.read_text()}"
+        moment = str(generator.choice(["bytecode", "after it was read", "after it was checked"]))
+        with expecting_code():
+            if moment == "bytecode":
+                plant_bytecode(file, str(generator.choice(["by time", "by an unchecked hash"])))
+                late = FileReference(main, "late").load()
+            elif moment == "after it was read":
+                code = read_code(main)
+                file.write_text(evil)
+                late = code.run().late
+            else:
+                remember(main)
+                check_values("run", f"{main}:late")
+                file.write_text(evil)
+                with pytest.raises(InputError, match="has changed since") as caught:
+                    FileReference(main, "late").load()
+                one_line(caught.value)
+                late = None
+        assert late is None or late() == ("good", "good", "good")
+        assert not (place / "ran").exists()
+        became = "refused in one line" if late is None else "what was hashed ran"
+        outcome.happened[f"{moment}: {became}"] += 1
+        shutil.rmtree(place)
+    return outcome
 
 
 def cheats(count: int, folder: Path, generator: np.random.Generator) -> Outcome:

@@ -43,10 +43,10 @@ def test_one_failure_does_not_stop_the_others(tmp_path: Path) -> None:
 
 def test_what_was_begun_is_gone_on_with(tmp_path: Path) -> None:
     command = command_of(tmp_path)
-    assert command.line()[3:5] == ["train", "--config"]
+    assert command.line()[4:6] == ["train", "--config"]
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "config.toml").touch()
-    assert command.line()[3:5] == ["train", "--resume"]
+    assert command.line()[4:6] == ["train", "--resume"]
 
 
 def test_what_a_signal_kills_is_started_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

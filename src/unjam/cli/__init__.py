@@ -10,6 +10,7 @@ from typing import Annotated
 import typer
 
 from unjam import __version__
+from unjam.children import isolate_children
 from unjam.cli.calibrate import calibrate
 from unjam.cli.drive import assess, drive, watch
 from unjam.cli.machine import bench, doctor
@@ -76,6 +77,7 @@ def main() -> None:
         if signum is not None and signal.getsignal(signum) != signal.SIG_IGN:
             signal.signal(signum, _terminate)
     end_with_parent(signal.SIGTERM)
+    isolate_children()
     sys.exit(_run())
 
 

@@ -22,6 +22,7 @@ from unjam.errors import InputError, wrong
 from unjam.files import NONE_OF_OURS, to_json, write_whole
 from unjam.physics.arrays import Floats
 from unjam.trust import check_trusted
+from unjam.user_code import read_code
 from unjam.worlds.drive import drive
 from unjam.worlds.world import RecordedWorld
 
@@ -183,7 +184,7 @@ def _check_code(name: str, recipe: Any, in_folder: bool) -> None:
         if not in_folder:
             alone = "a file by itself may not run; use the run folder"
             raise InputError(f"controller {name}: part of it is Python code ({code.name}), which {alone}")
-        if code.is_file() and hash_of(code.read_bytes()) != found["sha256"]:
+        if code.is_file() and read_code(code).sha256 != found["sha256"]:
             once = "allowed: as it was when it was trained, or train anew"
             raise InputError(f"controller {name}: its code {str(code)!r} has changed since; {once}")
         check_trusted(f"controller {name}", code)

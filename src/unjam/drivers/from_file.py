@@ -3,17 +3,13 @@
 Such a file is code and is run as such: use only files that you trust.
 """
 
-import hashlib
-import importlib.util
 import inspect
 import os
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from threading import RLock
 from traceback import extract_tb
-from types import ModuleType
 from typing import Any, Protocol
 
 import numpy as np
@@ -24,10 +20,11 @@ from unjam.drivers.local_state import LocalState
 from unjam.errors import InputError
 from unjam.physics.arrays import Array
 from unjam.processes import user_output
-from unjam.trust import remember
+from unjam.trust import check_expected, remember
+from unjam.user_code import UserCode, read_code
 
 _loading = RLock()
-"""held while a file runs: it finds its neighbours through `sys.path`, of which a process has one"""
+"""held while a file runs: its modules then have their short names in `sys.modules`, of which there is one"""
 
 
 def is_file_reference(text: str) -> bool:
@@ -54,55 +51,48 @@ class FileReference:
     def __str__(self) -> str:
         return f"{self.path.name}:{self.name}"
 
-    def hash_now(self) -> str:
-        """Return the SHA-256 of the file as it is now."""
-        return hashlib.sha256(self.path.read_bytes()).hexdigest()
-
-    def recipe(self) -> Recipe:
+    def recipe_of(self, sha256: str) -> Recipe:
         """Return where the code is, and its hash."""
-        return self._recipe_of(self.hash_now())
-
-    def _recipe_of(self, sha256: str) -> Recipe:
         return {"kind": "file", "path": str(self.path), "name": self.name, "sha256": sha256}
 
-    def load(self) -> Any:
-        """Return what has the name, running the file.
+    def read(self) -> UserCode:
+        """Return the code of the file as it is now.
 
         Raises:
-            InputError: the file is missing or fails when run, or has no such name.
+            InputError: the file is missing, unreadable or no Python file, or imports a compiled module of its
+                folder.
         """
-        path = self.path
-        if not os.path.isfile(path):
-            raise InputError(f"driver file: {str(path)!r} is not a file")
-        module_name = f"unjam_user_{path.stem}_{abs(hash(str(path))):x}"
-        spec = importlib.util.spec_from_file_location(module_name, path)
-        if spec is None or spec.loader is None:
-            raise InputError(f"driver file: {str(path)!r} is not a Python file")
-        remember(path)  # what a folder names was checked before it comes here
-        module = importlib.util.module_from_spec(spec)
-        with _loading:
-            sys.modules[module_name] = module
-            before = set(sys.modules)
-            sys.path.insert(0, str(path.parent))  # so that the file may import its neighbours
-            try:
-                with user_output():
-                    spec.loader.exec_module(module)
-            except (Exception, SystemExit) as error:  # whatever the user's code raises is the user's to mend
-                raise InputError(f"{path.name}: {type(error).__name__} when loading it: {error}") from error
-            finally:
-                sys.path.remove(str(path.parent))
-                new = set(sys.modules) - before
-                neighbours = [name for name in new if _lies_in(sys.modules[name], path.parent)]
-                # Another folder's file may have neighbours of these names.
-                remember(path, [Path(str(sys.modules.pop(name).__file__)) for name in neighbours])
+        if not os.path.isfile(self.path):
+            raise InputError(f"driver file: {str(self.path)!r} is not a file")
+        if self.path.suffix != ".py":
+            raise InputError(f"driver file: {str(self.path)!r} is not a Python file")
+        try:
+            return read_code(self.path)
+        except OSError as error:
+            raise InputError(f"driver file: {str(error.filename)!r}: {error.strerror}") from None
+
+    def load(self, code: UserCode | None = None) -> Any:
+        """Return what has the name, running the file: as it was read, else as it is now.
+
+        Raises:
+            InputError: as `read`; the file fails when run, or has no such name.
+        """
+        code = code or self.read()
+        check_expected(code)
+        remember(code.path, code.sha256)  # what a folder names was checked before it comes here
+        try:
+            with _loading, user_output():
+                module = code.run()
+        except (Exception, SystemExit) as error:  # whatever the user's code raises is the user's to mend
+            raise InputError(f"{self.path.name}: {type(error).__name__} when loading it: {error}") from error
         if not hasattr(module, self.name):
             public = ", ".join(key for key in vars(module) if not key.startswith("_")) or "nothing"
-            raise InputError(f"{path.name}: has no {self.name!r}; it has: {public}")
+            raise InputError(f"{self.path.name}: has no {self.name!r}; it has: {public}")
         return getattr(module, self.name)
 
-    def function(self, of: str) -> Callable[..., Any]:
+    def function(self, of: str, code: UserCode | None = None) -> Callable[..., Any]:
         """Return the function of that name, which takes `of`; raise `InputError` where it is none."""
-        found = self.load()
+        found = self.load(code)
         if not callable(found) or inspect.isclass(found):
             raise InputError(f"{self}: is not a function of {of}")
         return found
@@ -120,12 +110,6 @@ class FileReference:
             lines = [str(frame.lineno) for frame in frames if frame.filename == str(self.path)]
             place = f" (line {lines[-1]})" if lines else ""
             raise InputError(f"{self}: {type(error).__name__}: {error}{place}") from error
-
-
-def _lies_in(module: ModuleType, folder: Path) -> bool:
-    """Return whether a module was imported from a folder."""
-    file = getattr(module, "__file__", None)
-    return file is not None and folder.resolve() in Path(file).resolve().parents
 
 
 class Brought(Driver):
@@ -193,15 +177,16 @@ class FileDriver(FileReference, Brought):
     def __post_init__(self) -> None:
         """Load it; raise `InputError` where the file is another than it must be."""
         object.__setattr__(self, "path", self.path.resolve())
-        if self.sha256 and self.path.is_file() and self.sha256 != self.hash_now():
+        code = self.read()
+        if self.sha256 and self.sha256 != code.sha256:
             raise InputError(
                 f"{self}: its file has changed since; allowed: as it was when it was first loaded"
             )
-        object.__setattr__(self, "held", self._build())
-        object.__setattr__(self, "sha256", self.sha256 or self.hash_now())
+        object.__setattr__(self, "held", self._build(code))
+        object.__setattr__(self, "sha256", code.sha256)
 
-    def _build(self) -> Any:
-        found = self.load()
+    def _build(self, code: UserCode) -> Any:
+        found = self.load(code)
         if inspect.isclass(found):
             arguments = dict(self.parameters)
             if "time_step" in inspect.signature(found).parameters:
@@ -221,7 +206,7 @@ class FileDriver(FileReference, Brought):
     def recipe(self) -> Recipe:
         """Return where the code is, and the hash of what was loaded."""
         made = {"parameters": self.parameters, "time_step": self.time_step}
-        return {**self._recipe_of(self.sha256), **made}
+        return {**self.recipe_of(self.sha256), **made}
 
 
 @dataclass(frozen=True)

@@ -27,6 +27,7 @@ from unjam.drivers.local_state import (
 )
 from unjam.errors import InputError, wrong_name
 from unjam.physics.arrays import Array, as_column, clip, join_columns, namespace, stack_columns
+from unjam.user_code import UserCode
 
 RELATIVE_SPEED_SCALE = 5.0
 GAP_SCALE = 20.0
@@ -222,9 +223,14 @@ def feature(name: str) -> Feature:
 
 
 @cache
+def _own_code(name: str) -> UserCode:
+    return FileReference.of(name).read()
+
+
+@cache
 def _own_feature(name: str) -> Feature:
     reference = FileReference.of(name)
-    function = reference.function("a LocalState")
+    function = reference.function("a LocalState", _own_code(name))
 
     def look(seen: Seen) -> Array:
         like, state = seen.state.speed, seen.state
@@ -279,6 +285,22 @@ def observation_size(names: Sequence[str], expert: Driver) -> int:
     return observe(names, Seen(state, acceleration, expert, memory)).shape[1]
 
 
+def check_own_files(names: Sequence[str], files: Sequence[Recipe]) -> None:
+    """Load the users' own features anew where they were loaded from another code than `files` lists.
+
+    Raises:
+        InputError: their code is not what `files` lists.
+    """
+    if any(file not in files for file in own_files(names)):
+        _own_code.cache_clear()
+        _own_feature.cache_clear()
+    for file in own_files(names):
+        if file not in files:
+            allowed = "allowed: as it was when the driver was made"
+            raise InputError(f"driver recipe: the code {file['path']!r} of a feature has changed; {allowed}")
+
+
 def own_files(names: Sequence[str]) -> list[Recipe]:
-    """Return where the code of the users' own features is, and its hash."""
-    return [FileReference.of(name).recipe() for name in names if name not in FEATURES]
+    """Return where the code of the users' own features is, and the hash of what runs."""
+    own = [name for name in names if name not in FEATURES]
+    return [FileReference.of(name).recipe_of(_own_code(name).sha256) for name in own]

@@ -16,7 +16,7 @@ from unjam.drivers.driver import Driver, Recipe
 from unjam.drivers.follower_stopper import FollowerStopper
 from unjam.drivers.from_file import FileDriver, FileReference, is_file_reference
 from unjam.drivers.network import network_from_arrays
-from unjam.drivers.observation import FEATURES, FeatureName, observation_size
+from unjam.drivers.observation import FEATURES, FeatureName, check_own_files, observation_size
 from unjam.drivers.pi_saturation import PIFromGap, PISaturation
 from unjam.drivers.residual import EXPERT, ResidualDriver
 from unjam.drivers.road_experts import Cruise, GapMaker, JamAbsorber, JamAhead, Pacer
@@ -129,6 +129,8 @@ def _residual(recipe: Recipe, arrays: Arrays, held: Held) -> Driver:
     expert = held(found.expert, EXPERT)
     own = {name: array for name, array in arrays.items() if not name.startswith(f"{EXPERT}.")}
     network = network_from_arrays(own, found.authority, found.exploration_std, found.lasts)
+    if found.files:
+        check_own_files(found.parts, found.files)
     shown = observation_size(found.parts, expert)
     if network.inputs != shown:
         raise InputError(f"network: {network.inputs} inputs are not allowed; allowed: {shown}")

@@ -42,6 +42,7 @@ CAV_LINE: dict[str, Any] = {"colors": CAV_COLOUR, "linewidths": 1.6}
 STYLE: dict[Any, Any] = {
     "font.family": "DejaVu Sans",
     "font.size": 9,
+    "text.usetex": False,  # the working folder may hold a matplotlibrc, and LaTeX runs what that says
     "axes.edgecolor": MUTED,
     "axes.labelcolor": INK,
     "axes.titlecolor": INK,

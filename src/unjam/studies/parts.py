@@ -2,12 +2,15 @@
 
 import json
 import multiprocessing
+import os
+import sys
 from collections.abc import Callable, Mapping
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
+from unjam.children import isolated_start
 from unjam.controller import SHIPPED, shipped_file
 from unjam.files import make_folder, to_json, write_whole
 
@@ -47,7 +50,8 @@ def measure_parts(
     else:
         # Fresh processes: a forked one would inherit threads of torch that are not there.
         context = multiprocessing.get_context("spawn")
-        with ProcessPoolExecutor(workers, mp_context=context) as pool:
+        absolute = filter(os.path.isabs, sys.path)  # in a notebook the working folder is on it
+        with isolated_start(absolute), ProcessPoolExecutor(workers, mp_context=context) as pool:
             running = {pool.submit(function, *given): name for name, (function, given) in missing.items()}
             for done in as_completed(running):
                 keep(running[done], done.result())

@@ -7,11 +7,11 @@ listen, is never passed on to it: see `copy_harmless`.
 
 import json
 import subprocess
-import sys
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 from unjam import sandbox
+from unjam.children import child_environment, python_command
 from unjam.errors import InputError
 
 PROGRAM = Path(__file__).with_name("program.py")
@@ -137,10 +137,14 @@ def stamp_of(file: Path) -> tuple[int, int]:
 def _ask(command: Literal["configuration", "lanes", "copy"], path: Path, *more: Path) -> Any:
     """Return what the program answers; raise `InputError` where it says what is wrong, or is lost."""
     limits = [str(LARGEST_MEMORY), str(LONGEST_TIME), str(more[0].parent) if more else ""]
-    program = [sys.executable, "-I", "-S", sandbox.__file__, *limits, str(PROGRAM), command]
+    program = python_command("-I", "-S", sandbox.__file__, *limits, str(PROGRAM), command)
     try:
         done = subprocess.run(
-            [*program, str(path), *map(str, more)], capture_output=True, timeout=LONGEST_TIME, check=False
+            [*program, str(path), *map(str, more)],
+            capture_output=True,
+            timeout=LONGEST_TIME,
+            env=child_environment(),
+            check=False,
         )
         answer = json.loads(done.stdout)
     except (subprocess.TimeoutExpired, ValueError):

@@ -70,12 +70,14 @@ def _files(road: RunConfig, task: Task) -> dict[str, str]:
 
 
 def hashes_of_files(names: Iterable[str], *scenarios: Scenario) -> dict[str, str]:
-    """Return hashes of the files that `names` refer to and that scenarios are made from, by path."""
-    paths = [FileReference.of(name).path for name in names if is_file_reference(name)]
+    """Return hashes of the code that `names` refer to and of the files of scenarios, by path."""
+    codes = [FileReference.of(name).read() for name in names if is_file_reference(name)]
+    paths = list[Path]()
     for scenario in scenarios:
         if isinstance(scenario, OwnNetwork):
             own = read_sumo_files(Path(scenario.file))
             paths += [own.path, own.network, *own.additional_files, *own.route_files]
         if scenario.population:
             paths.append(population_file(scenario.population))
-    return {str(path): hash_of(path.read_bytes()) for path in paths}
+    hashes = {str(code.path): code.sha256 for code in codes}
+    return hashes | {str(path): hash_of(path.read_bytes()) for path in paths}

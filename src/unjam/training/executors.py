@@ -20,11 +20,12 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
+from unjam.children import child_environment, child_import_path, isolated_start, python_command
 from unjam.errors import MissingPartError, UnjamError, error_named
 from unjam.files import make_folder, write_whole
 from unjam.parameters import build
-from unjam.processes import bound, end_with_parent
-from unjam.trust import FLAG, is_all_trusted
+from unjam.processes import end_with_parent
+from unjam.trust import FLAG, expecting_code, is_all_trusted
 
 if TYPE_CHECKING:  # the command line asks which executors there are: it is to be quick
     from unjam.training.config import RunConfig
@@ -55,7 +56,7 @@ class CommandLine(NamedTuple):
     def line(self) -> list[str]:
         """Return the whole command line, as it must be on this machine at this moment."""
         begun = self.begun is not None and self.begun.is_file()
-        return [sys.executable, "-m", "unjam", *(self.again if begun else self.words)]
+        return python_command("-m", "unjam", *(self.again if begun else self.words))
 
 
 def training_command(config: "RunConfig", folder: Path, plan: Path, log: Path) -> CommandLine:
@@ -94,9 +95,8 @@ class Processes:
         with open(command.log, "ab") as log:
             log.write(f"$ {shlex.join(line)}\n".encode())
             log.flush()
-            environment = bound(os.environ)
             with subprocess.Popen(
-                line, stdin=subprocess.DEVNULL, stdout=log, stderr=log, env=environment
+                line, stdin=subprocess.DEVNULL, stdout=log, stderr=log, env=child_environment()
             ) as process:
                 with self._lock:
                     self._running.add(process)
@@ -163,10 +163,11 @@ def _ray(workers: int) -> Iterator[Callable[[CommandLine], int]]:
         import ray  # pyright: ignore[reportMissingImports]
     except ImportError:
         raise MissingPartError("executor: ray is not installed: pip install 'unjam[ray]'") from None
-    try:
-        ray.init(address="auto", log_to_driver=False)
-    except ConnectionError:
-        ray.init(address="local", num_cpus=workers, include_dashboard=False, log_to_driver=False)
+    with isolated_start(child_import_path()):
+        try:
+            ray.init(address="auto", log_to_driver=False)
+        except ConnectionError:
+            ray.init(address="local", num_cpus=workers, include_dashboard=False, log_to_driver=False)
     remote = ray.remote(num_cpus=1, max_retries=ATTEMPTS - 1)(_run_here)
     try:
         yield lambda command: ray.get(remote.remote(command))
@@ -178,6 +179,7 @@ def _run_here(command: CommandLine) -> int:
     return Processes().run(command)
 
 
+@expecting_code()
 def train_apart(
     config: "RunConfig",
     folder: Path,
@@ -190,14 +192,18 @@ def train_apart(
     Raises:
         UnjamError: of the same kind as in this process.
     """
-    command = [sys.executable, "-m", "unjam.training.executors"]
     child = subprocess.Popen(
-        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, encoding="utf-8", env=bound(os.environ)
+        python_command("-m", "unjam.training.executors"),
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        encoding="utf-8",
+        env=child_environment(),
     )
     try:
         assert child.stdin is not None
         assert child.stdout is not None
-        print(json.dumps([asdict(config), os.fspath(folder), resume, sys.path]), file=child.stdin, flush=True)
+        request = [asdict(config), os.fspath(folder), resume, child_import_path()]
+        print(json.dumps(request), file=child.stdin, flush=True)
         for line in child.stdout:
             match json.loads(line):
                 case ["row", row]:
@@ -222,7 +228,8 @@ def main() -> None:
     answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)  # SUMO and user code may print: not into the answers
     values, folder, resume, path = json.loads(sys.stdin.readline())
-    sys.path[:] = path  # a user's driver imports what it did in the program
+    # A user's driver may import what the program added to its path; last, it hides nothing that is installed.
+    sys.path.extend(each for each in path if each not in sys.path)
 
     def say(*words: Any) -> None:
         print(json.dumps(words), file=answers, flush=True)

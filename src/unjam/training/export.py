@@ -25,6 +25,7 @@ from unjam.scenarios.scenario import Scenario
 from unjam.training.evaluate import TRAINED, raise_failure
 from unjam.training.folder import origin, read_config
 from unjam.training.seeds import held_out_seeds
+from unjam.trust import expecting_code
 from unjam.worlds.workers import EpisodeTask, Workers
 
 if TYPE_CHECKING:
@@ -89,6 +90,7 @@ class Exported:
     """of the recorded sample"""
 
 
+@expecting_code()
 def export_controller(source: str | Path, to: str | Path, onnx: bool = False, scenario: str = "") -> Exported:
     """Write a controller into a file that needs nothing else: `.unjam`, and on demand an ONNX graph.
 

@@ -45,6 +45,7 @@ from unjam.training.model_facts import why_no_facts, write_model_facts
 from unjam.training.sampling import Sampler, episodes_of, iterations_ahead
 from unjam.training.seeds import VALIDATE
 from unjam.training.stopping import ends_early
+from unjam.trust import expecting_code
 from unjam.worlds.batch.run import run_where_possible
 from unjam.worlds.workers import Workers
 
@@ -133,7 +134,7 @@ def train_here(
         read_config(folder)
     else:
         make_new_folder(folder, f", or --resume {folder}")
-    with owned(folder):
+    with expecting_code(), owned(folder):
         return _train_owned(config, folder, resume, on_iteration, progress)
 
 

@@ -1,9 +1,7 @@
 """Many episodes at once, each in a worker process, with the same result whatever happens to a worker."""
 
-import os
 import queue
 import subprocess
-import sys
 import tempfile
 import threading
 from collections.abc import Callable, Sequence
@@ -11,10 +9,11 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any, Self, TypeVar
 
+from unjam.children import child_environment, python_command
 from unjam.drivers.driver import Driver
 from unjam.drivers.registry import recipe_of
 from unjam.errors import EpisodeError
-from unjam.processes import PrivateFolder, bound, sweep_private_folders
+from unjam.processes import PrivateFolder, sweep_private_folders
 from unjam.scenarios import scenario_recipe
 from unjam.scenarios.own_network import OwnNetwork
 from unjam.scenarios.scenario import Scenario
@@ -151,14 +150,13 @@ class _Worker:
     def _start(self) -> subprocess.Popen[bytes]:
         # A BLAS with threads of its own would fight with the other workers for the cores.
         single = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
-        environment = bound({**os.environ, **single, "TMPDIR": self._temporary})
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115  (lives as long as the process)
         process = subprocess.Popen(
-            [sys.executable, "-m", "unjam.worlds.worker"],
+            python_command("-m", "unjam.worlds.worker"),
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=self._errors,
-            env=environment,
+            env=child_environment(**single, TMPDIR=self._temporary),
             start_new_session=True,  # an interrupt in the terminal is the parent's to handle
         )
         self._messages: queue.SimpleQueue[Message | None] = queue.SimpleQueue()

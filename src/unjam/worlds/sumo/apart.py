@@ -17,8 +17,9 @@ from pathlib import Path
 from threading import Lock
 from typing import Any, Self, get_type_hints
 
+from unjam.children import child_environment, python_command
 from unjam.errors import LostError, error_named, in_own_words
-from unjam.processes import PrivateFolder, bound, end_with_parent, sweep_private_folders
+from unjam.processes import PrivateFolder, end_with_parent, sweep_private_folders
 from unjam.sandbox import confine, limit
 from unjam.scenarios.own_network import OwnNetwork
 from unjam.scenarios.scenario import Scenario
@@ -80,10 +81,10 @@ class SimulationApart:
             starter = _starter(os.getpid())
         start = starter.submit(
             subprocess.Popen[bytes],
-            [sys.executable, "-m", "unjam.worlds.sumo.apart"],
+            python_command("-m", "unjam.worlds.sumo.apart"),
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
-            env=bound({**os.environ, "TMPDIR": self._folder.name}),
+            env=child_environment(TMPDIR=self._folder.name),
             start_new_session=True,  # an interrupt in the terminal is this process's to handle
         )
         self._process = start.result()
