@@ -47,7 +47,7 @@ PASSED_GROUPS = (
 )
 """what the names of others of them begin with"""
 OTHERWISE = {
-    *("seed", "step-length", "collision.action", "collision.mingap-factor", "collision.check-junctions"),
+    *("step-length", "collision.action", "collision.mingap-factor", "collision.check-junctions"),
     *("no-step-log", "no-warnings", "duration-log.disable", "duration-log.statistics", "verbose", "start"),
     *("xml-validation", "xml-validation.net", "xml-validation.routes", "gui-settings-file", "quit-on-end"),
     *("delay", "precision", "step-log.period", "print-options", "human-readable-time", "registry-viewport"),
@@ -136,7 +136,7 @@ def read_sumo_files(path: Path) -> SumoFiles:
     found["to_copy"] = {Path(file): tuple(map(Path, made)) for file, made in found["to_copy"].items()}
     found["used_types"] = frozenset(found["used_types"])
     options: dict[str, str] = found["options"]
-    kinds = {name: _kind_of_option(path, name, value) for name, value in options.items()}
+    kinds = {name: kind_of_option(path.name, name, value) for name, value in options.items()}
     found["options"] = {name: value for name, value in options.items() if kinds[name] == "passed"}
     found["dropped"] = (
         *(f"option {name}" for name in options if kinds[name] == "not written"),
@@ -148,8 +148,14 @@ def read_sumo_files(path: Path) -> SumoFiles:
     return files
 
 
-def _kind_of_option(path: Path, name: str, value: str) -> str:
-    """Return what becomes of an option; raise `InputError` where it would have to be passed and cannot be."""
+def kind_of_option(
+    file: str, name: str, value: str
+) -> Literal["passed", "ignored", "replaced", "not written"]:
+    """Return what becomes of an option of a configuration.
+
+    Raises:
+        InputError: SUMO has no such option, or it changes the traffic and cannot be passed on.
+    """
     if is_passed(name):
         return "passed"
     if name in OTHERWISE:
@@ -160,10 +166,10 @@ def _kind_of_option(path: Path, name: str, value: str) -> str:
         return "not written"
     if name not in REFUSED:
         known = [*PASSED, *OTHERWISE, *REPLACED, *REFUSED]
-        raise InputError(f"{path.name}: {name}: SUMO has no such option{did_you_mean(name, known)}")
+        raise InputError(f"{file}: {name}: SUMO has no such option{did_you_mean(name, known)}")
     if value == REFUSED[name].partition(",")[0]:  # as in a configuration that lists all defaults
         return "ignored"
-    raise wrong(f"{path.name}: {name}", value, REFUSED[name])
+    raise wrong(f"{file}: {name}", value, REFUSED[name])
 
 
 def read_lanes(path: Path) -> list[Lane]:

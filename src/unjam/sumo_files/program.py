@@ -126,7 +126,7 @@ def _options(path: Path) -> dict[str, str]:
 
     def take(tag: str, attributes: Attributes) -> None:
         for value in filter(None, map(attributes.get, ("value", "v"))):
-            name = SYNONYMS.get(tag, tag).replace("device.routing.", "device.rerouting.")
+            name = sumo_name(tag)
             if name in options:
                 raise Broken(f"{path.name}: {tag}: is set twice")
             options[name] = _substituted(value)
@@ -140,6 +140,13 @@ def _options(path: Path) -> dict[str, str]:
     parser.StartElementHandler, parser.CharacterDataHandler = take, refuse
     parse(path, parser, [path.read_bytes()])
     return options
+
+
+def sumo_name(name: str) -> str:
+    """Return the name by which SUMO lists an option that has several."""
+    for old, new in (("device.routing.", "device.rerouting."), (".knownveh", ".explicit")):
+        name = name.replace(old, new)
+    return SYNONYMS.get(name, name)
 
 
 def _substituted(text: str) -> str:

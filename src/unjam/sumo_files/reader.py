@@ -71,6 +71,8 @@ class Reader:
         self._write = out.write if out else None
         self._within = 0
         """open elements within one that was dropped, itself included"""
+        self._names: dict[str, str] = {}
+        """other names by which elements are written"""
         self._plain: set[str] = set()
         """names of attributes that are known to name no file"""
         self._parsers: list[Any] = []
@@ -155,7 +157,9 @@ class Reader:
             kept |= self._types.get(kept.get("id", ""), {})
         self._write_start(tag, kept)
         if tag in DEFINED_ELSEWHERE and attributes.get("file"):
+            self._names = dict.fromkeys(DEFINED_ELSEWHERE, "content")  # within itself it would crash SUMO
             self._include(attributes["file"])
+            self._names = {}
             self._write_end(tag)
             self._drop_content()  # as SUMO does
 
@@ -182,11 +186,11 @@ class Reader:
     def _write_start(self, tag: str, attributes: Attributes) -> None:
         if self._write is not None:
             inside = "".join(f" {name}={quoteattr(value)}" for name, value in attributes.items())
-            self._write(f"<{tag}{inside}>")
+            self._write(f"<{self._names.get(tag, tag)}{inside}>")
 
     def _write_end(self, tag: str) -> None:
         if self._write is not None:
-            self._write(f"</{tag}>")
+            self._write(f"</{self._names.get(tag, tag)}>")
 
     def _include(self, name: str) -> None:
         """Read another file in this place, as SUMO does: its name is relative to the one that names it."""
