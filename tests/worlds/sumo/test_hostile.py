@@ -1,6 +1,7 @@
 """Files of others that want SUMO to write, to listen or to read elsewhere: it simulates, and nothing more."""
 
 import gzip
+import json
 import os
 import re
 import subprocess
@@ -11,6 +12,7 @@ import numpy as np
 import psutil
 import pytest
 
+import unjam
 from tests.worlds.sumo.own_roads import game, straight
 from tests.worlds.test_record import fingerprint
 from unjam.drivers import IDM
@@ -138,6 +140,17 @@ def test_what_is_left_out_is_told_once_in_one_line(hostile: Path, caplog: pytest
         "edgeData",
         "parameter device.ssm.file",
     } <= {*dropped}
+
+
+def test_it_is_noted_in_results_and_report(hostile: Path, tmp_path: Path) -> None:
+    road, out = {"horizon": 20, "cav_share": 0.5}, tmp_path / "out"
+    found = unjam.drive(str(hostile), ["human"], 1, road=road, workers=1, out=out)
+    (note,) = [each for each in found.notes if "left out" in each]
+    assert note.startswith(
+        "straight.sumocfg: left out, for they only write or listen: option tripinfo-output"
+    )
+    assert note in json.loads((out / "evaluation.json").read_text())["notes"]
+    assert "left out, for they only write or listen" in (out / "report.html").read_text()
 
 
 def test_harmless_files_are_read_themselves_and_nothing_is_told(

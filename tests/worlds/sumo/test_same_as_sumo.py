@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from unjam.drivers import Human
+from unjam.errors import InputError
 from unjam.scenarios import make_scenario
 from unjam.worlds.episode import run_episode
 from unjam.worlds.sumo.networks import sumo_program
@@ -242,3 +243,24 @@ def test_options_that_change_the_traffic_change_it_as_in_sumo(
     path = write(tmp_path / "changed", network, files, inside + option)
     speeds, seed = assert_same(path, simulation, monkeypatch)
     assert speeds != speeds_of_sumo(plain, seed)
+
+
+def test_a_changed_file_that_another_includes_is_copied_anew(
+    network: str, tmp_path: Path, simulation: Simulation, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    files, inside = FORMS["included files"]
+    path = write(tmp_path, network, files, inside)
+    before, _ = assert_same(path, simulation, monkeypatch)
+    (tmp_path / "deep/more/car.xml").write_text(TYPE.replace("/>", ' maxSpeed="3"/>'))
+    after, _ = assert_same(path, simulation, monkeypatch)
+    assert max(max(each.values(), default=0) for each in after.values()) <= 3 + 1e-6
+    assert before != after
+
+
+def test_an_episode_without_any_vehicle_is_no_result(
+    network: str, tmp_path: Path, simulation: Simulation
+) -> None:
+    files: Files = {"r.xml": f"<routes>{TYPE}{ROUTE}{FLOW.replace('90', '9')}</routes>"}
+    path = write(tmp_path, network, files, '<route-files value="r.xml"/><begin value="20"/>')
+    with pytest.raises(InputError, match="no vehicle entered in 1 decisions: see when and where"):
+        run_episode(make_scenario(str(path), {"cav_share": 0.3}), Human(), (0,), simulation=simulation)
