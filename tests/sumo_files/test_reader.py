@@ -101,6 +101,7 @@ def test_in_this_process_it_answers_the_same(tmp_path: Path, capsys: pytest.Capt
 
 INCLUDES = {
     "it is missing": ({"road.rou.xml": ["none.xml"]}, "none.xml': there is no such file"),
+    "a name that no file has": ({"road.rou.xml": ["a" * 5000]}, "': there is no such file"),
     "a folder": ({"road.rou.xml": ["."]}, "': there is no such file"),
     "itself": ({"road.rou.xml": ["road.rou.xml"]}, "road.rou.xml: includes itself"),
     "each other": ({"road.rou.xml": ["b.xml"], "b.xml": ["./road.rou.xml"]}, "road.rou.xml: includes itself"),

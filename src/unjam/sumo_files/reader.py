@@ -3,6 +3,7 @@
 It uses Python's own library alone: `program.py` runs it in a process of its own.
 """
 
+import os
 import zlib
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
@@ -47,7 +48,7 @@ class Broken(Exception):
 
 def check_exists(file: Path) -> None:
     """Raise `Broken` unless there is such a file."""
-    if not file.is_file():
+    if not os.path.isfile(file):  # also of names that no file can have
         raise Broken(f"{str(file)!r}: there is no such file")
 
 
@@ -87,11 +88,11 @@ class Reader:
 
     def read(self, path: Path) -> None:
         """Follow a file to its end; raise `Broken` where it has a document type, or is no XML."""
+        check_exists(path)
         if path.resolve() in [file.resolve() for file in self._files]:
             raise Broken(f"{path.name}: includes itself")
         if self._included > MOST_FILES:
             raise Broken(f"{self._files[0].name}: includes more than {MOST_FILES} files")
-        check_exists(path)
         self.sources.setdefault(path, stamp_of(path))
         self._files.append(path)
         parser = expat.ParserCreate()

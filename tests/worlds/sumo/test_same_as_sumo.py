@@ -262,5 +262,5 @@ def test_an_episode_without_any_vehicle_is_no_result(
 ) -> None:
     files: Files = {"r.xml": f"<routes>{TYPE}{ROUTE}{FLOW.replace('90', '9')}</routes>"}
     path = write(tmp_path, network, files, '<route-files value="r.xml"/><begin value="20"/>')
-    with pytest.raises(InputError, match="no vehicle entered in 1 decisions: see when and where"):
+    with pytest.raises(InputError, match="no vehicle entered in 0 decisions: see when and where"):
         run_episode(make_scenario(str(path), {"cav_share": 0.3}), Human(), (0,), simulation=simulation)
