@@ -87,8 +87,11 @@ def test_other_names_of_an_option_have_its_fate(options: dict[str, tuple[str, st
             "device.fcd-replay.files: 'd' is not allowed; allowed: no file",
         ),
         ('<phemlight-path value="mine"/>', "phemlight-path: 'mine' is not allowed; allowed: ./PHEMlight/"),
-        ('<laterl-resolution value="1"/>', "SUMO has no such option; did you mean 'lateral-resolution'?"),
-        ('<Begin value="1"/>', "Begin: SUMO has no such option; did you mean 'begin'?"),
+        (
+            '<laterl-resolution value="1"/>',
+            "SUMO 1.28 has no such option; did you mean 'lateral-resolution'?",
+        ),
+        ('<Begin value="1"/>', "Begin: SUMO 1.28 has no such option; did you mean 'begin'?"),
         ('<begin value="1"/><b value="1"/>', "b: is set twice"),
         ('<begin value="1" v="2"/>', "begin: is set twice"),
         ("<begin>1</begin>", "'1' is not allowed; allowed: <option value=\"...\"/>"),

@@ -163,6 +163,7 @@ def test_a_large_file_takes_no_memory_and_is_read_by_sumo_itself(
         ('<vehicle id="a" depart="triggered"/><trip id="b" depart="9"/>', None),
         ('<flow id="a" begin="1:00:00:00" end="90000"/>', 86400.0),
         ('<flow id="a"/>', 0.0),
+        ('<flow id="a" begin="9"/><person id="p" depart="1"/>', None),
     ],
 )
 def test_the_first_departure_is_known_unless_something_else_decides_it(

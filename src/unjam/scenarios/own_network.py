@@ -31,8 +31,8 @@ DRAWN = 100
 """calibrated people of an episode, drawn from the population"""
 WITH_OWN_ACC: dict[str, Any] = {"actuation": "cruise", "safety.active": False}
 """CAVs have an ACC that follows and makes room for who changes lanes; drivers hold it back"""
-MOST_NAMED = 8
-"""options and elements that a note names"""
+MOST_LOGGED, MOST_NOTED = 8, 200
+"""options and elements that a line of the log names, and a note"""
 LOG = logging.getLogger(__name__)
 
 
@@ -155,7 +155,7 @@ def own_network(file: str, changes: dict[str, Any]) -> OwnNetwork:
         InputError: one line on what is missing or broken, before SUMO starts.
     """
     files = read_sumo_files(Path(file).resolve())
-    _log_once(*notes_on_files(files))
+    _log_once(*notes_on_files(files, MOST_LOGGED))
     values = {"file": str(files.path), "simulation_step": files.step, **changes}
     made = build(OwnNetwork, values, Path(file).name)
     begin = files.begin if made.begin is None else made.begin
@@ -174,13 +174,13 @@ def own_network(file: str, changes: dict[str, Any]) -> OwnNetwork:
     return replace(made, horizon=max(1, int(driven / made.decision_step + 1e-9)))
 
 
-def notes_on_files(files: SumoFiles) -> list[str]:
+def notes_on_files(files: SumoFiles, most: int = MOST_NOTED) -> list[str]:
     """Return in which ways an episode is not what SUMO alone would make of the files, one line each."""
     ways = {
         "left out, for they only write or listen": files.dropped,
         "unjam has a value of its own for": files.replaced,
     }
-    return [f"{files.path.name}: {way}: {_shortened(names)}" for way, names in ways.items() if names]
+    return [f"{files.path.name}: {way}: {_shortened(names, most)}" for way, names in ways.items() if names]
 
 
 def notes_on_network(scenario: Scenario) -> list[str]:
@@ -188,9 +188,9 @@ def notes_on_network(scenario: Scenario) -> list[str]:
     return notes_on_files(read_sumo_files(Path(scenario.file))) if isinstance(scenario, OwnNetwork) else []
 
 
-def _shortened(names: Sequence[str]) -> str:
-    more = f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
-    return ", ".join(name[:60] for name in names[:MOST_NAMED]) + more
+def _shortened(names: Sequence[str], most: int) -> str:
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return ", ".join(name[:60] for name in names[:most]) + more
 
 
 @cache

@@ -166,7 +166,7 @@ def kind_of_option(
         return "not written"
     if name not in REFUSED:
         known = [*PASSED, *OTHERWISE, *REPLACED, *REFUSED]
-        raise InputError(f"{file}: {name}: SUMO has no such option{did_you_mean(name, known)}")
+        raise InputError(f"{file}: {name}: SUMO 1.28 has no such option{did_you_mean(name, known)}")
     if value == REFUSED[name].partition(",")[0]:  # as in a configuration that lists all defaults
         return "ignored"
     raise wrong(f"{file}: {name}", value, REFUSED[name])

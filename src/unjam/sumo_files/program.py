@@ -216,12 +216,16 @@ class _Demand:
         """Return what to call with the attributes of an element, by its name."""
         vehicles = {tag: partial(self._note_vehicle, depart) for tag, depart in DEMAND.items()}
         types = {"vType": self._note_type, "vTypeDistribution": self._note_mixture}
-        return {**vehicles, **types, "/vTypeDistribution": self._end_mixture}
+        persons = dict.fromkeys(("person", "personFlow"), self._note_person)
+        return {**vehicles, **types, **persons, "/vTypeDistribution": self._end_mixture}
 
     def _note_vehicle(self, depart: str, attributes: Attributes) -> None:
         self.wanted.add(attributes.get("type", DEFAULT_TYPE))
         if self.first is not None:
             self._note_departure(attributes.get(depart, ""))
+
+    def _note_person(self, attributes: Attributes) -> None:
+        self.first = None  # persons may take a car of their own
 
     def _note_type(self, attributes: Attributes) -> None:
         name = attributes.get("refId") or attributes.get("id", "")

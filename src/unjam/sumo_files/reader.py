@@ -72,6 +72,8 @@ class Reader:
         self._write = out.write if out else None
         self._within = 0
         """open elements within one that was dropped, itself included"""
+        self._in_mixture = False
+        """whether a distribution of types is open"""
         self._names: dict[str, str] = {}
         """other names by which elements are written"""
         self._plain: set[str] = set()
@@ -153,6 +155,7 @@ class Reader:
             self._drop_content()
             return
         if tag == "vTypeDistribution":
+            self._in_mixture = True
             self._parsers[-1].EndElementHandler = self._ended
         elif tag == "vType":
             kept |= self._types.get(kept.get("id", ""), {})
@@ -174,10 +177,11 @@ class Reader:
             self._within -= 1
         else:
             self._write_end(tag)
+            self._in_mixture &= tag != "vTypeDistribution"
             if (note := self._notes.get(f"/{tag}")) is not None:
                 note({})
         # Where nothing is written a call for each element would only take time.
-        if self._write is None and not self._within:
+        if self._write is None and not self._within and not self._in_mixture:
             self._parsers[-1].EndElementHandler = None
 
     def _text(self, text: str) -> None:
