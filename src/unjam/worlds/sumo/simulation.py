@@ -169,8 +169,7 @@ class Simulation:
         if path not in files.to_copy:
             return str(path)
         before, copy = self._copies.get(path, ([], Path(self._folder.name) / f"{len(self._copies)}.xml"))
-        stamps = list(map(stamp_of, files.to_copy[path]))
-        if stamps != before:
+        if (stamps := list(map(stamp_of, files.to_copy[path]))) != before:
             self._copies[path] = [], copy
             copy_harmless(path, copy)
             self._copies[path] = stamps, copy
