@@ -11,8 +11,9 @@ from tests.worlds.sumo.own_roads import straight
 from unjam.drivers import Human
 from unjam.errors import InputError
 from unjam.scenarios import make_scenario, scenario_from_recipe, scenario_recipe
-from unjam.scenarios.own_network import OwnNetwork, own_network
+from unjam.scenarios.own_network import OwnNetwork, notes_on_network, own_network, passenger_types
 from unjam.scenarios.road import OwnRoad
+from unjam.sumo_files import read_sumo_files
 from unjam.worlds.episode import run_episode
 from unjam.worlds.sumo.files import files_of
 from unjam.worlds.sumo.simulation import Simulation
@@ -176,3 +177,39 @@ def test_a_type_that_sumo_has_by_itself_may_be_a_cav(tmp_path: Path) -> None:
     types = ElementTree.fromstring(files_of(own(tmp_path), road).traffic)
     (bike,) = [kind for kind in types if kind.get("id") == "cav_of_DEFAULT_BIKETYPE"]
     assert bike.get("vClass") == "bicycle"
+
+
+@pytest.mark.parametrize(
+    "attributes", ['vClass="rail_urban"', 'vClass="ship"', 'vClass="aircraft"', 'carFollowModel="Rail"']
+)
+def test_trains_ships_and_aircraft_never_become_cavs(attributes: str, tmp_path: Path) -> None:
+    routes = (
+        f'<routes><vType id="train" {attributes}/><vType id="car"/>{{}}<trip id="t" type="train"/></routes>'
+    )
+    with pytest.raises(InputError, match="cav_types: 'train' is not allowed, for it is no type of road"):
+        own(tmp_path, routes=routes.format(""), cav_types=("train",))
+    with pytest.raises(InputError, match="cav_share: no vehicle is a car"):
+        own(tmp_path, routes=routes.format(""), cav_share=1.0)
+    found = own(tmp_path, routes=routes.format('<trip id="c" type="car"/>'), cav_share=1.0)
+    files = read_sumo_files(tmp_path / "road.sumocfg")
+    assert found.draw(np.random.default_rng(0)).cars == {"car", "DEFAULT_VEHTYPE"}
+    assert passenger_types(files) == ["car"]
+
+
+@pytest.mark.parametrize("changes", [{}, {"end": 900.0}, {"horizon": 300, "warmup": 30}])
+def test_demand_that_begins_after_the_end_is_refused(changes: dict[str, Any], tmp_path: Path) -> None:
+    routes = '<routes><flow id="f" begin="7:00:00"/></routes>'
+    path = configuration(tmp_path, '<end value="300"/>', routes=routes)
+    words = "no vehicle departs before the end, .* s; the first departs at 25,200 s; use --begin 25200 --end"
+    with pytest.raises(InputError, match=words):
+        make_scenario(str(path), {"cav_share": 0.5, **changes})
+    assert make_scenario(str(path), {"cav_share": 0.5, "begin": 25200.0, "end": 25300.0}).horizon == 100
+
+
+def test_what_differs_from_sumo_alone_is_noted(tmp_path: Path) -> None:
+    inside = '<seed value="7"/><max-depart-delay value="9"/><fcd-output value="x"/><tripinfo value="y"/>'
+    assert notes_on_network(own(tmp_path, inside)) == [
+        "road.sumocfg: left out, for they only write or listen: option fcd-output, option tripinfo",
+        "road.sumocfg: unjam has a value of its own for: seed, max-depart-delay",
+    ]
+    assert notes_on_network(make_scenario("ring")) == []

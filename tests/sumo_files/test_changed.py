@@ -66,3 +66,16 @@ def test_a_file_that_has_broken_since_is_told(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"road\.rou\.xml: cannot be read"):
         write_changed(files, {}, 1.0, tmp_path / "other.sumocfg")
     assert not (tmp_path / "other.sumocfg").exists()
+
+
+def test_included_types_are_changed_too_and_weights_of_edges_are_kept(tmp_path: Path) -> None:
+    mine, new = tmp_path / "mine", tmp_path / "new"
+    mine.mkdir()
+    new.mkdir()
+    (mine / "types.xml").write_text('<routes><vType id="car" tau="1"/></routes>')
+    (mine / "w.xml").write_text('<m><edge id="a" traveltime="9"/></m>')
+    routes = '<routes><include href="types.xml"/><vehicle id="v" type="car"/></routes>'
+    files = read_sumo_files(configuration(mine, '<w value="w.xml"/>', routes=routes))
+    found = read_sumo_files(write_changed(files, {"car": {"tau": "1.5"}}, 1.0, new / "other.sumocfg"))
+    assert found.types["car"] == {"id": "car", "tau": "1.5"}
+    assert [path.read_text() for path in found.weight_files] == ['<m><edge id="a" traveltime="9"></edge></m>']

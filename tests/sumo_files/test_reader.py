@@ -5,14 +5,15 @@ import json
 import subprocess
 import sys
 from pathlib import Path
+from xml.etree import ElementTree
 
 import pytest
 
 from tests.sumo_files.test_sumo_files import NETWORK, ROUTES, configuration
 from unjam import sandbox, sumo_files
 from unjam.errors import InputError
+from unjam.sumo_files import copy_harmless, read_lanes, read_sumo_files
 from unjam.sumo_files import program as reader
-from unjam.sumo_files import read_lanes, read_sumo_files
 
 LAUGHS = "".join(f'<!ENTITY l{n} "{f"&l{n - 1};" * 10 if n else "lol"}">' for n in range(10))
 DEFINITIONS = {
@@ -49,11 +50,10 @@ def test_what_unpacks_to_too_much_is_refused_and_takes_no_memory_here(
 ) -> None:
     monkeypatch.setattr(sumo_files, "LARGEST_MEMORY", 150 * 2**20)
     path = configuration(tmp_path)
-    line = b"a" * 1000 + b"\n"
-    bomb = b"<routes>" + line * 200_000 + b"</routes>"
+    bomb = b'<routes name="' + b"a" * 200_000_000 + b'"/>'
     (tmp_path / "road.rou.xml.gz").write_bytes(gzip.compress(bomb, 1))
     path.write_text(path.read_text().replace("road.rou.xml", "road.rou.xml.gz"))
-    assert refused(path) == "road.sumocfg: its files are too large to be read"
+    assert "road.rou.xml.gz: cannot be read: out of memory" in refused(path)
 
 
 def test_what_takes_too_long_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -96,4 +96,77 @@ def test_in_this_process_it_answers_the_same(tmp_path: Path, capsys: pytest.Capt
     reader.main("configuration", str(path))
     assert json.loads(capsys.readouterr().out)["found"]["network"] == str(tmp_path / "road.net.xml")
     reader.main("lanes", str(tmp_path / "none"))
-    assert "cannot be read" in json.loads(capsys.readouterr().out)["broken"]
+    assert "there is no such file" in json.loads(capsys.readouterr().out)["broken"]
+
+
+INCLUDES = {
+    "it is missing": ({"road.rou.xml": ["none.xml"]}, "none.xml': there is no such file"),
+    "a name that no file has": ({"road.rou.xml": ["a" * 5000]}, "': there is no such file"),
+    "a folder": ({"road.rou.xml": ["."]}, "': there is no such file"),
+    "itself": ({"road.rou.xml": ["road.rou.xml"]}, "road.rou.xml: includes itself"),
+    "each other": ({"road.rou.xml": ["b.xml"], "b.xml": ["./road.rou.xml"]}, "road.rou.xml: includes itself"),
+    "what is no XML": ({"road.rou.xml": ["b.xml"], "b.xml": None}, "b.xml: cannot be read: no element found"),
+    "more and more": (
+        {"road.rou.xml": ["1.xml"] * 9}
+        | {f"{n}.xml": [f"{n + 1}.xml"] * 9 for n in range(1, 9)}
+        | {"9.xml": []},
+        ".xml: includes more than 1000 files",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", INCLUDES)
+def test_included_files_that_harm_are_refused(name: str, tmp_path: Path) -> None:
+    files, words = INCLUDES[name]
+    path = configuration(tmp_path)
+    for file, included in files.items():
+        inside = "".join(f'<include href="{other}"/>' for other in included or ())
+        (tmp_path / file).write_text("" if included is None else f"<routes>{inside}</routes>")
+    assert words in refused(path)
+
+
+def test_included_files_count_wherever_they_are_included(tmp_path: Path) -> None:
+    (tmp_path / "deep").mkdir()
+    (tmp_path / "deep" / "types.xml").write_text(
+        '<routes><vType id="a"/><edgeData id="e" file="x"/><include href="more.xml"/></routes>'
+    )
+    (tmp_path / "deep" / "more.xml").write_text('<x><vehicle id="w" type="a"/></x>')
+    mixture = '<vTypeDistribution id="m"><include href="deep/types.xml"/></vTypeDistribution>'
+    path = configuration(tmp_path, routes=f'<routes>{mixture}<flow id="f" type="m"/></routes>')
+    found = read_sumo_files(path)
+    routes, types, more = (tmp_path / name for name in ("road.rou.xml", "deep/types.xml", "deep/more.xml"))
+    assert found.used_types == {"a"}
+    assert found.dropped == ("edgeData",)
+    assert found.to_copy == {routes: (routes, types, more)}
+    assert found.sources == (path, tmp_path / "road.net.xml", routes, more, types)
+    more.write_text('<x><vehicle id="w" type="b"/></x>')
+    assert read_sumo_files(path).used_types == {"a", "b"}
+    copy_harmless(routes, tmp_path / "copy.xml")
+    (copied,) = ElementTree.parse(tmp_path / "copy.xml").iter("vTypeDistribution")
+    assert [each.tag for each in copied.iter()][1:] == ["routes", "vType", "x", "vehicle"]
+
+
+@pytest.mark.long
+def test_a_large_file_takes_no_memory_and_is_read_by_sumo_itself(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sumo_files, "LARGEST_MEMORY", 100 * 2**20)
+    vehicle = '<vehicle id="v" type="car" depart="7.5" departLane="best"><route edges="a b"/></vehicle>\n'
+    found = read_sumo_files(configuration(tmp_path, routes=f"<routes>{vehicle * 300_000}</routes>"))
+    assert (found.used_types, found.to_copy, found.first_departure) == ({"car"}, {}, 7.5)
+
+
+@pytest.mark.parametrize(
+    ("routes", "first"),
+    [
+        ('<vehicle id="a" depart="20"/><trip id="b" depart="0:00:09"/><flow id="c" begin="12"/>', 9.0),
+        ('<vehicle id="a" depart="triggered"/><trip id="b" depart="9"/>', None),
+        ('<flow id="a" begin="1:00:00:00" end="90000"/>', 86400.0),
+        ('<flow id="a"/>', 0.0),
+        ('<flow id="a" begin="9"/><person id="p" depart="1"/>', None),
+    ],
+)
+def test_the_first_departure_is_known_unless_something_else_decides_it(
+    routes: str, first: float | None, tmp_path: Path
+) -> None:
+    assert read_sumo_files(configuration(tmp_path, routes=f"<x>{routes}</x>")).first_departure == first

@@ -98,7 +98,7 @@ def test_minus_one_is_no_end(tmp_path: Path) -> None:
     ("option", "text"),
     [
         *(("end", text) for text in ("noon", "nan", "inf", "-5", "90:00", "1:2:3:4:5")),
-        *(("begin", text) for text in ("", "1:xx:0", "nan", "-1")),
+        *(("begin", text) for text in ("1:xx:0", "nan", "-1")),
         *(("step-length", text) for text in ("0", "nan", "fast", "-1")),
     ],
 )
@@ -128,9 +128,22 @@ def test_of_a_distribution_its_types_are_used(tmp_path: Path) -> None:
     found = types_of(
         tmp_path,
         '<vType id="c"/><vTypeDistribution id="inside"><vType id="a"/><vType id="b"/></vTypeDistribution>'
-        '<vTypeDistribution id="named" vTypes="b c"/><flow id="1" type="inside"/><flow id="2" type="named"/>',
+        '<vTypeDistribution id="named" vTypes="b c"/><vType id="d"/>'
+        '<flow id="1" type="inside"/><flow id="2" type="named"/>',
     )
     assert found.used_types == {"a", "b", "c"}
+    assert set(found.types) == {"a", "b", "c", "d", "DEFAULT_VEHTYPE"}
+
+
+def test_a_distribution_may_name_types_of_elsewhere_and_other_distributions(tmp_path: Path) -> None:
+    found = types_of(
+        tmp_path,
+        '<vType id="c"/><vTypeDistribution id="m"><vType refId="c" probability="1"/><vType id="a">'
+        '<param key="k"/></vType></vTypeDistribution><vType id="never"/>'
+        '<vTypeDistribution id="all" vTypes="m"/>'
+        '<flow id="1" type="all"/><vType id="last"/>',
+    )
+    assert found.used_types == {"a", "c"}
 
 
 def test_distributions_of_one_file_serve_the_vehicles_of_another(tmp_path: Path) -> None:

@@ -153,6 +153,12 @@ def hash_of(part: bytes) -> str:
     return hashlib.sha256(part).hexdigest()
 
 
+def hash_of_file(path: Path) -> str:
+    """Return the SHA-256 of a file, of which never more than a block is in memory."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
 def _check_hashes(name: str, hashes: dict[str, str], parts: dict[str, bytes]) -> None:
     """Raise `InputError` unless the manifest names the hash of every other part, and of nothing else.
 

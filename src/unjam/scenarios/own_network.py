@@ -1,6 +1,7 @@
 """The user's own road: any SUMO network with its traffic, some of whose vehicles become CAVs."""
 
 import logging
+from collections.abc import Sequence
 from dataclasses import field, replace
 from functools import cache
 from pathlib import Path
@@ -19,6 +20,9 @@ from unjam.sumo_files import SumoFiles, read_sumo_files
 
 LONGEST = 3600.0
 """seconds of an episode where the configuration names no end"""
+OFF_THE_ROAD = ("rail", "rail_urban", "rail_electric", "rail_fast", "tram", "subway", "cable_car")
+OFF_THE_ROAD += ("ship", "aircraft", "drone", "pedestrian", "wheelchair", "container")
+"""SUMO's vehicle classes that no driver of cars drives"""
 CARS = ("passenger", "private", "hov", "taxi", "evehicle", "delivery", "truck", "trailer", "bus", "coach")
 """SUMO's vehicle classes that a share picks from"""
 PASSENGER = "passenger"
@@ -27,8 +31,8 @@ DRAWN = 100
 """calibrated people of an episode, drawn from the population"""
 WITH_OWN_ACC: dict[str, Any] = {"actuation": "cruise", "safety.active": False}
 """CAVs have an ACC that follows and makes room for who changes lanes; drivers hold it back"""
-MOST_NAMED = 8
-"""things of the files that are not used, in the line that tells of them"""
+MOST_LOGGED, MOST_NOTED = 8, 200
+"""options and elements that a line of the log names, and a note"""
 LOG = logging.getLogger(__name__)
 
 
@@ -74,6 +78,8 @@ class OwnNetwork(Scenario):
         for name in self.cav_types:
             if name not in files.used_types:
                 raise ValueError(f"cav_types: no vehicle has the type {name!r}; allowed: {known}")
+            if not is_on_the_road(files.types.get(name, {})):
+                raise ValueError(f"cav_types: {name!r} is not allowed, for it is no type of road vehicles")
         if not self.cav_types:
             if self.cav_share == 0:
                 raise ValueError(
@@ -149,34 +155,62 @@ def own_network(file: str, changes: dict[str, Any]) -> OwnNetwork:
         InputError: one line on what is missing or broken, before SUMO starts.
     """
     files = read_sumo_files(Path(file).resolve())
-    if files.dropped:
-        _tell_dropped(files.path.name, files.dropped)
+    _log_once(*notes_on_files(files, MOST_LOGGED))
     values = {"file": str(files.path), "simulation_step": files.step, **changes}
     made = build(OwnNetwork, values, Path(file).name)
+    begin = files.begin if made.begin is None else made.begin
+    warmup = made.warmup * made.simulation_step
+    end = made.end or (begin + LONGEST if files.end is None else files.end)
+    if "horizon" in changes:
+        end = begin + warmup + made.horizon * made.decision_step
+    if files.first_departure is not None and (first := files.first_departure) >= end:
+        when = f"the first departs at {first:,g} s; use --begin {first:.0f} --end {first + LONGEST:.0f}"
+        raise InputError(f"{files.path.name}: no vehicle departs before the end, {end:,g} s; {when}")
     if "horizon" in changes:
         return made
-    begin = files.begin if made.begin is None else made.begin
-    end = made.end or (begin + LONGEST if files.end is None else files.end)
-    driven = end - begin - made.warmup * made.simulation_step
+    driven = end - begin - warmup
     if driven <= 0:
         raise wrong("end", end, f"after begin, {begin:g} s" + (" and the warm-up" if made.warmup else ""))
     return replace(made, horizon=max(1, int(driven / made.decision_step + 1e-9)))
 
 
+def notes_on_files(files: SumoFiles, most: int = MOST_NOTED) -> list[str]:
+    """Return in which ways an episode is not what SUMO alone would make of the files, one line each."""
+    ways = {
+        "left out, for they only write or listen": files.dropped,
+        "unjam has a value of its own for": files.replaced,
+    }
+    return [f"{files.path.name}: {way}: {_shortened(names, most)}" for way, names in ways.items() if names]
+
+
+def notes_on_network(scenario: Scenario) -> list[str]:
+    """Return the notes on the files of a network of the user's own; of other scenarios none."""
+    return notes_on_files(read_sumo_files(Path(scenario.file))) if isinstance(scenario, OwnNetwork) else []
+
+
+def _shortened(names: Sequence[str], most: int) -> str:
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return ", ".join(name[:60] for name in names[:most]) + more
+
+
 @cache
-def _tell_dropped(file: str, dropped: tuple[str, ...]) -> None:
-    """Tell once, in one line, what of the files SUMO is not given."""
-    names = ", ".join(name[:60] for name in dropped[:MOST_NAMED])
-    more = f" and {len(dropped) - MOST_NAMED} more" if len(dropped) > MOST_NAMED else ""
-    LOG.warning("%s: left out, so that SUMO only simulates: %s%s", file, names, more)
+def _log_once(*notes: str) -> None:
+    for note in notes:
+        LOG.warning("%s", note)
 
 
 def passenger_types(files: SumoFiles) -> list[str]:
     """Return the types of passenger cars that vehicles have; SUMO's default class is that one."""
     classes = {name: files.types.get(name, {}).get("vClass", PASSENGER) for name in files.used_types}
-    return sorted(name for name, kind in classes.items() if kind == PASSENGER)
+    on_roads = {name for name in classes if is_on_the_road(files.types.get(name, {}))}
+    return sorted(name for name, kind in classes.items() if kind == PASSENGER and name in on_roads)
 
 
 def is_car(attributes: dict[str, str]) -> bool:
     """Return whether a share may pick vehicles of a type; SUMO's default class is a passenger car."""
-    return attributes.get("vClass", "passenger") in CARS
+    return attributes.get("vClass", PASSENGER) in CARS and is_on_the_road(attributes)
+
+
+def is_on_the_road(attributes: dict[str, str]) -> bool:
+    """Return whether vehicles of a type drive on roads: trains, ships, aircraft and pedestrians do not."""
+    return attributes.get("vClass") not in OFF_THE_ROAD and attributes.get("carFollowModel") != "Rail"

@@ -6,13 +6,15 @@ listen, is never passed on to it: see `copy_harmless`.
 """
 
 import json
+import re
 import subprocess
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 from unjam import sandbox
 from unjam.children import child_environment, python_command
-from unjam.errors import InputError
+from unjam.errors import InputError, did_you_mean, wrong
+from unjam.sumo_files.reader import stamp_of
 
 PROGRAM = Path(__file__).with_name("program.py")
 LARGEST_MEMORY = 4 * 2**30
@@ -32,6 +34,7 @@ PASSED = {
     *("random-depart-offset", "waiting-time-memory", "startup-wait-threshold", "slope-centered"),
     *("time-to-impatience", "pedestrian.model", "pedestrian.timegap-crossing", "mesosim"),
     *("use-stop-ended", "use-stop-started", "routing-algorithm", "replay-rerouting", "time-to-teleport"),
+    *("thread-rngs", "phemlight-year", "phemlight-temperature"),
 }
 """options that only say how to simulate"""
 PASSED_GROUPS = (
@@ -39,17 +42,41 @@ PASSED_GROUPS = (
     *("overhead-wire.", "emergencydecel.", "parking.", "pedestrian.striping.", "ride.", "mapmatch."),
     *("weights.", "persontrip.", "railway.", "device.rerouting.", "person-device.rerouting."),
     *("device.driverstate.", "device.bluelight.", "device.glosa.", "device.toc.", "device.taxi."),
-    *("device.emissions.", "device.battery.", "device.friction.", "meso-"),
+    *("device.emissions.", "device.battery.", "device.friction.", "device.stationfinder."),
+    *("device.elechybrid.", "pedestrian.jupedsim.", "meso-"),
 )
 """what the names of others of them begin with"""
 OTHERWISE = {
-    *("seed", "step-length", "collision.action", "collision.mingap-factor", "collision.check-junctions"),
+    *("step-length", "collision.action", "collision.mingap-factor", "collision.check-junctions"),
     *("no-step-log", "no-warnings", "duration-log.disable", "duration-log.statistics", "verbose", "start"),
     *("xml-validation", "xml-validation.net", "xml-validation.routes", "gui-settings-file", "quit-on-end"),
     *("delay", "precision", "step-log.period", "print-options", "human-readable-time", "registry-viewport"),
+    *("aggregate-warnings", "language", "log.timestamps", "log.processid", "help", "version", "threads"),
+    *("device.rerouting.threads", "emissions.volumetric-fuel", "load-state.offset"),
+    *("load-state.remove-vehicles", "configuration-file", "configuration", "c", "game", "game.mode"),
+    *("breakpoints", "edgedata-files", "data-files", "alternative-net-file", "selection-file", "demo"),
+    *("disable-textures", "window-size", "window-pos", "tracker-interval", "gui-testing"),
+    *("gui-testing-debug", "suppress-warnings", "no-duration-log", *"vtgdHWXVQGSDTBmN?"),
 }
 """options that unjam decides itself, or that change nothing: of no interest where they are left out"""
-FILED = ("file", "output", "threads")
+REPLACED = ("seed", "random", "max-depart-delay")
+"""options that change the traffic, and for which unjam has a value of its own"""
+NOT_WRITTEN = re.compile(
+    r"output|^(write-|save-|netstate|ndump|dump-|summary$|tripinfo$|personinfo$|vehroutes|personroutes$)"
+    r"|^(log|log-file|message-log|error-log|precision\.geo|person-fcd|remote-port|num-clients|l|C)$"
+    r"|^(person-)?device\.(fcd|ssm|tripinfo|vehroute|btsender|btreceiver|example)\."
+    r"|^device\.toc\.file$|^device\.fcd-replay\.(?!files)|^pedestrian\.jupedsim\.(wkt|py)"
+)
+"""options about what SUMO writes, and where it listens: without them the traffic is the same"""
+REFUSED = {
+    "load-state": "no file, as episodes begin on an empty road; begin earlier, with --set warmup=600",
+    "astar.all-distances": "no file, as unjam cannot check what is in it",
+    "astar.landmark-distances": "no file, as unjam cannot check what is in it",
+    "device.fcd-replay.files": "no file, as unjam cannot check what is in it",
+    "phemlight-path": "./PHEMlight/, SUMO's default",
+}
+"""options that change what is simulated, and that SUMO cannot be told; with what is allowed instead"""
+FILED = ("file", "output", "threads", ".wkt", ".py")
 """what is in the names of options that belong to these groups and are harmful all the same"""
 
 
@@ -60,18 +87,26 @@ class SumoFiles(NamedTuple):
     network: Path
     additional_files: tuple[Path, ...]
     route_files: tuple[Path, ...]
+    weight_files: tuple[Path, ...]
+    """travel times of edges, for vehicles that choose their route"""
+    sources: tuple[Path, ...]
+    """all files that were read: this one, those that it names, and those that they include"""
     begin: float
     """[s]"""
     end: float | None
     """[s]; None: when the last vehicle has arrived"""
+    first_departure: float | None
+    """when the first vehicle departs at the earliest [s]; None where that cannot be told"""
     step: float
     """[s]"""
     options: dict[str, str]
     """what else SUMO may be told of it, by name: harmless ways of simulating"""
     dropped: tuple[str, ...]
-    """what it is not told: options and elements that write, listen, or read other files"""
-    to_copy: frozenset[Path]
-    """files that SUMO gets a harmless copy of; it reads the others themselves"""
+    """options and elements that are left out: they only write or listen"""
+    replaced: tuple[str, ...]
+    """options that change the traffic, and for which unjam has a value of its own"""
+    to_copy: dict[Path, tuple[Path, ...]]
+    """files that SUMO gets a harmless copy of, and what the copy is made from; it reads others themselves"""
     types: dict[str, dict[str, str]]
     """attributes of all vehicle types, by id"""
     used_types: frozenset[str]
@@ -95,16 +130,46 @@ def read_sumo_files(path: Path) -> SumoFiles:
             return files
     found = _ask("configuration", path)
     stamps = {Path(file): (time, size) for file, (time, size) in found.pop("stamps").items()}
-    found["network"] = Path(found["network"])
-    for name, kind in {"additional_files": tuple, "route_files": tuple, "to_copy": frozenset}.items():
-        found[name] = kind(map(Path, found[name]))
+    found["network"], found["sources"] = Path(found["network"]), tuple(stamps)
+    for name in ("additional_files", "route_files", "weight_files"):
+        found[name] = tuple(map(Path, found[name]))
+    found["to_copy"] = {Path(file): tuple(map(Path, made)) for file, made in found["to_copy"].items()}
     found["used_types"] = frozenset(found["used_types"])
-    options = found["options"]
-    found["options"] = {name: value for name, value in options.items() if is_passed(name)}
-    found["dropped"] = (*(f"option {name}" for name in options if is_missed(name)), *found["dropped"])
+    options: dict[str, str] = found["options"]
+    kinds = {name: kind_of_option(path.name, name, value) for name, value in options.items()}
+    found["options"] = {name: value for name, value in options.items() if kinds[name] == "passed"}
+    found["dropped"] = (
+        *(f"option {name}" for name in options if kinds[name] == "not written"),
+        *found["dropped"],
+    )
+    found["replaced"] = tuple(name for name in options if kinds[name] == "replaced")
     files = SumoFiles(path, **found)
     _known[path] = stamps, files
     return files
+
+
+def kind_of_option(
+    file: str, name: str, value: str
+) -> Literal["passed", "ignored", "replaced", "not written"]:
+    """Return what becomes of an option of a configuration.
+
+    Raises:
+        InputError: SUMO has no such option, or it changes the traffic and cannot be passed on.
+    """
+    if is_passed(name):
+        return "passed"
+    if name in OTHERWISE:
+        return "ignored"
+    if name in REPLACED:
+        return "replaced"
+    if NOT_WRITTEN.search(name):
+        return "not written"
+    if name not in REFUSED:
+        known = [*PASSED, *OTHERWISE, *REPLACED, *REFUSED]
+        raise InputError(f"{file}: {name}: SUMO 1.28 has no such option{did_you_mean(name, known)}")
+    if value == REFUSED[name].partition(",")[0]:  # as in a configuration that lists all defaults
+        return "ignored"
+    raise wrong(f"{file}: {name}", value, REFUSED[name])
 
 
 def read_lanes(path: Path) -> list[Lane]:
@@ -126,12 +191,6 @@ def copy_harmless(path: Path, copy: Path, types: Path | None = None) -> None:
         InputError: it is broken, or too large.
     """
     _ask("copy", path, copy, *([types] if types else []))
-
-
-def stamp_of(file: Path) -> tuple[int, int]:
-    """Return time of change and size of a file: another content has another stamp."""
-    found = file.stat()
-    return found.st_mtime_ns, found.st_size
 
 
 def _ask(command: Literal["configuration", "lanes", "copy"], path: Path, *more: Path) -> Any:
@@ -158,8 +217,3 @@ def _ask(command: Literal["configuration", "lanes", "copy"], path: Path, *more: 
 def is_passed(name: str) -> bool:
     """Return whether SUMO may be told an option: it only says how to simulate."""
     return name in PASSED or (name.startswith(PASSED_GROUPS) and not any(word in name for word in FILED))
-
-
-def is_missed(name: str) -> bool:
-    """Return whether it matters that SUMO is not told an option."""
-    return not is_passed(name) and name not in OTHERWISE

@@ -35,7 +35,7 @@ def write_changed(files: SumoFiles, types: Types, scale: float, path: Path) -> P
         scaled = float(before) * scale
     except ValueError:
         raise wrong(f"{files.path.name}: scale", before, "a number") from None
-    names: dict[str, list[str]] = {"additional-files": [], "route-files": []}
+    names: dict[str, list[str]] = {"additional-files": [], "route-files": [], "weight-files": []}
     undefined = {name: types[name] for name in types if "id" not in files.types[name]}
     if undefined:  # SUMO's default type may be defined before any vehicle has it
         inside = "".join(
@@ -49,6 +49,7 @@ def write_changed(files: SumoFiles, types: Types, scale: float, path: Path) -> P
         for option, kind, originals in (
             ("additional-files", "add", files.additional_files),
             ("route-files", "rou", files.route_files),
+            ("weight-files", "weights", files.weight_files),
         ):
             for number, original in enumerate(originals):
                 names[option].append(f"{number}.{kind}.xml")

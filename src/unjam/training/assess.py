@@ -18,7 +18,7 @@ from unjam.measures.effect import Judged, headline, recommended, shown_beside
 from unjam.measures.statistics import estimate_of
 from unjam.reports.assessment import ASSESSMENT_FILE, ASSESSMENT_PAGE, write_assessment
 from unjam.scenarios import NAMED_BEFORE, make_scenario, scenario_recipe
-from unjam.scenarios.own_network import WITH_OWN_ACC
+from unjam.scenarios.own_network import WITH_OWN_ACC, notes_on_network
 from unjam.scenarios.scenario import Scenario
 from unjam.training.choice import (
     PEOPLE,
@@ -194,6 +194,7 @@ def assess(
     notes = notes_on_teleports(
         {each.label: found for each, found in (rows if judged else choice.rows).items()}
     )
+    notes += notes_on_network(asked.road)
     document = {**about, **_document(asked, choice, rows, judged, chose, budget), "notes": notes}
     save_evaluation(folder / CHOOSING, Evaluation(tried, {}), about)
     save_evaluation(folder, Evaluation({each.label: found for each, found in rows.items()}, shown), about)

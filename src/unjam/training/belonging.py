@@ -7,7 +7,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from unjam.controller.file import hash_of
+from unjam.controller.file import hash_of, hash_of_file
 from unjam.drivers.from_file import FileReference, is_file_reference
 from unjam.drivers.registry import recipe_of
 from unjam.errors import InputError, wrong
@@ -75,9 +75,8 @@ def hashes_of_files(names: Iterable[str], *scenarios: Scenario) -> dict[str, str
     paths = list[Path]()
     for scenario in scenarios:
         if isinstance(scenario, OwnNetwork):
-            own = read_sumo_files(Path(scenario.file))
-            paths += [own.path, own.network, *own.additional_files, *own.route_files]
+            paths += read_sumo_files(Path(scenario.file)).sources
         if scenario.population:
             paths.append(population_file(scenario.population))
     hashes = {str(code.path): code.sha256 for code in codes}
-    return hashes | {str(path): hash_of(path.read_bytes()) for path in paths}
+    return hashes | {str(path): hash_of_file(path) for path in paths}

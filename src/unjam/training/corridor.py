@@ -6,7 +6,7 @@ from math import inf
 from pathlib import Path
 from typing import Any
 
-from unjam.controller.file import hash_of
+from unjam.controller.file import hash_of_file
 from unjam.errors import InputError, did_you_mean, wrong, wrong_name
 from unjam.measures.detectors import Measurement, read_detectors
 from unjam.scenarios.own_network import OwnNetwork, own_network, passenger_types
@@ -62,11 +62,12 @@ class Corridor:
     def about(self) -> dict[str, Any]:
         """Return what a calibration is about: names and hashes of the files, and what is measured when."""
         files = self.files
-        named = [self.detectors, files.path, files.network, *files.additional_files, *files.route_files]
         return {
             "scenario": files.path.name,
             "detectors": self.detectors.name,
-            "files": [{"name": path.name, "sha256": hash_of(path.read_bytes())} for path in named],
+            "files": [
+                {"name": path.name, "sha256": hash_of_file(path)} for path in (self.detectors, *files.sources)
+            ],
             "begin": self.begin,
             "end": self.end,
             "intervals": {"used": len(self.measured), "left_out": self.left_out},

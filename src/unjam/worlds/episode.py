@@ -119,7 +119,11 @@ def check_can_see(features: Sequence[str], scenario: Scenario, where: str) -> No
 
 
 def check_cavs_drove(episode: Episode, driver: Driver) -> None:
-    """Raise `NoCavError` where a driver had nobody to drive."""
+    """Raise `NoCavError` where a driver had no CAV, and `InputError` where no vehicle entered at all."""
+    if not episode.vehicle_ids:
+        raise InputError(
+            f"no vehicle entered in {episode.steps} decisions: see when and where vehicles depart"
+        )
     if not episode.cav_ids and not driver.native:
         raise NoCavError(f"no CAV was on the road in {episode.steps} decisions: let more vehicles be CAVs")
 

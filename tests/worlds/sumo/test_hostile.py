@@ -1,6 +1,7 @@
 """Files of others that want SUMO to write, to listen or to read elsewhere: it simulates, and nothing more."""
 
 import gzip
+import json
 import os
 import re
 import subprocess
@@ -11,11 +12,12 @@ import numpy as np
 import psutil
 import pytest
 
+import unjam
 from tests.worlds.sumo.own_roads import game, straight
 from tests.worlds.test_record import fingerprint
 from unjam.drivers import IDM
 from unjam.scenarios import make_scenario
-from unjam.scenarios.own_network import _tell_dropped
+from unjam.scenarios.own_network import _log_once
 from unjam.sumo_files import PASSED, is_passed, read_sumo_files
 from unjam.worlds.episode import run_episode
 from unjam.worlds.sumo.networks import sumo_program
@@ -123,12 +125,12 @@ def test_in_a_worker_it_is_the_same(hostile: Path, tmp_path: Path) -> None:
 
 
 def test_what_is_left_out_is_told_once_in_one_line(hostile: Path, caplog: pytest.LogCaptureFixture) -> None:
-    _tell_dropped.cache_clear()
+    _log_once.cache_clear()
     for _ in range(2):
         make_scenario(str(hostile), {"cav_share": 0.5})
     (line,) = [record.getMessage() for record in caplog.records]
     words = (
-        r"straight\.sumocfg: left out, so that SUMO only simulates: option tripinfo-output, .* and \d+ more"
+        r"straight\.sumocfg: left out, for they only write or listen: option tripinfo-output, .* and \d+ more"
     )
     assert re.fullmatch(words, line)
     dropped = read_sumo_files(hostile).dropped
@@ -136,9 +138,19 @@ def test_what_is_left_out_is_told_once_in_one_line(hostile: Path, caplog: pytest
         "option remote-port",
         "file of e1Detector",
         "edgeData",
-        "include",
         "parameter device.ssm.file",
     } <= {*dropped}
+
+
+def test_it_is_noted_in_results_and_report(hostile: Path, tmp_path: Path) -> None:
+    road, out = {"horizon": 20, "cav_share": 0.5}, tmp_path / "out"
+    found = unjam.drive(str(hostile), ["human"], 1, road=road, workers=1, out=out)
+    (note,) = [each for each in found.notes if "left out" in each]
+    assert note.startswith(
+        "straight.sumocfg: left out, for they only write or listen: option tripinfo-output"
+    )
+    assert note in json.loads((out / "evaluation.json").read_text())["notes"]
+    assert "left out, for they only write or listen" in (out / "report.html").read_text()
 
 
 def test_harmless_files_are_read_themselves_and_nothing_is_told(
@@ -146,7 +158,7 @@ def test_harmless_files_are_read_themselves_and_nothing_is_told(
 ) -> None:
     found = read_sumo_files(straight(tmp_path, COLUMN))
     make_scenario(str(found.path), {"cav_share": 0.5})
-    assert (found.dropped, found.to_copy, caplog.records) == ((), frozenset(), [])
+    assert (found.dropped, found.replaced, found.to_copy, caplog.records) == ((), (), {}, [])
 
 
 def test_left_out_outputs_change_no_vehicle(tmp_path: Path, simulation: Simulation) -> None:
@@ -159,6 +171,7 @@ def test_left_out_outputs_change_no_vehicle(tmp_path: Path, simulation: Simulati
             path.write_text(
                 path.read_text().replace("<end ", '<additional-files value="outputs.add.xml"/><end ')
             )
+            (folder / "more.add.xml").write_text(NESTED)
             without = re.sub("<calibrator.*</calibrator>", "", WRITING, flags=re.DOTALL)
             (folder / "outputs.add.xml").write_text(without.replace("CANARY", str(tmp_path / "canary")))
         scenario = make_scenario(str(path), {"cav_share": 0.5, "horizon": 200})
@@ -197,7 +210,7 @@ def test_compressed_and_strangely_encoded_files_are_copied(tmp_path: Path, simul
     demand.write_bytes(f"<?xml version='1.0' encoding='utf-16'?>{demand.read_text()}".encode("utf-16"))
     (tmp_path / "road.net.xml.gz").write_bytes(gzip.compress(network.read_bytes()))
     path.write_text(path.read_text().replace("road.net.xml", "road.net.xml.gz"))
-    assert read_sumo_files(path).to_copy == {demand, tmp_path / "road.net.xml.gz"}
+    assert read_sumo_files(path).to_copy.keys() == {demand, tmp_path / "road.net.xml.gz"}
     assert fingerprint(run_episode(scenario, IDM(), (0,), simulation=simulation)) == fingerprint(plain)
 
 
@@ -213,7 +226,7 @@ def test_what_hides_is_found(name: str, tmp_path: Path) -> None:
     )
     path.write_text(path.read_text().replace("<end ", '<additional-files value="hidden.add.xml"/><end '))
     found = read_sumo_files(path)
-    assert found.to_copy == {tmp_path / "hidden.add.xml"}
+    assert found.to_copy.keys() == {tmp_path / "hidden.add.xml"}
     assert found.dropped in (("edgeData",), ("parameter file",), ("parameter SWARMLOG",))
 
 

@@ -107,9 +107,8 @@ class SimulationApart:
     def load(self, files: Files, step: float, seed: int) -> None:
         """Start an episode, as `Simulation.load` does."""
         named = {option: list(map(str, paths)) for option, paths in files.named.items()}
-        self._ask(
-            "load", {**files._asdict(), "named": named, "to_copy": [*map(str, files.to_copy)]}, step, seed
-        )
+        to_copy = {str(path): list(map(str, made_from)) for path, made_from in files.to_copy.items()}
+        self._ask("load", {**files._asdict(), "named": named, "to_copy": to_copy}, step, seed)
 
     def _ask(self, name: str, *arguments: Any) -> Any:
         assert self._process.stdin is not None
@@ -176,8 +175,9 @@ def _do(simulation: Simulation, name: str, arguments: list[Any]) -> Any:
     if name == "load":
         files = arguments[0]
         named = {option: tuple(map(Path, paths)) for option, paths in files["named"].items()}
-        parts = {"options": tuple(files["options"]), "named": named}
-        arguments[0] = Files(**{**files, **parts, "to_copy": frozenset(map(Path, files["to_copy"]))})
+        to_copy = {Path(path): tuple(map(Path, made)) for path, made in files["to_copy"].items()}
+        parts = {"options": tuple(files["options"]), "named": named, "to_copy": to_copy}
+        arguments[0] = Files(**{**files, **parts})
     return getattr(simulation, name)(*arguments)
 
 

@@ -1,7 +1,8 @@
 """What SUMO reads of an episode: the network, who drives how, and who enters."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from unjam.physics.idm import IDMParameters
@@ -34,8 +35,8 @@ class Files(NamedTuple):
     """XML of vehicle types, and of routes and vehicles where they are not the user's"""
     option: str
     """by which SUMO takes the traffic"""
-    to_copy: frozenset[Path] = frozenset()
-    """files that SUMO must not read themselves, but in a harmless copy"""
+    to_copy: Mapping[Path, tuple[Path, ...]] = MappingProxyType({})
+    """files that SUMO must not read themselves, but in a harmless copy; and what the copy is made from"""
     records_trips: bool = False
     """whether SUMO records all trips: see `Simulation.end_with_trips`"""
 
@@ -62,6 +63,7 @@ def _own_files(scenario: Scenario, road: OwnRoad) -> Files:
         "--net-file": (files.network,),
         "--additional-files": files.additional_files,
         "--route-files": files.route_files,
+        "--weight-files": files.weight_files,
     }
     traffic = _own_types_xml(scenario, road)
     return Files(tuple(options), named, traffic, "--additional-files", files.to_copy, records_trips=True)

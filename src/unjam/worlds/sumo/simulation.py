@@ -83,8 +83,8 @@ class Simulation:
         """simulates one time step"""
         self._folder = PrivateFolder()
         self._error_log = Path(self._folder.name) / "error.log"
-        self._copies: dict[Path, tuple[tuple[int, int] | None, Path]] = {}
-        """of users' own files, with the stamps of those"""
+        self._copies: dict[Path, tuple[list[tuple[int, int]], Path]] = {}
+        """of users' own files, with the stamps of what they are made from"""
         self._trips = Path(self._folder.name) / "trips.xml"
         self._printed = Path(self._folder.name) / "printed.log" if alone else None
         """what SUMO says before it has a log"""
@@ -172,11 +172,11 @@ class Simulation:
         """Return what SUMO reads instead of a file: itself, or a harmless copy of its content."""
         if path not in files.to_copy:
             return str(path)
-        stamp, copy = self._copies.get(path, (None, Path(self._folder.name) / f"{len(self._copies)}.xml"))
-        if stamp_of(path) != stamp:
-            self._copies[path] = None, copy
+        before, copy = self._copies.get(path, ([], Path(self._folder.name) / f"{len(self._copies)}.xml"))
+        if (stamps := list(map(stamp_of, files.to_copy[path]))) != before:
+            self._copies[path] = [], copy
             copy_harmless(path, copy)
-            self._copies[path] = stamp_of(path), copy
+            self._copies[path] = stamps, copy
         return str(copy)
 
     def _options(self, step: float, seed: int) -> list[str]:

@@ -1,0 +1,130 @@
+"""What becomes of a configuration's options: passed, replaced, left out or refused."""
+
+import subprocess
+from pathlib import Path
+from xml.etree import ElementTree
+
+import pytest
+
+from tests.sumo_files.test_sumo_files import configuration
+from unjam.errors import InputError
+from unjam.sumo_files import REFUSED, kind_of_option, read_sumo_files
+from unjam.sumo_files.program import FILE_OPTIONS, sumo_name
+from unjam.worlds.sumo.networks import sumo_program
+
+VALUES = {"BOOL": "true", "INT": "1", "FLOAT": "1", "TIME": "1"}
+ONLY_REPORTS = {"configuration", "output", "report", "traci_server", "gui_only"}
+"""groups of options that change no vehicle"""
+NO_EFFECT = {
+    *("device.rerouting.output", "device.rerouting.threads", "device.taxi.dispatch-algorithm.output"),
+    *("device.taxi.idle-algorithm.output", "device.toc.file", "emissions.volumetric-fuel"),
+    *("load-state.offset", "load-state.remove-vehicles", "threads"),
+}
+"""options of other groups that change none either, or none without another option"""
+DEVICES_THAT_WRITE = ("ssm", "example", "fcd", "tripinfo", "vehroute", "btreceiver", "btsender", "fcd-replay")
+DECIDED = {"step-length", "collision.action", "collision.check-junctions", "collision.mingap-factor"}
+"""options that unjam reads, or decides for all networks"""
+
+
+@pytest.fixture(scope="module")
+def options(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[str, str, list[str]]]:
+    """All options of SUMO: group, kind of value and other names."""
+    template = tmp_path_factory.mktemp("template") / "template.xml"
+    subprocess.run([sumo_program("sumo"), "--save-template", str(template)], check=True, capture_output=True)
+    return {
+        option.tag: (group.tag, option.attrib["type"], option.get("synonymes", "").split())
+        for group in ElementTree.parse(template).getroot()
+        for option in group
+    }
+
+
+def fate(name: str, kind: str) -> str:
+    """What becomes of an option with a value that is not its default."""
+    try:
+        return kind_of_option("mine.sumocfg", sumo_name(name), VALUES.get(kind, "some"))
+    except InputError:
+        return "refused"
+
+
+def test_every_option_of_sumo_is_passed_or_refused_unless_it_changes_no_vehicle(
+    options: dict[str, tuple[str, str, list[str]]],
+) -> None:
+    fates: dict[str, set[str]] = {}
+    for name, (group, kind, _) in options.items():
+        if name in FILE_OPTIONS or name in DECIDED:
+            continue
+        device = name.removeprefix("person-").removeprefix("device.").partition(".")[0]
+        harmless = group in ONLY_REPORTS or name in NO_EFFECT or device in DEVICES_THAT_WRITE
+        found = fate(name, kind)
+        fates.setdefault(found, set()).add(name)
+        if harmless and name not in REFUSED:
+            assert found in ("not written", "ignored"), name
+        else:
+            assert found in ("passed", "replaced", "refused"), name
+    assert fates["refused"] == {*REFUSED}
+    assert fates["replaced"] == {"seed", "random", "max-depart-delay"}
+
+
+def test_other_names_of_an_option_have_its_fate(options: dict[str, tuple[str, str, list[str]]]) -> None:
+    for name, (_, kind, others) in options.items():
+        for other in others:
+            if name in FILE_OPTIONS:
+                assert sumo_name(other) == name
+            else:
+                assert fate(other, kind) == fate(name, kind), other
+
+
+@pytest.mark.parametrize(
+    ("inside", "words"),
+    [
+        (
+            '<load-state value="state.xml"/>',
+            "load-state: 'state.xml' is not allowed; allowed: no file, as episodes",
+        ),
+        ('<astar.all-distances value="d"/>', "astar.all-distances: 'd' is not allowed; allowed: no file"),
+        (
+            '<device.fcd-replay.file value="d"/>',
+            "device.fcd-replay.files: 'd' is not allowed; allowed: no file",
+        ),
+        ('<phemlight-path value="mine"/>', "phemlight-path: 'mine' is not allowed; allowed: ./PHEMlight/"),
+        (
+            '<laterl-resolution value="1"/>',
+            "SUMO 1.28 has no such option; did you mean 'lateral-resolution'?",
+        ),
+        ('<Begin value="1"/>', "Begin: SUMO 1.28 has no such option; did you mean 'begin'?"),
+        ('<begin value="1"/><b value="1"/>', "b: is set twice"),
+        ('<begin value="1" v="2"/>', "begin: is set twice"),
+        ("<begin>1</begin>", "'1' is not allowed; allowed: <option value=\"...\"/>"),
+        ('<n value="other.net.xml"/>', "n: is set twice"),
+    ],
+)
+def test_what_sumo_would_refuse_or_unjam_cannot_do_is_told(inside: str, words: str, tmp_path: Path) -> None:
+    with pytest.raises(InputError) as caught:
+        read_sumo_files(configuration(tmp_path, inside))
+    assert words in str(caught.value)
+    assert str(caught.value).startswith("road.sumocfg: ")
+
+
+@pytest.mark.parametrize(
+    "inside",
+    [
+        '<load-state value=""/><b value=""/>',
+        '<phemlight-path value="./PHEMlight/"/>',
+        '<mesosim value="false"/><configuration-file value="other.sumocfg"/>',
+        '<device.fcd-replay.probability value="-1"/>',
+        "<!-- text --> <processing/>",
+    ],
+)
+def test_options_at_their_defaults_change_nothing(inside: str, tmp_path: Path) -> None:
+    found = read_sumo_files(configuration(tmp_path, inside))
+    assert (found.replaced, found.begin) == ((), 0.0)
+
+
+def test_files_of_a_configuration_may_name_variables_that_are_not_set(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("NOWHERE", raising=False)
+    path = configuration(tmp_path, '<scale value="${NOWHERE}2"/>')
+    path.write_text(path.read_text().replace("road.rou", "${NOWHERE}road.rou"))
+    found = read_sumo_files(path)
+    assert (found.route_files, found.options) == ((tmp_path / "road.rou.xml",), {"scale": "2"})
