@@ -31,7 +31,7 @@ def test_a_failed_write_leaves_what_was_there(
     path = tmp_path / "file"
     write_whole(path, "old")
 
-    def fail(*_: object) -> None:
+    def fail(*_: object, **options: object) -> None:
         raise OSError(number, os.strerror(number))
 
     monkeypatch.setattr(os, step, fail)
@@ -78,10 +78,13 @@ def test_appends_whole_lines(tmp_path: Path) -> None:
     assert path.read_text(encoding="utf-8") == "eins\nzwölf\n"
 
 
-@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full")
-def test_appending_to_a_full_disk_is_a_disk_error() -> None:
-    with pytest.raises(DiskError, match="cannot write /dev/full: No space left on device"):
-        append_line(Path("/dev/full"), "more")
+def test_appending_to_a_full_disk_is_a_disk_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(descriptor: int) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "fsync", fail)
+    with pytest.raises(DiskError, match=f"cannot write {tmp_path}/lines: {os.strerror(errno.ENOSPC)}"):
+        append_line(tmp_path / "lines", "more")
 
 
 def test_makes_a_folder_and_those_above_it_and_may_find_it_there(tmp_path: Path) -> None:

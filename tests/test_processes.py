@@ -13,6 +13,7 @@ import pytest
 from tests.training.test_run import small_config
 from tests.worlds.test_workers import has_ended
 from unjam.errors import InputError
+from unjam.folders import HELD_FOLDERS
 from unjam.processes import (
     HEARTBEAT,
     LOCK,
@@ -118,7 +119,7 @@ def test_a_process_whose_parent_was_gone_before_ends_at_once() -> None:
 def test_nobody_else_is_bound(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv(PARENT, raising=False)
     end_with_parent(signal.SIGKILL)
-    assert bound({"A": "b"}) == {"A": "b", PARENT: str(os.getpid())}
+    assert bound({"A": "b"}) == {"A": "b", PARENT: str(os.getpid()), HELD_FOLDERS: "[]"}
 
 
 @pytest.mark.long

@@ -9,8 +9,8 @@ from typing import Any
 
 import platformdirs
 
-from unjam.errors import DiskError, InputError
-from unjam.files import write_whole
+from unjam.errors import InputError, UnjamError
+from unjam.files import make_folder, write_whole
 
 TRUSTED = "UNJAM_TRUSTED"
 """the variable that tells this process and its children what may run beside what is remembered"""
@@ -71,9 +71,9 @@ def remember(code: Path, imported: Iterable[Path] = ()) -> None:
         return
     lines = [os.fsencode(code), *(each.encode() + b" " + os.fsencode(path) for each, path in others.items())]
     try:
-        _folder().mkdir(parents=True, exist_ok=True)
+        make_folder(_folder())
         write_whole(_folder() / key, b"\n".join(lines) + b"\n")
-    except (OSError, DiskError):
+    except (OSError, UnjamError):
         os.environ[TRUSTED] = " ".join([*_told(), key])
 
 
