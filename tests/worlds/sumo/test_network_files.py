@@ -283,4 +283,5 @@ def test_leftovers_are_removed_when_they_are_old_also_by_several_at_once(
         return is_leftover(path)
 
     monkeypatch.setattr(networks, "is_leftover", listed)
-    assert files_in(cache) == {network_file(road_of(230)), new}
+    made = network_file(road_of(230))
+    assert files_in(cache) == {made, new}

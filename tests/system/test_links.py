@@ -1,0 +1,282 @@
+"""Links that a stranger has planted in a folder: no verb writes through them, whatever it writes."""
+
+import os
+import re
+import shutil
+import subprocess
+from collections.abc import Iterable
+from itertools import cycle
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+
+from tests.studies.test_field import table
+from tests.system.conftest import PLAIN, UNJAM, Run
+from tests.system.test_calibrate import CALIBRATE, PEOPLE, ROWS
+from tests.system.test_verbs import SMALL, TINY_RUN
+from tests.worlds.sumo.own_roads import straight
+from unjam.processes import LOCK
+
+ROAD = {"road.length": "[60,60]", "road.vehicles": 5, "road.horizon": 40, "virtual.virtual_ratio": 0}
+TRIAL = {**ROAD, "trpo.batch_steps": 160, "steps": 160, "evaluation.validation_episodes": 1}
+SEARCH = ["search", "ring", *(word for key, value in TRIAL.items() for word in ("--set", f"{key}={value}"))]
+SEARCH += ["--vary", "trpo.target_kl=0.01,0.02", "--workers", "1", "--out", "searched"]
+TUNE = ["tune", "ring", "--length", "60", "--vehicles", "5", "--set", "horizon=20", "--expert", "pi"]
+TUNE += ["--vary", "window=10,30", "--steps", "3000", "--out", "tuned"]
+ASSESS = ["assess", "straight.sumocfg", "--shares", "0.5", "-d", "acc", "--set", "horizon=40", "-n", "36"]
+FIT = ["fit-drivers", "data.parquet", "--set", "calibration.generations=2", "--out", "files/people.json"]
+STUDY = ["reproduce", "table-1", "--seeds", "1", "--workers", "1", "--out", "studies"]
+DRIVE = ["drive", "ring", "-d", "pi", "-n", "1", *SMALL, "--out", "new"]
+FILM = ["watch", "ring", *SMALL, "-d", "pi", "--video"]
+TWO_ROADS = '[[tasks]]\nroad = {length = [70, 70]}\n[[tasks]]\nname = "short"\n[virtual]\nvirtual_ratio = 0\n'
+
+
+class Case(NamedTuple):
+    """A command line, the folder that it writes to, and whether it reads only."""
+
+    words: list[str]
+    folder: str
+    reads: bool = False
+
+
+CASES = {
+    "train": Case([*TINY_RUN, "--steps", "160", "--set", "virtual.virtual_ratio=0", "--out", "new"], "new"),
+    "train on": Case(["train", "--resume", "run", "--steps", "320", "--tensorboard"], "run"),
+    "train on, several roads": Case(["train", "--resume", "roads", "--steps", "640"], "roads"),
+    "evaluate": Case(["evaluate", "run", "-n", "1", "--workers", "1"], "run"),
+    "model": Case(["model", "run"], "run"),
+    "report": Case(["report", "run"], "run"),
+    "search": Case([*SEARCH, "--trials", "2"], "searched"),
+    "tune": Case(TUNE, "tuned"),
+    "calibrate": Case([*map(str, CALIBRATE), "--out", "calibrated"], "calibrated"),
+    "drive": Case(DRIVE, "new"),
+    "assess": Case([*ASSESS, "--out", "new"], "new"),
+    "export": Case(["export", "run", "--to", "files/ring.unjam", "--onnx"], "files"),
+    "certify": Case(["certify", "files/it.unjam"], "files"),
+    "keys": Case(["keys", "files/another"], "files"),
+    "sign": Case(["sign", "files/it.unjam", "--key", "files/maker.key"], "files"),
+    "watch": Case([*FILM, "files/film.gif"], "files"),
+    "watch, .mp4": Case([*FILM, "files/film.mp4"], "files"),
+    "scenarios": Case(["scenarios", "ring", "--picture", "files/road.png"], "files"),
+    "fit-drivers": Case(FIT, "files"),
+    "runs": Case(["runs", "--under", "."], "run", reads=True),
+    "verify": Case(["verify", "run"], "run", reads=True),
+    "runs remove": Case(["runs", "remove", "run", "--under", ".", "--yes"], "run"),
+}
+NEVER_ENDS = {"reproduce": (Case(STUDY, "studies"), ("plans", "runs", "logs", "drives", "table-1"))}
+"""what would take hours; what it writes, where links are refused before it begins"""
+KINDS = ("a file", "a folder", "nothing")
+RANDOM = re.compile(r"\.[0-9a-f]{16}(\.part)?$")
+"""how names end that nobody can guess"""
+
+
+@pytest.fixture(scope="module")
+def base(tmp_path_factory: pytest.TempPathFactory, warm: Run) -> Path:
+    """A folder with one of everything that verbs write or go on with."""
+    place = tmp_path_factory.mktemp("base")
+    (place / "files").mkdir()
+    (place / "studies").mkdir()
+    straight(place, PEOPLE, length=100.0)
+    (place / "detectors.csv").write_text("\n".join(ROWS).replace("100", "50"))
+    table(place / "data.parquet", [{}, {}])
+    (place / "roads.toml").write_text(TWO_ROADS)
+    for words in (
+        [*TINY_RUN, "--steps", "160", "--out", "run", "--tensorboard"],
+        [*TINY_RUN, "--config", "roads.toml", "--steps", "160", "--out", "roads"],
+        [*SEARCH, "--trials", "1"],
+        TUNE,
+        CASES["calibrate"].words,
+        ["export", "run", "--to", "files/it.unjam"],
+        ["keys", "files/maker"],
+    ):
+        made = warm(*words, folder=place, pictures=False)
+        assert made.returncode == 0, made.stderr
+    return place
+
+
+class Scene:
+    """A copy of the base, with links to canaries elsewhere."""
+
+    def __init__(self, base: Path, tmp_path: Path, folder: str) -> None:
+        self.place, self.outside = tmp_path / "place", tmp_path / "outside"
+        shutil.copytree(base, self.place)
+        self.outside.mkdir()
+        self.folder = self.place / folder
+        self.planted = 0
+
+    def plant(self, name: str, kind: str) -> None:
+        """Put a link in place of a file or folder, to what was there or a file like it, elsewhere."""
+        path, canary = self.folder / name, self.outside / str(self.planted)
+        self.planted += 1
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if os.path.lexists(path):
+            shutil.move(path, canary)
+        elif kind != "nothing":
+            canary.write_text("mine")
+        if kind == "hard link":
+            path.hardlink_to(canary)
+            return
+        if kind == "nothing" and canary.exists():
+            canary.rename(path.with_name("kept"))
+        if kind == "a folder" and not canary.is_dir():
+            canary.unlink()
+            canary.mkdir()
+            (canary / "canary").write_text("mine")
+        path.symlink_to(canary)
+
+    def run(self, warm: Run, case: Case) -> None:
+        """Run a verb: it ends well, or with one line, and nothing has changed outside."""
+        before = state_of(self.outside)
+        ran = warm(*case.words, folder=self.place, pictures=False)
+        assert "Traceback" not in ran.stderr, ran.stderr
+        assert ran.returncode in (0, 2), ran.stderr
+        if ran.returncode == 2:
+            assert ran.stderr.splitlines()[-1].startswith("unjam: "), ran.stderr
+            assert "allowed: " in ran.stderr, ran.stderr
+        assert state_of(self.outside) == before, ran.stderr
+        assert {path.name for path in self.place.parent.iterdir()} == {"place", "outside"}
+
+
+def state_of(folder: Path) -> dict[str, tuple[object, ...]]:
+    """What a folder holds: kinds, times and contents; links are not followed."""
+    found: dict[str, tuple[object, ...]] = {}
+    for path in sorted([folder, *folder.rglob("*")]):
+        about = path.lstat()
+        content = path.read_bytes() if path.is_file() and not path.is_symlink() else b""
+        found[str(path.relative_to(folder))] = (about.st_mode, about.st_ino, about.st_mtime_ns, content)
+    return found
+
+
+def written_by(case: Case, base: Path, tmp_path: Path, warm: Run) -> list[str]:
+    """The names that a verb writes below its folder, found by running it."""
+    scene = Scene(base, tmp_path, case.folder)
+    before = state_of(scene.folder) if scene.folder.is_dir() else {}
+    ran = warm(*case.words, folder=scene.place, pictures=False)
+    assert ran.returncode == 0, ran.stderr
+    after = state_of(scene.folder) if scene.folder.is_dir() else {}
+    shutil.rmtree(tmp_path)
+    tmp_path.mkdir()
+    return sorted(
+        name
+        for name in (before.keys() | after.keys()) - {"."}
+        if before.get(name) != after.get(name) and not RANDOM.search(name)
+    )
+
+
+def with_temporary_names(names: Iterable[str]) -> list[str]:
+    """Names, that of the lock, and temporary names that can be guessed: those of earlier versions."""
+    parts = [str(Path(name).with_name(f".{Path(name).name}.part")) for name in names]
+    return [*names, LOCK, *parts]
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("verb", CASES)
+def test_no_verb_writes_through_a_link(verb: str, base: Path, tmp_path: Path, warm: Run) -> None:
+    case = CASES[verb]
+    place = tmp_path / "scene"
+    place.mkdir()
+    written = written_by(case, base, place, warm)
+    assert not case.reads or written == []
+    top = [name for name in written if "/" not in name]
+    deep = [name for name in written if "/" in name and not (base / case.folder / name).is_dir()]
+    names = with_temporary_names(top or ["progress.jsonl"])
+    together: list[list[tuple[str, str]]] = [
+        [(name, "hard link") for name in (*written, LOCK) if not (base / case.folder / name).is_dir()],
+        list(zip(deep, cycle(KINDS), strict=False)),
+        *([(name, kind)] for name, kind in zip(names, cycle(KINDS), strict=False)),
+    ]
+    for planted in filter(None, together):
+        scene = Scene(base, place, case.folder)
+        for name, kind in planted:
+            scene.plant(name, kind)
+        scene.run(warm, case)
+        shutil.rmtree(place)
+        place.mkdir()
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("verb", NEVER_ENDS)
+def test_what_takes_hours_refuses_links_before_it_begins(
+    verb: str, base: Path, tmp_path: Path, warm: Run
+) -> None:
+    case, names = NEVER_ENDS[verb]
+    for number, (name, kind) in enumerate(zip(with_temporary_names(names), cycle(KINDS), strict=False)):
+        (tmp_path / str(number)).mkdir()
+        scene = Scene(base, tmp_path / str(number), case.folder)
+        scene.plant(name, kind)
+        scene.run(warm, case)
+        assert [path.name for path in scene.folder.iterdir()] == [Path(name).name]
+
+
+@pytest.mark.long
+def test_a_folder_may_be_reached_through_links(base: Path, tmp_path: Path, warm: Run) -> None:
+    scene = Scene(base, tmp_path, "run")
+    (scene.place / "data").mkdir()
+    shutil.move(scene.folder, scene.place / "data" / "run")
+    (scene.place / "link").symlink_to("data")
+    ran = warm("report", "link/run", folder=scene.place, pictures=False)
+    assert ran.returncode == 0, ran.stderr
+    (scene.place / "last").symlink_to("data/run")
+    ran = warm("evaluate", "last", "-n", "1", folder=scene.place, pictures=False)
+    assert ran.returncode == 0, ran.stderr
+
+
+CALL = re.compile(r"(?:\[pid +\d+\] )?(\w+)\((.*)\) += (-?\d+)(?:<(.*)>)?")
+QUOTED = re.compile(r'(AT_FDCWD|\d+)?(?:<([^>]*)>)?(?:, )?"((?:[^"\\]|\\.)*)"')
+CHANGES = (
+    "mkdir,mkdirat,rename,renameat,renameat2,unlink,unlinkat,rmdir,link,linkat,symlink,symlinkat,truncate"
+)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not shutil.which("strace"), reason="no strace")
+@pytest.mark.parametrize("verb", CASES)
+def test_whatever_a_verb_writes_it_names_from_an_open_folder(verb: str, base: Path, tmp_path: Path) -> None:
+    """Also what other packages and programs write: each of the system's calls is looked at."""
+    case, scene, log = CASES[verb], Scene(base, tmp_path, CASES[verb].folder), tmp_path / "log"
+    trace = [
+        "strace",
+        "-f",
+        "-qq",
+        "-y",
+        "-s",
+        "4096",
+        "-e",
+        f"trace=open,creat,openat,{CHANGES}",
+        "-o",
+        str(log),
+    ]
+    environment = {**os.environ, **PLAIN}
+    ran = subprocess.run(
+        [*trace, str(UNJAM), *case.words],
+        cwd=scene.place,
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert ran.returncode == 0, ran.stderr
+    unsafe = [line for line in log.read_text().splitlines() if is_unsafe(line, scene.folder)]
+    assert unsafe == []
+
+
+def is_unsafe(line: str, folder: Path) -> bool:
+    """Whether a line of strace changes something inside a folder by a path that may lead through links."""
+    found = CALL.search(line)
+    if found is None:
+        return False
+    call, arguments, code, opened = found.groups()
+    if int(code) < 0 or (call in ("open", "openat") and not re.search("O_WRONLY|O_RDWR|O_CREAT", arguments)):
+        return False
+    for number, at, name in QUOTED.findall(arguments):
+        path = Path(at or "/", name)
+        if not (path.is_relative_to(folder) and path != folder) and not Path(opened or "/").is_relative_to(
+            folder
+        ):
+            continue
+        if RANDOM.search(name) and "events.out.tfevents" in name:
+            continue
+        if number in ("", "AT_FDCWD") or "/" in name or (call == "openat" and "O_NOFOLLOW" not in arguments):
+            return True
+    return False
