@@ -4,13 +4,13 @@ import os
 import re
 import shutil
 import subprocess
-from collections.abc import Iterable
 from itertools import cycle
 from pathlib import Path
 from typing import NamedTuple
 
 import pytest
 
+from tests.faults.links import KINDS, plant, state_of, with_temporary_names
 from tests.studies.test_field import table
 from tests.system.conftest import PLAIN, UNJAM, Run
 from tests.system.test_calibrate import CALIBRATE, PEOPLE, ROWS
@@ -66,7 +66,7 @@ CASES = {
 }
 NEVER_ENDS = {"reproduce": (Case(STUDY, "studies"), ("plans", "runs", "logs", "drives", "table-1"))}
 """what would take hours; what it writes, where links are refused before it begins"""
-KINDS = ("a file", "a folder", "nothing")
+SYMBOLIC = [kind for kind in KINDS if kind != "hard link"]
 RANDOM = re.compile(r"\.[0-9a-f]{16}(\.part)?$")
 """how names end that nobody can guess"""
 
@@ -103,27 +103,6 @@ class Scene:
         shutil.copytree(base, self.place)
         self.outside.mkdir()
         self.folder = self.place / folder
-        self.planted = 0
-
-    def plant(self, name: str, kind: str) -> None:
-        """Put a link in place of a file or folder, to what was there or a file like it, elsewhere."""
-        path, canary = self.folder / name, self.outside / str(self.planted)
-        self.planted += 1
-        path.parent.mkdir(parents=True, exist_ok=True)
-        if os.path.lexists(path):
-            shutil.move(path, canary)
-        elif kind != "nothing":
-            canary.write_text("mine")
-        if kind == "hard link":
-            path.hardlink_to(canary)
-            return
-        if kind == "nothing" and canary.exists():
-            canary.rename(path.with_name("kept"))
-        if kind == "a folder" and not canary.is_dir():
-            canary.unlink()
-            canary.mkdir()
-            (canary / "canary").write_text("mine")
-        path.symlink_to(canary)
 
     def run(self, warm: Run, case: Case) -> None:
         """Run a verb: it ends well, or with one line, and nothing has changed outside."""
@@ -136,16 +115,6 @@ class Scene:
             assert "allowed: " in ran.stderr, ran.stderr
         assert state_of(self.outside) == before, ran.stderr
         assert {path.name for path in self.place.parent.iterdir()} == {"place", "outside"}
-
-
-def state_of(folder: Path) -> dict[str, tuple[object, ...]]:
-    """What a folder holds: kinds, times and contents; links are not followed."""
-    found: dict[str, tuple[object, ...]] = {}
-    for path in sorted([folder, *folder.rglob("*")]):
-        about = path.lstat()
-        content = path.read_bytes() if path.is_file() and not path.is_symlink() else b""
-        found[str(path.relative_to(folder))] = (about.st_mode, about.st_ino, about.st_mtime_ns, content)
-    return found
 
 
 def written_by(case: Case, base: Path, tmp_path: Path, warm: Run) -> list[str]:
@@ -164,12 +133,6 @@ def written_by(case: Case, base: Path, tmp_path: Path, warm: Run) -> list[str]:
     )
 
 
-def with_temporary_names(names: Iterable[str]) -> list[str]:
-    """Names, that of the lock, and temporary names that can be guessed: those of earlier versions."""
-    parts = [str(Path(name).with_name(f".{Path(name).name}.part")) for name in names]
-    return [*names, LOCK, *parts]
-
-
 @pytest.mark.long
 @pytest.mark.parametrize("verb", CASES)
 def test_no_verb_writes_through_a_link(verb: str, base: Path, tmp_path: Path, warm: Run) -> None:
@@ -183,13 +146,13 @@ def test_no_verb_writes_through_a_link(verb: str, base: Path, tmp_path: Path, wa
     names = with_temporary_names(top or ["progress.jsonl"])
     together: list[list[tuple[str, str]]] = [
         [(name, "hard link") for name in (*written, LOCK) if not (base / case.folder / name).is_dir()],
-        list(zip(deep, cycle(KINDS), strict=False)),
-        *([(name, kind)] for name, kind in zip(names, cycle(KINDS), strict=False)),
+        list(zip(deep, cycle(SYMBOLIC), strict=False)),
+        *([(name, kind)] for name, kind in zip(names, cycle(SYMBOLIC), strict=False)),
     ]
     for planted in filter(None, together):
         scene = Scene(base, place, case.folder)
         for name, kind in planted:
-            scene.plant(name, kind)
+            plant(scene.folder / name, kind, scene.outside)
         scene.run(warm, case)
         shutil.rmtree(place)
         place.mkdir()
@@ -201,10 +164,10 @@ def test_what_takes_hours_refuses_links_before_it_begins(
     verb: str, base: Path, tmp_path: Path, warm: Run
 ) -> None:
     case, names = NEVER_ENDS[verb]
-    for number, (name, kind) in enumerate(zip(with_temporary_names(names), cycle(KINDS), strict=False)):
+    for number, (name, kind) in enumerate(zip(with_temporary_names(names), cycle(SYMBOLIC), strict=False)):
         (tmp_path / str(number)).mkdir()
         scene = Scene(base, tmp_path / str(number), case.folder)
-        scene.plant(name, kind)
+        plant(scene.folder / name, kind, scene.outside)
         scene.run(warm, case)
         assert [path.name for path in scene.folder.iterdir()] == [Path(name).name]
 
