@@ -39,9 +39,13 @@ def plant(path: Path, kind: str, outside: Path) -> None:
     path.symlink_to(canary)
 
 
-def state_of(folder: Path) -> dict[str, tuple[object, ...]]:
-    """Return what a folder holds: kinds, times and contents; links are not followed."""
-    found: dict[str, tuple[object, ...]] = {}
+State = dict[str, tuple[int, int, int, bytes]]
+"""what a folder holds, by path: mode, number and time of change of a file, and its content"""
+
+
+def state_of(folder: Path) -> State:
+    """Return what a folder holds; links are not followed."""
+    found: State = {}
     for path in sorted([folder, *folder.rglob("*")]):
         about = path.lstat()
         content = path.read_bytes() if path.is_file() and not path.is_symlink() else b""

@@ -3,6 +3,7 @@
 import os
 import re
 import shutil
+import stat
 import subprocess
 from itertools import cycle
 from pathlib import Path
@@ -112,50 +113,51 @@ class Scene:
         assert ran.returncode in (0, 2), ran.stderr
         if ran.returncode == 2:
             assert ran.stderr.splitlines()[-1].startswith("unjam: "), ran.stderr
-            assert "allowed: " in ran.stderr, ran.stderr
         assert state_of(self.outside) == before, ran.stderr
         assert {path.name for path in self.place.parent.iterdir()} == {"place", "outside"}
 
 
-def written_by(case: Case, base: Path, tmp_path: Path, warm: Run) -> list[str]:
-    """The names that a verb writes below its folder, found by running it."""
+def written_by(case: Case, base: Path, tmp_path: Path, warm: Run) -> dict[str, bool]:
+    """The names that a verb writes below its folder, and which are folders, found by running it."""
     scene = Scene(base, tmp_path, case.folder)
     before = state_of(scene.folder) if scene.folder.is_dir() else {}
     ran = warm(*case.words, folder=scene.place, pictures=False)
     assert ran.returncode == 0, ran.stderr
     after = state_of(scene.folder) if scene.folder.is_dir() else {}
-    shutil.rmtree(tmp_path)
-    tmp_path.mkdir()
-    return sorted(
-        name
-        for name in (before.keys() | after.keys()) - {"."}
-        if before.get(name) != after.get(name) and not RANDOM.search(name)
-    )
+    changed = {name for name in before.keys() | after.keys() if before.get(name) != after.get(name)}
+    return {
+        name: stat.S_ISDIR((after.get(name) or before[name])[0])
+        for name in sorted(changed)
+        if name != "." and not RANDOM.search(name)
+    }
+
+
+def plantings(written: dict[str, bool]) -> list[list[tuple[str, str]]]:
+    """What to plant together, name and kind: those in subfolders at once, as no verb sees them at first."""
+    files = [name for name, is_folder in written.items() if not is_folder]
+    top = [name for name in written if "/" not in name] or ["progress.jsonl"]
+    deep = [name for name in files if "/" in name]
+    deep_folders = [name for name in written if "/" in name and name not in files]
+    return [
+        [(name, "hard link") for name in (*files, LOCK)],
+        list(zip(deep, cycle(SYMBOLIC), strict=False)),
+        [(name, "a folder") for name in deep_folders if str(Path(name).parent) not in deep_folders],
+        *([(name, kind)] for name, kind in zip(with_temporary_names(top), cycle(SYMBOLIC), strict=False)),
+    ]
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("verb", CASES)
 def test_no_verb_writes_through_a_link(verb: str, base: Path, tmp_path: Path, warm: Run) -> None:
     case = CASES[verb]
-    place = tmp_path / "scene"
-    place.mkdir()
-    written = written_by(case, base, place, warm)
-    assert not case.reads or written == []
-    top = [name for name in written if "/" not in name]
-    deep = [name for name in written if "/" in name and not (base / case.folder / name).is_dir()]
-    names = with_temporary_names(top or ["progress.jsonl"])
-    together: list[list[tuple[str, str]]] = [
-        [(name, "hard link") for name in (*written, LOCK) if not (base / case.folder / name).is_dir()],
-        list(zip(deep, cycle(SYMBOLIC), strict=False)),
-        *([(name, kind)] for name, kind in zip(names, cycle(SYMBOLIC), strict=False)),
-    ]
-    for planted in filter(None, together):
-        scene = Scene(base, place, case.folder)
+    written = written_by(case, base, tmp_path / "first", warm)
+    assert not case.reads or not written
+    for number, planted in enumerate(filter(None, plantings(written))):
+        scene = Scene(base, tmp_path / str(number), case.folder)
         for name, kind in planted:
             plant(scene.folder / name, kind, scene.outside)
         scene.run(warm, case)
-        shutil.rmtree(place)
-        place.mkdir()
+        shutil.rmtree(scene.place.parent)
 
 
 @pytest.mark.long
@@ -165,7 +167,6 @@ def test_what_takes_hours_refuses_links_before_it_begins(
 ) -> None:
     case, names = NEVER_ENDS[verb]
     for number, (name, kind) in enumerate(zip(with_temporary_names(names), cycle(SYMBOLIC), strict=False)):
-        (tmp_path / str(number)).mkdir()
         scene = Scene(base, tmp_path / str(number), case.folder)
         plant(scene.folder / name, kind, scene.outside)
         scene.run(warm, case)

@@ -18,17 +18,19 @@ class Journal(BaseJournalBackend):
 
     def __init__(self, path: Path) -> None:
         """Take the file, which may be missing; a line that a crash has cut short is left out."""
-        self._path = path
+        self._path, self._lines = path, list(map(_as_line, read_lines(path)))
         if path.is_file():
-            write_whole(path, "".join(f"{line}\n" for line in map(_as_line, read_lines(path))))
+            write_whole(path, "".join(f"{line}\n" for line in self._lines))
 
     def read_logs(self, log_number_from: int) -> Iterable[dict[str, Any]]:
         """Return the entries of the log from a number on."""
-        return read_lines(self._path)[log_number_from:]
+        return map(json.loads, self._lines[log_number_from:])
 
     def append_logs(self, logs: list[dict[str, Any]]) -> None:
         """Add entries to the log; they are on the disk when this returns."""
-        append_line(self._path, "\n".join(map(_as_line, logs)))
+        lines = list(map(_as_line, logs))
+        append_line(self._path, "\n".join(lines))
+        self._lines += lines
 
 
 def _as_line(entry: dict[str, Any]) -> str:
