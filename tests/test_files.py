@@ -3,6 +3,7 @@ import json
 import os
 import subprocess
 import sys
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -10,8 +11,20 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from unjam.errors import DiskError
-from unjam.files import append_line, make_folder, to_json, write_whole
+from unjam.errors import DiskError, InputError
+from unjam.files import (
+    append_line,
+    is_leftover,
+    make_folder,
+    open_in_place,
+    remove,
+    to_json,
+    write_folder,
+    write_new,
+    write_whole,
+)
+from unjam.folders import without_links
+from unjam.processes import bound, owned
 
 
 def test_writes_text_and_bytes_over_what_was_there(tmp_path: Path) -> None:
@@ -31,7 +44,7 @@ def test_a_failed_write_leaves_what_was_there(
     path = tmp_path / "file"
     write_whole(path, "old")
 
-    def fail(*_: object) -> None:
+    def fail(*_: object, **options: object) -> None:
         raise OSError(number, os.strerror(number))
 
     monkeypatch.setattr(os, step, fail)
@@ -78,10 +91,13 @@ def test_appends_whole_lines(tmp_path: Path) -> None:
     assert path.read_text(encoding="utf-8") == "eins\nzwölf\n"
 
 
-@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full")
-def test_appending_to_a_full_disk_is_a_disk_error() -> None:
-    with pytest.raises(DiskError, match="cannot write /dev/full: No space left on device"):
-        append_line(Path("/dev/full"), "more")
+def test_appending_to_a_full_disk_is_a_disk_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(descriptor: int) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "fsync", fail)
+    with pytest.raises(DiskError, match=f"cannot write {tmp_path}/lines: {os.strerror(errno.ENOSPC)}"):
+        append_line(tmp_path / "lines", "more")
 
 
 def test_makes_a_folder_and_those_above_it_and_may_find_it_there(tmp_path: Path) -> None:
@@ -96,6 +112,151 @@ def test_a_folder_where_a_file_is_in_the_way_is_a_disk_error(tmp_path: Path, bel
     with pytest.raises(DiskError, match="cannot write"):
         make_folder(tmp_path / "file" / below)
     assert (tmp_path / "file").read_text() == "mine"
+
+
+Writer = Callable[[Path], object]
+WRITERS: dict[str, Writer] = {
+    "whole": lambda path: write_whole(path, "new"),
+    "new": lambda path: write_new(path, b"new", 0o600),
+    "line": lambda path: append_line(path, "new"),
+    "in place": lambda path: os.close(open_in_place(path, os.O_RDWR | os.O_CREAT)),
+}
+
+
+@pytest.fixture
+def outside(tmp_path: Path) -> Iterator[Path]:
+    """A folder with a user's file, which stays as it was."""
+    folder = tmp_path / "outside"
+    folder.mkdir()
+    (folder / "file").write_text("mine")
+    os.utime(folder / "file", (1, 1))
+    os.utime(folder, (1, 1))
+    yield folder
+    assert [path.name for path in folder.iterdir()] == ["file"]
+    assert (folder / "file").read_text() == "mine"
+    assert (folder / "file").stat().st_mtime == folder.stat().st_mtime == 1
+
+
+@pytest.mark.parametrize("target", ["file", "", "nothing"])
+@pytest.mark.parametrize("how", WRITERS)
+def test_nothing_is_written_through_a_link(how: str, target: str, outside: Path, tmp_path: Path) -> None:
+    path = tmp_path / "name"
+    path.symlink_to(outside / target)
+    with pytest.raises(InputError, match=r"name' (is a symbolic link .*; allowed: |exists; allowed: )"):
+        WRITERS[how](path)
+    assert path.is_symlink()
+    assert sorted(each.name for each in tmp_path.iterdir()) == ["name", "outside"]
+
+
+@pytest.mark.parametrize("how", ["whole", "line", "in place"])
+def test_a_hard_link_of_a_file_elsewhere_is_not_written_in_place(
+    how: str, outside: Path, tmp_path: Path
+) -> None:
+    path = tmp_path / "name"
+    path.hardlink_to(outside / "file")
+    if how == "whole":
+        write_whole(path, "new")
+        assert path.read_text() == "new"
+        return
+    with pytest.raises(InputError, match=r"name' has 2 names \(hard links\), .*; allowed: a file with one"):
+        WRITERS[how](path)
+
+
+DEEP: dict[str, Writer] = {
+    **{
+        f"{name}, deep": (lambda path, write=write: write(path / "sub" / "file"))
+        for name, write in WRITERS.items()
+    },
+    "folder": lambda path: write_folder(path / "sub" / "it", {"file": "new"}),
+    "make": lambda path: make_folder(path / "sub" / "it"),
+    "remove": lambda path: remove(path / "sub" / "file"),
+    "up": lambda path: write_whole(path / ".." / "outside" / "file", "new"),
+    "up by a new folder": lambda path: make_folder(path / "new" / ".." / ".." / "outside" / "new"),
+}
+
+
+@pytest.mark.parametrize("how", DEEP)
+def test_inside_a_held_folder_no_path_leads_out(how: str, outside: Path, tmp_path: Path) -> None:
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "results").symlink_to("elsewhere")  # the user's own choice
+    results = tmp_path / "results"
+    with without_links(results):
+        write_whole(results / "file", "new")
+        (results / "sub").symlink_to(outside)
+        with pytest.raises(InputError, match="is a symbolic link or leads out of its folder"):
+            DEEP[how](results)
+    assert (tmp_path / "elsewhere" / "file").read_text() == "new"
+    with pytest.raises(InputError, match=r"sub' is a symbolic link"), without_links(results):
+        pass
+
+
+def test_a_folder_in_place_of_a_link_and_a_removed_folder_spare_what_links_lead_to(
+    outside: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "it").symlink_to(outside)
+    write_folder(tmp_path / "it", {"file": "new"})
+    assert (tmp_path / "it" / "file").read_text() == "new"
+    assert not (tmp_path / "it").is_symlink()
+    (tmp_path / "it" / "sub").symlink_to(outside)
+    remove(tmp_path / "it")
+    remove(tmp_path / "it")
+    (tmp_path / "link").symlink_to(outside)
+    remove(tmp_path / "link")
+    assert [path.name for path in tmp_path.iterdir()] == ["outside"]
+
+
+def test_a_link_that_leads_nowhere_is_no_place_for_a_folder(tmp_path: Path) -> None:
+    (tmp_path / "link").symlink_to("nowhere")
+    with pytest.raises(InputError, match="link' is a symbolic link"):
+        make_folder(tmp_path / "link")
+    assert not (tmp_path / "nowhere").exists()
+
+
+def test_a_child_process_follows_no_link_in_what_its_parent_holds(outside: Path, tmp_path: Path) -> None:
+    (tmp_path / "results" / "trials").mkdir(parents=True)
+    code = (
+        "import sys\nfrom pathlib import Path\nfrom unjam.errors import InputError\n"
+        "from unjam.files import write_whole\n"
+        "try:\n    write_whole(Path(sys.argv[1]), 'new')\nexcept InputError as error:\n    print(error)\n"
+    )
+    with owned(tmp_path / "results"):
+        (tmp_path / "results" / "trials" / "0").symlink_to(outside)
+        ran = subprocess.run(
+            [sys.executable, "-c", code, str(tmp_path / "results" / "trials" / "0" / "file")],
+            **{"capture_output": True, "text": True, "check": True, "env": bound(os.environ)},
+        )
+    assert "trials/0' is a symbolic link" in ran.stdout
+
+
+@pytest.mark.parametrize("before", WRITERS)
+def test_without_handles_of_folders_links_are_refused_too(
+    before: str, outside: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(os, "supports_dir_fd", set())  # as on Windows
+    (tmp_path / "results").mkdir()
+    write_folder(tmp_path / "results" / "it", {"file": "new"})
+    WRITERS[before](tmp_path / "results" / "name")
+    remove(tmp_path / "results" / "it")
+    assert [path.name for path in (tmp_path / "results").iterdir()] == ["name"]
+    with without_links(tmp_path / "results"):
+        (tmp_path / "results" / "sub").symlink_to(outside)
+        with pytest.raises(InputError, match="is a symbolic link"):
+            WRITERS[before](tmp_path / "results" / "sub" / "file")
+
+
+def test_what_is_left_of_a_killed_write_has_a_name_that_nobody_can_guess(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def die(*_: object, **options: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(os, "replace", die)
+    for _ in range(2):
+        with pytest.raises(KeyboardInterrupt):
+            write_whole(tmp_path / "file", "new")
+    left = [path for path in tmp_path.iterdir() if is_leftover(path)]
+    assert len({path.name for path in left}) == 2
+    assert all(len(path.name) == len(".part") + 17 for path in left)
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), float("-inf"), np.float64("nan")])

@@ -24,6 +24,7 @@ EVERYWHERE = {
     "children",
     "errors",
     "files",
+    "folders",
     "kernels",
     "manifest",
     "parameters",
@@ -202,6 +203,98 @@ def test_nothing_is_evaluated_unpickled_or_given_to_a_shell() -> None:
             if keyword.arg in ("shell", "allow_pickle"):
                 assert isinstance(keyword.value, ast.Constant), where
                 assert keyword.value.value is False, where
+
+
+WRITERS = {"files.py", "folders.py"}
+"""what writes, renames and removes for all others, and follows no link that a stranger planted"""
+CHANGES = {
+    *("write_text", "write_bytes", "touch", "mkdir", "unlink", "rmdir", "symlink_to", "hardlink_to", "chmod"),
+    *("lchmod", "extract", "extractall", "tofile", "savez", "savez_compressed", "save_file", "imsave"),
+    *("FileHandler", "write_frames", "SummaryWriter", "JournalFileBackend", "memmap"),
+}
+"""calls that change files by their path, whatever they are called on"""
+CHANGES_IF_GIVEN_A_PATH = {"save", "savefig", "to_csv", "to_parquet", "to_json", "to_pickle", "to_html"}
+SYSTEM_CALLS = {
+    *("open", "mkdir", "makedirs", "remove", "removedirs", "unlink", "rmdir", "rename", "renames", "replace"),
+    *("link", "symlink", "truncate", "chmod", "chown", "mkfifo", "mknod"),
+}
+READS = {"shutil.which", "shutil.disk_usage", "shutil.get_terminal_size"}
+PRIVATE = "in a private temporary folder, with a random name, that its user alone may enter"
+BUFFER = "into memory, or to the standard output"
+UNSAFE_BUT = {
+    "worlds/sumo/simulation.py: traffic.write_text(files.traffic)": PRIVATE,
+    "worlds/sumo/networks.py: (folder / name).write_text(content)": PRIVATE,
+    "sumo_files/program.py: open(copy, 'w', encoding='utf-8')": PRIVATE,
+    "reports/film.py: imageio_ffmpeg.write_frames(str(film), (SIZE, SIZE), fps=rate, "
+    "ffmpeg_log_level='error')": PRIVATE,
+    "training/tensorboard.py: SummaryWriter(str(place), filename_suffix=f'.{secrets.token_hex(8)}')": (
+        "nobody can guess the name of its file, and its folder was made without following links"
+    ),
+    "cli/__init__.py: os.open(os.devnull, os.O_WRONLY)": "no file",
+    "cli/output.py: open(os.devnull, way)": "no file",
+    "sandbox.py: os.open(path, os.O_PATH | os.O_CLOEXEC)": "a handle, by which nothing can be written",
+    "cli/parts.py: draw_road(scene, fastest, words).save(content, 'PNG')": BUFFER,
+    "cli/runs.py: pd.json_normalize(rows).to_csv(sys.stdout, index=False)": BUFFER,
+    "reports/figures.py: figure.savefig(content, format='svg', dpi=DPI, metadata={'Date': None})": BUFFER,
+    "reports/figures.py: figure.savefig(content, format='png', dpi=dpi)": BUFFER,
+    "reports/figures.py: opaque.quantize(256, Image.Quantize.MAXCOVERAGE).save(small, 'PNG')": BUFFER,
+    "reports/film.py: next(frames).save(film, kind, save_all=True, append_images=frames, "
+    "duration=durations, loop=0)": BUFFER,
+}
+"""calls that change no file that a stranger's link could stand for, and why not"""
+
+
+def changes_files(call: ast.Call) -> bool:
+    """Whether a call may write, rename or remove a file by its path."""
+    called, name = ast.unparse(call.func), name_of(call.func)
+    if name == "open" and called != "os.open":
+        if call.args and ast.unparse(call.args[0]).startswith("open_in_place("):
+            return False  # it has a descriptor already
+        modes = [
+            *call.args[called == "open" : 2],
+            *(word.value for word in call.keywords if word.arg == "mode"),
+        ]
+        known = [str(mode.value) for mode in modes if isinstance(mode, ast.Constant)]
+        unknown = called == "open" and len(known) < len(modes)
+        return unknown or any(set("wax+") & set(mode) and set(mode) <= set("rwaxbt+") for mode in known)
+    if called.startswith(("os.", "shutil.")):
+        return called not in READS and (called.startswith("shutil.") or name in SYSTEM_CALLS)
+    if name in ("rename", "replace") and isinstance(call.func, ast.Attribute):
+        return len(call.args) == 1 and not call.keywords  # those of texts and tables have more
+    return name in CHANGES or (
+        name in CHANGES_IF_GIVEN_A_PATH and isinstance(call.func, ast.Attribute) and bool(call.args)
+    )
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        *("open(path, 'w')", "open(path, mode='ab')", "open(path, 'r+b')", "open(path, how)"),
+        *(
+            "path.open('x')",
+            "path.open(mode='w')",
+            "gzip.open(path, 'wb')",
+            "path.write_text('')",
+            "path.write_bytes(b'')",
+        ),
+        *("shutil.rmtree(path)", "shutil.copyfile(a, b)", "os.replace(a, b)", "os.open(path, flags)"),
+        *("path.rename(other)", "path.replace(other)", "path.unlink()", "path.parent.mkdir(parents=True)"),
+        *("figure.savefig(path)", "frame.to_csv(path)", "np.savez(path, a)", "image.save(path)"),
+    ],
+)
+def test_a_call_that_changes_files_is_recognised(line: str) -> None:
+    assert changes_files(next(calls(ast.parse(line))))
+
+
+def test_files_are_changed_in_one_place_which_follows_no_link() -> None:
+    found = {
+        f"{module}: {ast.unparse(call)}"
+        for module, tree in MODULES.items()
+        if module not in WRITERS
+        for call in calls(tree)
+        if changes_files(call)
+    }
+    assert found == set(UNSAFE_BUT)
 
 
 def test_a_users_file_is_run_in_one_place() -> None:

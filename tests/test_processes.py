@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -13,13 +14,16 @@ import pytest
 from tests.training.test_run import small_config
 from tests.worlds.test_workers import has_ended
 from unjam.errors import InputError
+from unjam.folders import HELD_FOLDERS
 from unjam.processes import (
     HEARTBEAT,
     LOCK,
     MISSED,
     PARENT,
     bound,
+    check_not_owned,
     end_with_parent,
+    is_owned,
     owned,
     sweep_private_folders,
 )
@@ -118,7 +122,7 @@ def test_a_process_whose_parent_was_gone_before_ends_at_once() -> None:
 def test_nobody_else_is_bound(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv(PARENT, raising=False)
     end_with_parent(signal.SIGKILL)
-    assert bound({"A": "b"}) == {"A": "b", PARENT: str(os.getpid())}
+    assert bound({"A": "b"}) == {"A": "b", PARENT: str(os.getpid()), HELD_FOLDERS: "[]"}
 
 
 @pytest.mark.long
@@ -140,6 +144,42 @@ def test_a_training_that_was_started_for_another_ends_with_it(tmp_path: Path) ->
     )
     assert parent.returncode == -signal.SIGKILL
     assert soon(int(parent.stdout))
+
+
+def test_who_only_looks_neither_makes_nor_changes_a_lock(tmp_path: Path) -> None:
+    folder, lock, other = tmp_path / "run", tmp_path / "run" / LOCK, tmp_path / "other"
+    folder.mkdir()
+    assert not is_owned(folder)
+    assert list(folder.iterdir()) == []
+    process = holder(folder)
+    before = lock.read_bytes(), lock.stat().st_mtime_ns
+    assert is_owned(folder)
+    with pytest.raises(InputError, match="is being written by another process"):
+        check_not_owned(folder)
+    assert (lock.read_bytes(), lock.stat().st_mtime_ns) == before
+    process.kill()
+    process.wait()
+    assert not is_owned(folder)
+    assert (lock.read_bytes(), lock.stat().st_mtime_ns) == before
+    lock.rename(other)
+    lock.symlink_to(other)
+    assert not is_owned(folder)
+    assert (other.read_bytes(), other.stat().st_mtime_ns) == before
+
+
+@pytest.mark.parametrize("link", [Path.symlink_to, Path.hardlink_to])
+def test_a_lock_that_is_a_link_is_refused_and_what_it_leads_to_stays(
+    link: Callable[[Path, Path], None], tmp_path: Path
+) -> None:
+    (tmp_path / "run").mkdir()
+    (tmp_path / "mine").write_text("mine")
+    link(tmp_path / "run" / LOCK, tmp_path / "mine")
+    with (
+        pytest.raises(InputError, match=r"\.lock' (is a symbolic link|has 2 names)"),
+        owned(tmp_path / "run"),
+    ):
+        pass
+    assert (tmp_path / "mine").read_text() == "mine"
 
 
 def test_an_owner_on_another_machine_holds_a_folder_while_its_heart_beats(tmp_path: Path) -> None:

@@ -1,11 +1,13 @@
-"""Writing files so that nothing is lost or half-written, whatever happens in between."""
+"""Writing files so that nothing is lost or half-written, and nothing outside is written through a link.
+
+All of unjam writes, renames and removes through these functions; `tests/test_layers.py` checks it.
+"""
 
 import errno
 import json
 import math
 import os
-import shutil
-import sys
+import secrets
 import zipfile
 import zlib
 from collections import Counter
@@ -17,6 +19,7 @@ from typing import Any
 from safetensors import SafetensorError
 
 from unjam.errors import DISK_ERRNOS, DiskError, InputError, disk_error
+from unjam.folders import link_error, reached, root_of
 
 LONGEST_INTEGER = 20
 """characters of an integer of 64 bits"""
@@ -30,6 +33,9 @@ DAMAGED = (
 NONE_OF_OURS = (*DAMAGED, zipfile.BadZipFile, zlib.error, EOFError, MemoryError, RuntimeError)
 """what reading can raise where a file is none; `RuntimeError`: of a kind that zipfile does not know"""
 
+APPEND = os.O_WRONLY | os.O_APPEND | os.O_CREAT
+"""flags of `open_in_place`: append to a file, and make a missing one"""
+
 
 @contextmanager
 def reading(what: str) -> Iterator[None]:
@@ -41,24 +47,24 @@ def reading(what: str) -> Iterator[None]:
 
 
 def write_whole(path: Path, content: bytes | str) -> None:
-    """Write a file whole or not at all: to a temporary name, to the disk, then in place.
+    """Write a file whole or not at all: to a random temporary name, to the disk, then in place.
 
     Raises:
+        InputError: it is a link, or inside a held folder it is reached through one.
         DiskError: the disk is full or cannot be written; what was there before is still there.
     """
-    data = content.encode() if isinstance(content, str) else content
-    temporary = path.with_name(f".{path.name}.part")
-    if path.exists() and not path.is_file():
-        raise DiskError(f"cannot write {path}: it is no file")
+    name, temporary = path.name or ".", _temporary_name()
     try:
-        with open(temporary, "wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-        sync_folder(path.parent)
+        with reached(path.parent) as folder:
+            folder.check_writable(name)
+            try:
+                _write(folder.create(temporary), content)
+                folder.rename(temporary, name)
+            except OSError:
+                with suppress(OSError):
+                    folder.remove(temporary)
+                raise
     except OSError as error:
-        temporary.unlink(missing_ok=True)
         raise _disk(error, path) from None
 
 
@@ -70,20 +76,18 @@ def write_new(path: Path, content: bytes, mode: int) -> None:
         DiskError: the disk is full or cannot be written.
     """
     try:
-        descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)
+        with reached(path.parent) as folder:
+            descriptor = folder.create(path.name, mode)
+            try:
+                _write(descriptor, content)
+                folder.sync()
+            except BaseException:
+                folder.remove(path.name)
+                raise
     except FileExistsError:
         raise InputError(f"file: {str(path)!r} exists; allowed: a new one") from None
     except OSError as error:
         raise _disk(error, path) from None
-    try:
-        with open(descriptor, "wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        sync_folder(path.parent)
-    except BaseException as error:
-        path.unlink(missing_ok=True)
-        raise (_disk(error, path) if isinstance(error, OSError) else error) from None
 
 
 def write_folder(folder: Path, files: dict[str, bytes | str]) -> None:
@@ -92,21 +96,32 @@ def write_folder(folder: Path, files: dict[str, bytes | str]) -> None:
     What has its name already is removed before.
 
     Raises:
+        InputError: inside a held folder it is reached through a link.
         DiskError: the disk is full or cannot be written.
     """
-    temporary = folder.with_name(f".{folder.name}.part")
+    remove(folder)
+    make_folder(folder.parent)
+    temporary = _temporary_name()
     try:
-        for old in (temporary, folder):
-            if old.exists():
-                shutil.rmtree(old)
-        temporary.mkdir(parents=True)
-        for name, content in files.items():
-            write_whole(temporary / name, content)
-        os.replace(temporary, folder)
-        sync_folder(folder.parent)
-    except (OSError, DiskError) as error:
-        shutil.rmtree(temporary, ignore_errors=True)
-        raise (_disk(error, folder) if isinstance(error, OSError) else error) from None
+        with reached(folder.parent) as above:
+            try:
+                above.make(temporary)
+                with above.enter(temporary) as inner:
+                    for name, content in files.items():
+                        _write(inner.create(name), content)
+                    inner.sync()
+                above.rename(temporary, folder.name)
+            except OSError:
+                with suppress(OSError):
+                    above.remove(temporary)
+                raise
+    except OSError as error:
+        raise _disk(error, folder) from None
+
+
+def _temporary_name() -> str:
+    """Return a name that nobody can guess, of what `is_leftover` where its process is killed."""
+    return f".{secrets.token_hex(8)}.part"
 
 
 def is_leftover(path: Path) -> bool:
@@ -114,26 +129,65 @@ def is_leftover(path: Path) -> bool:
     return path.name.startswith(".") and path.name.endswith(".part")
 
 
-def sync_folder(folder: Path) -> None:
-    """Let the disk keep the names of a folder's files too; on Windows that is the system's business."""
-    if sys.platform == "win32":
-        return
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
+def _write(descriptor: int, content: bytes | str) -> None:
+    """Write an open file, and to the disk, and close it."""
+    with open(descriptor, "wb") as file:
+        file.write(content.encode() if isinstance(content, str) else content)
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def open_in_place(path: Path, flags: int, mode: int = 0o666) -> int:
+    """Open a file as it is, with the flags of `os.open`, and return its descriptor.
+
+    Raises:
+        InputError: it is a link, is reached through one inside a held folder, or is to be written and has
+            other names (hard links), which may be those of a file elsewhere.
+        DiskError: it is something else than a file.
+        OSError: it cannot be opened.
+    """
+    with reached(path.parent) as folder:
+        folder.check_writable(path.name)
+        descriptor = folder.open(path.name, flags, mode)
+    names = os.fstat(descriptor).st_nlink
+    if names > 1 and flags & (os.O_WRONLY | os.O_RDWR):
         os.close(descriptor)
+        why = f"has {names} names (hard links), and writing it would change the others"
+        raise InputError(f"file: {str(path)!r} {why}; allowed: a file with one name, such as a copy")
+    return descriptor
 
 
 def append_line(path: Path, line: str) -> None:
-    """Append a line to a file, and to the disk; raise `DiskError` where it is full."""
+    """Append a line to a file, and to the disk.
+
+    Raises:
+        InputError: it is a link, or has other names (hard links).
+        DiskError: the disk is full or cannot be written.
+    """
     try:
-        with open(path, "a", encoding="utf-8") as file:
-            file.write(line + "\n")
-            file.flush()
-            os.fsync(file.fileno())
+        _write(open_in_place(path, APPEND), f"{line}\n")
     except OSError as error:
         raise _disk(error, path) from None
+
+
+def remove(path: Path) -> None:
+    """Remove a file, or a folder with everything in it; of a link the link itself. It may be missing.
+
+    Raises:
+        InputError: inside a held folder it is reached through a link.
+        DiskError: it cannot be removed.
+    """
+    try:
+        with suppress(FileNotFoundError), reached(path.parent) as folder:
+            folder.remove(path.name)
+    except OSError as error:
+        raise _disk(error, path) from None
+
+
+def remove_if_empty(folder: Path) -> None:
+    """Remove a folder that is empty; any other stays as it is."""
+    with suppress(OSError):
+        folder.rmdir()
 
 
 def read_lines(path: Path) -> list[dict[str, Any]]:
@@ -153,10 +207,21 @@ def check_folder(path: Path) -> None:
 
 
 def make_folder(path: Path) -> None:
-    """Make a folder and those above it; raise `DiskError` where that is impossible."""
+    """Make a folder and those above it.
+
+    Raises:
+        InputError: it is a link that leads nowhere, or inside a held folder it is reached through a link.
+        DiskError: it cannot be made.
+    """
+    whole = path.absolute()
     try:
+        if root_of(whole) != whole:
+            with reached(whole, make=True):
+                return
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
+        if path.is_symlink():
+            raise link_error(path) from None
         raise _disk(error, path, errno.EEXIST) from None
 
 

@@ -1,11 +1,12 @@
 """Processes that do not outlive the one that wants them, and folders that one process writes at a time."""
 
 import ctypes
+import json
 import os
 import platform
-import shutil
 import signal
 import socket
+import stat
 import sys
 import tempfile
 import threading
@@ -15,7 +16,9 @@ from contextlib import AbstractContextManager, contextmanager, nullcontext, redi
 from functools import cache
 from pathlib import Path
 
-from unjam.errors import InputError
+from unjam.errors import DiskError, InputError
+from unjam.files import open_in_place, remove
+from unjam.folders import HELD_FOLDERS, held_folders, without_links
 from unjam.sandbox import confine, limit
 
 PARENT = "UNJAM_PARENT"
@@ -38,9 +41,10 @@ _is_own = False
 
 
 def bound(environment: Mapping[str, str]) -> dict[str, str]:
-    """Return the environment of a process of unjam that is to end with this one."""
+    """Return the environment of a process of unjam that ends with this one, and holds the same folders."""
     kept = {name: value for name, value in environment.items() if name not in OTHER_TRACI}
-    return {**kept, PARENT: str(os.getpid())}
+    held = json.dumps([str(folder) for folder in held_folders()])
+    return {**kept, HELD_FOLDERS: held, PARENT: str(os.getpid())}
 
 
 def own_this_process() -> None:
@@ -78,9 +82,10 @@ def end_with_parent(signum: int) -> None:
 @contextmanager
 def printed_to(path: Path) -> Iterator[None]:
     """Let a file have what this process, its libraries included, prints as errors meanwhile."""
-    before = os.dup(2)
-    with path.open("wb") as file:
-        os.dup2(file.fileno(), 2)
+    before, descriptor = os.dup(2), open_in_place(path, os.O_WRONLY | os.O_CREAT)
+    os.ftruncate(descriptor, 0)
+    os.dup2(descriptor, 2)
+    os.close(descriptor)
     try:
         yield
     finally:
@@ -156,11 +161,18 @@ def owned(folder: Path) -> Iterator[None]:
     """Hold a folder that is there for this process alone; it is free again when the process ends, however.
 
     Where machines share a folder but not its locks, the lock's age tells that an owner elsewhere still lives.
-    On Windows nothing is held.
+    On Windows there is no lock. Inside the folder no link is followed meanwhile, by child processes neither.
 
     Raises:
-        InputError: another process holds it.
+        InputError: another process holds it, or one of its entries is a link.
     """
+    with without_links(folder), _locked_folder(folder):
+        yield
+
+
+@contextmanager
+def _locked_folder(folder: Path) -> Iterator[None]:
+    """Hold the lock of a folder."""
     path = folder / LOCK
     descriptor = _locked(path)
     while descriptor is not None and not _is_file(path, descriptor):  # its owner removed it just now
@@ -180,7 +192,7 @@ def owned(folder: Path) -> Iterator[None]:
         finally:
             ended.set()
             beats.join()
-            path.unlink(missing_ok=True)
+            remove(path)
     finally:
         os.close(descriptor)
 
@@ -222,35 +234,45 @@ def sweep_private_folders() -> None:
     for folder in Path(tempfile.gettempdir()).glob(f"{PREFIX}*"):
         with suppress(OSError, AttributeError, InputError):  # Windows has no users; somebody holds it
             found = folder.lstat()
-            if found.st_uid != os.getuid() or time.time() - found.st_mtime < MISSED * HEARTBEAT:
+            young = time.time() - found.st_mtime < MISSED * HEARTBEAT
+            if young or found.st_uid != os.getuid() or not stat.S_ISDIR(found.st_mode):
                 continue
             if (folder / HELD).is_file() and (descriptor := _locked(folder / HELD)) is not None:
-                shutil.rmtree(folder, ignore_errors=True)
+                with suppress(DiskError):
+                    remove(folder)
                 os.close(descriptor)
+
+
+def check_not_owned(folder: Path) -> None:
+    """Raise `InputError` where a process holds a folder now; its lock is only read, never written or made."""
+    path = folder / LOCK
+    with suppress(OSError):  # there is none, or it cannot be read
+        if not stat.S_ISREG(path.lstat().st_mode) or (descriptor := _locked(path, reads=True)) is None:
+            return
+        try:
+            _refuse_other_machine(path, descriptor)
+        finally:
+            os.close(descriptor)
 
 
 def is_owned(folder: Path) -> bool:
     """Return whether a process holds a folder now."""
-    if not (folder / LOCK).is_file():
-        return False
     try:
-        with owned(folder):
-            return False
+        check_not_owned(folder)
     except InputError:
         return True
-    except OSError:  # somebody else's folder, which cannot be held
-        return False
+    return False
 
 
-def _locked(path: Path) -> int | None:
-    """Return an open and locked file; None where there are no locks."""
+def _locked(path: Path, reads: bool = False) -> int | None:
+    """Return an open and locked file, for one that only `reads` a shared lock; None without locks."""
     try:
         import fcntl
     except ImportError:
         return None
-    descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+    descriptor = open_in_place(path, os.O_RDONLY if reads else os.O_RDWR | os.O_CREAT, 0o644)
     try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        fcntl.flock(descriptor, (fcntl.LOCK_SH if reads else fcntl.LOCK_EX) | fcntl.LOCK_NB)
     except BlockingIOError:
         os.close(descriptor)
         held = f"run: {str(path.parent)!r} is being written by another process"
@@ -263,6 +285,6 @@ def _locked(path: Path) -> int | None:
 def _is_file(path: Path, descriptor: int) -> bool:
     """Return whether an open file still is the one of that name."""
     try:
-        return os.path.samestat(path.stat(), os.fstat(descriptor))
+        return os.path.samestat(path.lstat(), os.fstat(descriptor))
     except FileNotFoundError:
         return False

@@ -11,8 +11,8 @@ from typing import Any
 
 import platformdirs
 
-from unjam.errors import DiskError, InputError
-from unjam.files import write_whole
+from unjam.errors import InputError, UnjamError
+from unjam.files import make_folder, write_whole
 from unjam.user_code import UserCode, read_code
 
 TRUSTED = "UNJAM_TRUSTED"
@@ -113,9 +113,9 @@ def remember(code: Path, sha256: str = "") -> None:
     if _is_known(key):
         return
     try:
-        _folder().mkdir(parents=True, exist_ok=True)
+        make_folder(_folder())
         write_whole(_folder() / key, os.fsencode(code) + b"\n")
-    except (OSError, DiskError):
+    except (OSError, UnjamError):
         with _lock:
             os.environ[TRUSTED] = " ".join([*_told(), key])
 

@@ -2,6 +2,7 @@
 
 from tests.faults.files import checkpoints, configurations, controllers, full_disks, results, signatures
 from tests.faults.inputs import inputs
+from tests.faults.links import links
 from tests.faults.outcome import Fault
 from tests.faults.processes import hostile, killed_runs, lost_workers, networks, resets
 from tests.faults.trust import caches, cheats, codes, crash_points, lineages, locks, replacements, sandboxes
@@ -75,6 +76,12 @@ FAULTS: dict[str, Fault] = {
         "bytecode beside it",
         replacements,
         quick=12,
+        long=500,
+    ),
+    "links": Fault(
+        "links to files, folders or nothing elsewhere, and hard links, planted in a run folder that goes on",
+        links,
+        quick=40,
         long=500,
     ),
 }

@@ -16,6 +16,7 @@ from tests.training.test_run import small_config
 from unjam import files
 from unjam.errors import DiskError
 from unjam.files import append_line, to_json
+from unjam.folders import Folder
 from unjam.training import folder as run_folder
 from unjam.training.folder import PROGRESS, continue_folder, last_state, save_checkpoint, start_folder
 
@@ -37,6 +38,7 @@ class Disk:
         for name in ("replace", "mkdir", "unlink", "rmdir"):
             patch.setattr(os, name, self.failing(getattr(os, name)))
         patch.setattr(os, "fsync", self.failing(lambda descriptor: None))  # no power is lost here
+        patch.setattr(Folder, "open", self.failing(Folder.open))
         patch.setattr(files, "open", self.opened, raising=False)
 
     def fail(self) -> NoReturn:

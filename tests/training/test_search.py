@@ -205,6 +205,19 @@ def test_values_that_nobody_offered_are_not_tried(tmp_path: Path, trainings: Tra
     assert trainings.done == []
 
 
+def test_a_journal_that_a_crash_has_cut_short_goes_on_and_has_no_link(tmp_path: Path) -> None:
+    journal = pytest.importorskip("unjam.training.journal").Journal
+    path, entries = tmp_path / JOURNAL, [{"op_code": 0, "value": [float("nan")]}, {"op_code": 1}]
+    journal(path).append_logs(entries)
+    with path.open("a") as file:
+        file.write('{"op_code": 2')
+    again = journal(path)
+    again.append_logs([{"op_code": 3}])
+    assert [entry["op_code"] for entry in again.read_logs(0)] == [0, 1, 3]
+    assert [entry["op_code"] for entry in journal(path).read_logs(1)] == [1, 3]
+    assert [each.name for each in tmp_path.iterdir()] == [JOURNAL]
+
+
 def test_a_folder_with_something_else_is_left_alone(tmp_path: Path) -> None:
     (tmp_path / "mine.txt").touch()
     with pytest.raises(InputError, match="is not empty; allowed: a new folder, or that of a search"):

@@ -15,6 +15,7 @@ from rich.markup import escape
 from unjam.cli.options import JsonOption
 from unjam.cli.output import aside, console, new_table, print_json
 from unjam.errors import MissingPartError, UnjamError
+from unjam.files import make_folder
 from unjam.processes import has_display, protections
 
 RESULTS_SUMO = "1.28.0"
@@ -123,11 +124,10 @@ def _cache() -> Check:
 
     folder = cache_folder()
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        make_folder(folder)
         free = shutil.disk_usage(folder).free / 2**30
-    except OSError as error:
-        found = f"{folder}: {error.strerror}"
-        return Check("cache folder", False, found, "set UNJAM_CACHE to a folder of yours")
+    except (UnjamError, OSError) as error:
+        return Check("cache folder", False, str(error), "set UNJAM_CACHE to a folder of yours")
     found, ok = f"{folder}, {free:.0f} GiB free", os.access(folder, os.W_OK) and free > 0.1
     return Check("cache folder", ok, found, "free some space, or set UNJAM_CACHE")
 

@@ -206,7 +206,7 @@ def new_folder(out: Path | None, name: str) -> Path:
         return out
     words = Path(name).stem  # a scenario may be a file
     folders = (Path("runs") / f"{words}-{number:03d}" for number in count(1))
-    return next(folder for folder in folders if not folder.exists())
+    return next(folder for folder in folders if not os.path.lexists(folder))
 
 
 def executor_named(name: str) -> Executor:

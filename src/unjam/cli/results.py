@@ -2,7 +2,6 @@
 
 import logging
 import warnings
-from contextlib import nullcontext
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated
@@ -12,7 +11,7 @@ import typer
 from unjam.cli.options import DEFAULT_WORKERS, HumansOption, JsonOption, WorkersOption, scenario_changes
 from unjam.cli.output import aside, console, counting_steps, new_table, print_json, print_metrics
 from unjam.errors import InputError, go_on_with, wrong
-from unjam.processes import go_on_limited, owned
+from unjam.processes import check_not_owned, go_on_limited, owned
 
 
 def evaluate(
@@ -150,8 +149,9 @@ def report(
     go_on_limited(f"report: {', '.join(map(str, folders))}", target.absolute().parent, Path(get_cachedir()))
     from unjam.reports.html import write_report
 
-    with owned(target.absolute().parent) if target.parent in folders else nullcontext():
-        written = write_report(folders, target)
+    if target.parent in folders:
+        check_not_owned(target.parent)
+    written = write_report(folders, target)
     if json:
         print_json({"report": str(written), "folders": [str(folder) for folder in folders]})
     else:

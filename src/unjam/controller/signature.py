@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from unjam.errors import InputError, MissingPartError, wrong
-from unjam.files import check_folder, to_json, write_new
+from unjam.files import check_folder, remove, to_json, write_new
 
 try:
     from cryptography.exceptions import InvalidSignature, UnsupportedAlgorithm
@@ -79,7 +79,7 @@ def make_keys(name: Path) -> KeyPair:
         shown = known.public_bytes(Encoding.PEM, PublicFormat.SubjectPublicKeyInfo)
         write_new(public, shown, EVERYBODYS)
     except BaseException:
-        private.unlink()
+        remove(private)
         raise
     return KeyPair(private, public, fingerprint_of(known))
 

@@ -83,11 +83,11 @@ def data_uri(figure: Figure) -> str:
     return f"data:image/svg+xml;base64,{base64.b64encode(drawing).decode()}"
 
 
-def png_bytes(figure: Figure, dpi: int = DPI) -> bytes:
-    """Return a figure as a small PNG of 256 colours."""
+def png_bytes(figure: Figure, dpi: int = DPI, small: bool = True) -> bytes:
+    """Return a figure as a PNG, a `small` one of 256 colours."""
     content = io.BytesIO()
     figure.savefig(content, format="png", dpi=dpi)
-    return _few_colours(content.getvalue())
+    return _few_colours(content.getvalue()) if small else content.getvalue()
 
 
 def _few_colours(png: bytes) -> bytes:

@@ -10,6 +10,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from unjam.errors import DiskError, MissingPartError, wrong
 from unjam.files import check_folder, write_whole
+from unjam.processes import PrivateFolder
 from unjam.reports.figures import CAV_COLOUR, INK, colour_table
 from unjam.reports.results import shown_of
 from unjam.scenarios.scenario import VEHICLE_LENGTH
@@ -148,27 +149,25 @@ def _write_mp4(frames: Iterator[Image.Image], path: Path, rate: float) -> None:
         import imageio_ffmpeg
     except ImportError:
         raise MissingPartError("video: .mp4 needs imageio-ffmpeg: pip install imageio-ffmpeg") from None
-    half = path.with_name(f".{path.stem}-half{path.suffix}")  # ffmpeg writes by itself, and says little
-    writer = imageio_ffmpeg.write_frames(
-        str(half),
-        (SIZE, SIZE),
-        fps=rate,  # pyright: ignore[reportArgumentType]  ffmpeg takes fractions too
-        ffmpeg_log_level="error",
-    )
-    writer.send(None)
-    try:
-        for frame in frames:
-            writer.send(np.asarray(frame.convert("RGB")).tobytes())
-        writer.close()
-        imageio_ffmpeg.count_frames_and_secs(str(half))  # which one that was cut short does not survive
-        film = half.read_bytes()
-    except (OSError, RuntimeError) as error:
-        raise DiskError(
-            f"video: {path.name} could not be written: {' '.join(str(error).split())[:200]}"
-        ) from None
-    finally:
-        half.unlink(missing_ok=True)
-    write_whole(path, film)
+    with PrivateFolder() as private:  # ffmpeg writes by itself, through links too, and says little
+        film = Path(private, path.name)
+        writer = imageio_ffmpeg.write_frames(
+            str(film),
+            (SIZE, SIZE),
+            fps=rate,  # pyright: ignore[reportArgumentType]  ffmpeg takes fractions too
+            ffmpeg_log_level="error",
+        )
+        writer.send(None)
+        try:
+            for frame in frames:
+                writer.send(np.asarray(frame.convert("RGB")).tobytes())
+            writer.close()
+            imageio_ffmpeg.count_frames_and_secs(str(film))  # which one that was cut short does not survive
+            content = film.read_bytes()
+        except (OSError, RuntimeError) as error:
+            words = " ".join(str(error).split())[:200]
+            raise DiskError(f"video: {path.name} could not be written: {words}") from None
+    write_whole(path, content)
 
 
 def _frames(episode: Episode, title: str, every: int) -> Iterator[Image.Image]:

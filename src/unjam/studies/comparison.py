@@ -30,7 +30,7 @@ from unjam.measures.statistics import (
     probability_of_improvement,
 )
 from unjam.measures.table import cell_of, unbroken
-from unjam.reports.figures import INK, LINES, STYLE, new_figure, space_time
+from unjam.reports.figures import INK, LINES, STYLE, new_figure, png_bytes, space_time
 from unjam.reports.results import Shown, read_results, validations_of
 from unjam.studies.parts import read_part
 from unjam.studies.references import best_expert
@@ -98,7 +98,9 @@ def comparison_of(title: str, variants: Sequence[str], road: str = "ring") -> St
         found = studies.references(road)
         references = {"all human": found["human"], "best expert": found[best_expert(found, metric)]}
         write_whole(folder / "curves.json", to_json({road: curves}))
-        draw_curves(road, curves, references, metric).savefig(folder / "curves.png")
+        write_whole(
+            folder / "curves.png", png_bytes(draw_curves(road, curves, references, metric), small=False)
+        )
         studies.keep_controllers(planned([road], variants, seeds), folder / "controllers")
 
     tables = {"checkpoints": partial(_checkpoints, road)}
@@ -303,7 +305,7 @@ def draw_curves(
 def _figure_5(studies: StudyFolder, seeds: int, folder: Path, workers: int) -> None:
     """Draw a space-time picture per road: people alone, the best expert, the paper's method and ours."""
     for road in PAPERS_ROADS:
-        space_time(shown_on(studies, road)).savefig(folder / f"{road}.png")
+        write_whole(folder / f"{road}.png", png_bytes(space_time(shown_on(studies, road)), small=False))
 
 
 def shown_on(studies: StudyFolder, road: str) -> list[Shown]:

@@ -39,7 +39,7 @@ from unjam.following.open_loop import (
 )
 from unjam.following.pairs import Pair, Stretches, moments_of, of_split, split_by_trajectory, stretches_of
 from unjam.physics.idm import PAPER_IDM, parameter_rows
-from unjam.reports.figures import INK, LINES, STYLE, new_figure
+from unjam.reports.figures import INK, LINES, STYLE, new_figure, png_bytes
 from unjam.studies.parts import OnProgress, Part, measure_parts
 from unjam.studies.study import Table, about_study
 
@@ -241,7 +241,7 @@ def run(
     rows = summary(measure_parts(folder / "parts", parts, workers, on_progress))
     about["command"] = [about["command"][0], "FOLDER", ngsim.name, astazero.name]
     write_whole(folder / "field.json", to_json({"manifest": about, "rows": rows}, indent=1))
-    picture(rows).savefig(folder / "field.png")
+    write_whole(folder / "field.png", png_bytes(picture(rows), small=False))
 
 
 def summary(parts: Table) -> Table:

@@ -28,7 +28,7 @@ from unjam.following.open_loop import always, idm_follow, with_residual
 from unjam.following.pairs import SPLITS, Floats, Moments, moments_of, of_split, split_by_trajectory
 from unjam.physics.arrays import at_least
 from unjam.physics.idm import PAPER_IDM, idm_acceleration
-from unjam.reports.figures import INK, LINES, STYLE, new_figure
+from unjam.reports.figures import INK, LINES, STYLE, new_figure, png_bytes
 from unjam.studies.parts import OnProgress, Part, measure_parts
 from unjam.studies.study import Study, Table, about_study
 
@@ -212,7 +212,7 @@ def run(
         for row in rows
     ]
     write_whole(folder / "figure-6.json", to_json({"manifest": about, "rows": kept}, indent=1))
-    picture(rows).savefig(folder / "figure-6.png")
+    write_whole(folder / "figure-6.png", png_bytes(picture(rows), small=False))
 
 
 @rc_context(STYLE)

@@ -23,7 +23,7 @@ from unjam.drivers.observation import observation_size
 from unjam.drivers.residual import ResidualDriver
 from unjam.files import to_json, write_whole
 from unjam.measures.statistics import estimate_of, over_trainings
-from unjam.reports.figures import LINES, STYLE, new_figure, stacked_bars
+from unjam.reports.figures import LINES, STYLE, new_figure, png_bytes, stacked_bars
 from unjam.reports.results import read_progress, seconds_by_part
 from unjam.studies.comparison import entries
 from unjam.studies.parts import read_part
@@ -155,7 +155,7 @@ def _write_theory(studies: StudyFolder, seeds: int, folder: Path, workers: int) 
         "model": model_over_training(studies, seeds),
     }
     write_whole(folder / "theory.json", to_json(found, indent=1))
-    draw(found["model"]).savefig(folder / "model.png")
+    write_whole(folder / "model.png", png_bytes(draw(found["model"]), small=False))
 
 
 def measured_seconds(steps: int = STEPS, rounds: int = ROUNDS) -> dict[str, list[dict[str, float]]]:
@@ -193,7 +193,7 @@ def _write_time(studies: StudyFolder, seeds: int, folder: Path, workers: int) ->
     over_trpo = {variant: sum(parts.values()) / of_trpo for variant, parts in medians.items()}
     numbers = {"turns": found, "median": medians, "over_trpo": over_trpo}
     write_whole(folder / "time.json", to_json(numbers, indent=1))
-    draw_time(medians).savefig(folder / "time.png")
+    write_whole(folder / "time.png", png_bytes(draw_time(medians), small=False))
 
 
 def draw_time(seconds: dict[str, dict[str, float]]) -> Figure:

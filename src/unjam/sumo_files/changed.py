@@ -45,7 +45,7 @@ def write_changed(files: SumoFiles, types: Types, scale: float, path: Path) -> P
         write_whole(folder / "types.add.xml", f"<additional>{inside}</additional>\n")
     with PrivateFolder() as private:
         copy, changes = Path(private) / "copy.xml", Path(private) / "types.json"
-        changes.write_text(to_json(types), encoding="utf-8")
+        write_whole(changes, to_json(types))
         for option, kind, originals in (
             ("additional-files", "add", files.additional_files),
             ("route-files", "rou", files.route_files),

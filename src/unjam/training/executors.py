@@ -22,9 +22,10 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from unjam.children import child_environment, child_import_path, isolated_start, python_command
 from unjam.errors import MissingPartError, UnjamError, error_named
-from unjam.files import make_folder, write_whole
+from unjam.files import APPEND, make_folder, open_in_place, write_whole
+from unjam.folders import HELD_FOLDERS
 from unjam.parameters import build
-from unjam.processes import end_with_parent
+from unjam.processes import bound, end_with_parent
 from unjam.trust import FLAG, expecting_code, is_all_trusted
 
 if TYPE_CHECKING:  # the command line asks which executors there are: it is to be quick
@@ -92,7 +93,7 @@ class Processes:
 
     def _once(self, command: CommandLine) -> int:
         line = command.line()
-        with open(command.log, "ab") as log:
+        with open(open_in_place(command.log, APPEND), "ab") as log:
             log.write(f"$ {shlex.join(line)}\n".encode())
             log.flush()
             with subprocess.Popen(
@@ -170,12 +171,14 @@ def _ray(workers: int) -> Iterator[Callable[[CommandLine], int]]:
             ray.init(address="local", num_cpus=workers, include_dashboard=False, log_to_driver=False)
     remote = ray.remote(num_cpus=1, max_retries=ATTEMPTS - 1)(_run_here)
     try:
-        yield lambda command: ray.get(remote.remote(command))
+        yield lambda command: ray.get(remote.remote(command, bound({})[HELD_FOLDERS]))
     finally:
         ray.shutdown()
 
 
-def _run_here(command: CommandLine) -> int:
+def _run_here(command: CommandLine, held_folders: str) -> int:
+    """Run a command line in a process of the cluster, where folders are held that another machine holds."""
+    os.environ[HELD_FOLDERS] = held_folders
     return Processes().run(command)
 
 

@@ -19,6 +19,7 @@ from unjam.errors import InputError, wrong
 from unjam.files import check_folder, make_folder, write_whole
 from unjam.measures.metrics import measure
 from unjam.measures.statistics import summarise
+from unjam.processes import PrivateFolder
 from unjam.reports.results import EVALUATION_FILE, read_about
 from unjam.scenarios import example_of, scenario_from_recipe
 from unjam.scenarios.scenario import Scenario
@@ -138,12 +139,10 @@ def export_controller(source: str | Path, to: str | Path, onnx: bool = False, sc
             raise InputError(f"onnx: {driver.describe()} is not allowed: {why}")
         graph = {GRAPH: onnx_graph(driver, limit)}
     made = controller_bytes(driver, about, {SAMPLE: sample_bytes(driver, states, limit), **graph})
-    unverified = to.with_name(f".{to.stem}.new{to.suffix}")
-    try:
+    with PrivateFolder() as private:
+        unverified = Path(private, to.name)
         write_whole(unverified, made)
         verify_controller(unverified)
-    finally:
-        unverified.unlink(missing_ok=True)
     write_whole(to, made)  # what was there before is good until then
     beside = to.with_suffix(".onnx") if graph else None
     if beside is not None:

@@ -5,7 +5,6 @@ are made at the end of iterations: written whole, checked by hash, two generatio
 """
 
 import json
-import shutil
 from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
@@ -16,8 +15,17 @@ from unjam.controller import make_driver
 from unjam.controller.file import hash_of
 from unjam.drivers.driver import Driver
 from unjam.drivers.observation import feature, observation_size
-from unjam.errors import InputError, wrong
-from unjam.files import DAMAGED, is_leftover, make_folder, to_json, write_folder, write_whole
+from unjam.errors import DiskError, InputError, wrong
+from unjam.files import (
+    DAMAGED,
+    is_leftover,
+    make_folder,
+    remove,
+    remove_if_empty,
+    to_json,
+    write_folder,
+    write_whole,
+)
 from unjam.manifest import manifest, package_versions
 from unjam.parameters import build
 from unjam.processes import LOCK, owned
@@ -115,8 +123,7 @@ def new_and_owned(folder: Path, or_with: str = "") -> Iterator[None]:
             check()  # another may have written it until just now
             yield
     finally:
-        with suppress(OSError):  # it holds something: all went well
-            folder.rmdir()
+        remove_if_empty(folder)  # it holds something where all went well
 
 
 def start_folder(folder: Path, config: RunConfig) -> None:
@@ -226,7 +233,7 @@ def last_state(
         check_belongs(found[0]["belongs"], belongs)
     _sweep(folder / "checkpoint")
     for left in [path for place in places for path in place.glob(".*") if is_leftover(path)]:
-        left.unlink()
+        remove(left)
     done = found[0]["iteration"] if found else 0
     for place in places:
         if (place / PROGRESS).is_file():
@@ -284,7 +291,8 @@ def check_files_of(folder: Path, config: RunConfig) -> None:
 def _sweep(folder: Path) -> None:
     """Remove all but the newest two checkpoints, and those that were not written to their end."""
     for old in [*_places(folder)[:-GENERATIONS], *filter(is_leftover, folder.glob(".*"))]:
-        shutil.rmtree(old, ignore_errors=True)
+        with suppress(DiskError):
+            remove(old)
 
 
 def _hash(state: dict[str, Any], data: bytes) -> str:

@@ -1,17 +1,16 @@
 """Run folders as things: which there are, how far each is, in what they differ, and removing one."""
 
 import os
-import shutil
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
 from unjam.errors import InputError, UnjamError
-from unjam.files import DAMAGED
+from unjam.files import DAMAGED, remove
 from unjam.measures.statistics import Estimate, paired_difference
 from unjam.parameters import flat
-from unjam.processes import is_owned, owned
+from unjam.processes import check_not_owned, is_owned
 from unjam.reports.results import EVALUATION_FILE, damaged, read_about, read_progress
 from unjam.training.config import RunConfig
 from unjam.training.folder import MANIFEST, read_config
@@ -130,5 +129,5 @@ def remove_run(folder: Path) -> None:
     read_run(folder)
     if folder.is_symlink() or Path.cwd().is_relative_to(folder.resolve()):
         raise InputError(f"run: {str(folder)!r} is a link, or where you are; allowed: a run folder elsewhere")
-    with owned(folder):
-        shutil.rmtree(folder)
+    check_not_owned(folder)
+    remove(folder)

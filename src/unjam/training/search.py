@@ -137,7 +137,8 @@ def quiet_optuna(verb: str) -> Any:
 def _study(base: RunConfig, space: Space, folder: Path) -> "Study":
     optuna = quiet_optuna("search")
     from optuna.storages import JournalStorage
-    from optuna.storages.journal import JournalFileBackend
+
+    from unjam.training.journal import Journal
 
     known = (folder / CONFIG).is_file()
     if not known:
@@ -145,7 +146,7 @@ def _study(base: RunConfig, space: Space, folder: Path) -> "Study":
     if known and read_config(folder, to_run=False) != base:
         raise InputError(f"out: {str(folder)!r} is of another configuration; allowed: a new folder")
     write_whole(folder / CONFIG, to_toml(base))
-    storage = JournalStorage(JournalFileBackend(str(folder / JOURNAL)))
+    storage = JournalStorage(Journal(folder / JOURNAL))
     study = optuna.create_study(
         storage=storage, study_name="search", direction="maximize", load_if_exists=True
     )

@@ -1,10 +1,12 @@
-"""Progress of a training as TensorBoard shows it, written by Stable-Baselines3's logger."""
+"""Progress of a training as TensorBoard shows it."""
 
+import secrets
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 from unjam.errors import MissingPartError
+from unjam.files import make_folder
 from unjam.parameters import flat
 from unjam.training.executors import OnIteration
 
@@ -20,19 +22,21 @@ def tensorboard_into(folder: Path | str) -> OnIteration:
     Raises:
         MissingPartError: TensorBoard is not installed.
     """
-    if find_spec("tensorboard") is None:  # Stable-Baselines3 would say so after the first iteration
+    if find_spec("tensorboard") is None:  # else only the first iteration would tell
         raise MissingPartError("tensorboard: it is not installed: pip install 'unjam[train]'")
-    from stable_baselines3.common.logger import Logger, TensorBoardOutputFormat
+    from torch.utils.tensorboard.writer import SummaryWriter
 
-    logger: Logger | None = None
+    place = Path(folder, FOLDER)
+    writer: SummaryWriter | None = None
 
     def write(row: dict[str, Any]) -> None:
-        nonlocal logger
-        if logger is None:  # the run makes its folder first
-            logger = Logger(str(folder), [TensorBoardOutputFormat(str(Path(folder, FOLDER)))])
+        nonlocal writer
+        if writer is None:  # the run makes its folder first
+            make_folder(place)  # no link is followed there, and nobody can guess the name of the file
+            writer = SummaryWriter(str(place), filename_suffix=f".{secrets.token_hex(8)}")
         for name, value in flat(row).items():
             if isinstance(value, int | float) and name not in ("iteration", "actual_steps"):
-                logger.record(name.replace(".", "/", 1), value)
-        logger.dump(row["actual_steps"])
+                writer.add_scalar(name.replace(".", "/", 1), value, row["actual_steps"])
+        writer.flush()
 
     return write

@@ -15,6 +15,7 @@ import platformdirs
 import pytest
 
 from unjam.errors import DiskError, EpisodeError, MissingPartError
+from unjam.files import is_leftover
 from unjam.scenarios import Ring
 from unjam.scenarios.road import RoadNetwork
 from unjam.worlds.sumo import networks
@@ -203,11 +204,11 @@ def test_a_cache_that_cannot_be_a_folder_is_a_disk_error(
 def test_a_disk_that_takes_nothing_is_a_disk_error_and_leaves_nothing_behind(
     problem: int, cache: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def fail(*arguments: Any) -> NoReturn:
+    def fail(*arguments: Any, **options: Any) -> NoReturn:
         raise OSError(problem, os.strerror(problem))
 
     monkeypatch.setattr(os, "replace", fail)
-    with pytest.raises(DiskError, match=f"cannot write .*networks: {os.strerror(problem)}"):
+    with pytest.raises(DiskError, match=f"cannot write .*networks.*: {os.strerror(problem)}"):
         network_file(road_of(230))
     assert files_in(cache) == {cache / "networks"}
 
@@ -262,14 +263,25 @@ def test_a_network_that_a_full_disk_cut_short_is_not_kept(
 
     with monkeypatch.context() as patch:
         patch.setattr(subprocess, "run", run_on_full_disk)
-        with pytest.raises(DiskError, match=r"cannot write .*networks: No space left on device"):
+        with pytest.raises(DiskError, match="cannot write a temporary file: No space left on device"):
             network_file(road_of(230))
     assert files_in(cache) == {cache / "networks"}
     assert len(edges_of(network_file(road_of(230)))) == 4
 
 
-def test_what_another_process_removes_meanwhile_disturbs_nobody(cache: Path) -> None:
-    networks = cache / "networks"
-    networks.mkdir(parents=True, exist_ok=True)
-    (networks / "tmpgone").symlink_to("nowhere")  # it is listed, and is not there
-    assert network_file(road_of(230)).is_file()
+def test_leftovers_are_removed_when_they_are_old_also_by_several_at_once(
+    cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    old, new, gone = (cache / "networks" / f".{name}.part" for name in ("old", "new", "gone"))
+    old.parent.mkdir(parents=True)
+    for path in (old, new, gone):
+        path.touch()
+    os.utime(old, (1, 1))
+
+    def listed(path: Path) -> bool:
+        gone.unlink(missing_ok=True)
+        return is_leftover(path)
+
+    monkeypatch.setattr(networks, "is_leftover", listed)
+    made = network_file(road_of(230))
+    assert files_in(cache) == {made, new}

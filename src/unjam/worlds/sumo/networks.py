@@ -5,7 +5,6 @@ import hashlib
 import os
 import shutil
 import subprocess
-import tempfile
 import time
 from collections import Counter
 from collections.abc import Iterable
@@ -20,7 +19,9 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 import platformdirs
 
-from unjam.errors import DISK_ERRNOS, EpisodeError, MissingPartError, disk_error, wrong
+from unjam.errors import DISK_ERRNOS, DiskError, EpisodeError, MissingPartError, disk_error, wrong
+from unjam.files import is_leftover, make_folder, remove, write_whole
+from unjam.processes import PrivateFolder
 from unjam.scenarios.road import Connection, Edge, Node, RoadNetwork
 from unjam.sumo_files import read_lanes, stamp_of
 from unjam.worlds.record import Floats
@@ -96,23 +97,17 @@ def network_file(network: RoadNetwork) -> Path:
     target = cache_folder() / "networks" / f"{name}.net.xml"
     if is_as_made(target):
         return target
+    make_folder(target.parent)
+    for left in filter(is_leftover, target.parent.glob(".*")):  # of processes that were killed
+        with suppress(FileNotFoundError, DiskError):  # another process has just removed it
+            if time.time() - left.lstat().st_mtime > LONG_AGO:
+                remove(left)
     try:
-        target.parent.mkdir(parents=True, exist_ok=True)
-        for left in target.parent.glob("tmp*"):  # by processes that were killed meanwhile
-            with suppress(FileNotFoundError):  # another process has just removed it
-                if time.time() - left.stat().st_mtime > LONG_AGO:
-                    shutil.rmtree(left, ignore_errors=True)
-        with tempfile.TemporaryDirectory(dir=target.parent) as folder:
-            made = _netconvert(files, options, Path(folder))
-            with made.open("ab") as file:
-                file.write(seal(made.read_bytes()))
-                file.flush()
-                os.fsync(file.fileno())
-            os.replace(made, target)  # whole or not at all, also with several workers at it
+        with PrivateFolder() as folder:
+            made = _netconvert(files, options, Path(folder)).read_bytes()
     except OSError as error:
-        if error.errno in DISK_ERRNOS:
-            raise disk_error(error, target.parent) from None
-        raise
+        raise (disk_error(error, "a temporary file") if error.errno in DISK_ERRNOS else error) from None
+    write_whole(target, made + seal(made))  # whole or not at all, also with several workers at it
     return target
 
 
