@@ -1,6 +1,7 @@
 """The user's own road: any SUMO network with its traffic, some of whose vehicles become CAVs."""
 
 import logging
+from collections.abc import Collection
 from dataclasses import field, replace
 from functools import cache
 from pathlib import Path
@@ -14,15 +15,20 @@ from unjam.drivers.roadside import Roadside
 from unjam.errors import InputError, wrong
 from unjam.parameters import STRICT, Count, NotNegative, Positive, build
 from unjam.scenarios.road import OwnRoad
-from unjam.scenarios.scenario import Scenario
+from unjam.scenarios.scenario import CruiseControl, Scenario
 from unjam.sumo_files import SumoFiles, read_sumo_files
 
 LONGEST = 3600.0
 """seconds of an episode where the configuration names no end"""
-CARS = ("passenger", "private", "hov", "taxi", "evehicle", "delivery", "truck", "trailer", "bus", "coach")
-"""SUMO's vehicle classes that a share picks from"""
 PASSENGER = "passenger"
 """the class of those that calibrated people drive: SUMO's default"""
+PASSENGER_CARS = (PASSENGER, "private", "hov", "taxi", "evehicle")
+"""SUMO's vehicle classes that are passenger cars"""
+ROAD_CLASSES = (
+    *(*PASSENGER_CARS, "ignoring", "emergency", "authority", "army", "vip", "delivery", "truck", "trailer"),
+    *("bus", "coach", "motorcycle", "moped", "custom1", "custom2"),
+)
+"""SUMO's vehicle classes whose vehicles may become CAVs"""
 DRAWN = 100
 """calibrated people of an episode, drawn from the population"""
 WITH_OWN_ACC: dict[str, Any] = {"actuation": "cruise", "safety.active": False}
@@ -45,14 +51,19 @@ class OwnNetwork(Scenario):
     reward: ClassVar[str] = "travel-time"
     closed: ClassVar[bool] = False
     has_coordinate: ClassVar[bool] = False
+    has_vehicle_types: ClassVar[bool] = True
     tells: ClassVar[tuple[str, ...]] = ("allowed_speed", "lane_speeds", "cav_share")
 
     file: str = ""
     """the .sumocfg file"""
     cav_share: Annotated[float, Field(ge=0, le=1)] = 0.0
-    """share of the vehicles that become CAVs, cars and the like alone"""
+    """share of the vehicles of `cav_classes` that become CAVs"""
     cav_types: tuple[str, ...] = ()
-    """vehicle types all of whose vehicles become CAVs"""
+    """vehicle types all of whose vehicles become CAVs, whatever their class"""
+    cav_classes: tuple[str, ...] = PASSENGER_CARS
+    """SUMO's vehicle classes of which the share picks"""
+    cruise: CruiseControl = field(default_factory=lambda: CruiseControl(acceleration=None, deceleration=None))
+    """the CAV's own ACC: it has the limits of acceleration of its vehicle, unless it is given others"""
     cavs: Count | None = None
     """at most so many CAVs: the first of these that enter"""
     begin: NotNegative | None = None
@@ -70,7 +81,10 @@ class OwnNetwork(Scenario):
             files = read_sumo_files(Path(self.file))
         except InputError as error:
             raise ValueError(str(error)) from None
-        known = ", ".join(sorted(files.used_types))
+        known, classes = ", ".join(sorted(files.used_types)), ", ".join(self.cav_classes)
+        for name in self.cav_classes:
+            if name not in ROAD_CLASSES:
+                raise ValueError(f"cav_classes: {name!r} is not allowed; allowed: {', '.join(ROAD_CLASSES)}")
         for name in self.cav_types:
             if name not in files.used_types:
                 raise ValueError(f"cav_types: no vehicle has the type {name!r}; allowed: {known}")
@@ -79,8 +93,11 @@ class OwnNetwork(Scenario):
                 raise ValueError(
                     "cav_share: 0.0 is not allowed without cav_types; allowed: > 0, <= 1, as --cav-share 0.1"
                 )
-            if not any(is_car(files.types.get(name, {})) for name in files.used_types):
-                raise ValueError(f"cav_share: no vehicle is a car; its types are {known}; name cav_types")
+            if not self.eligible_types(files):
+                raise ValueError(
+                    f"cav_share: no vehicle has one of the classes {classes}; its types are "
+                    f"{_list_types(files, files.used_types)}; name cav_classes or cav_types"
+                )
         if self.emission_class != type(self).emission_class:
             raise ValueError(
                 "emission_class: it is not allowed on your own network, whose vehicle types say it"
@@ -108,7 +125,7 @@ class OwnNetwork(Scenario):
             limit_speed=float("nan"),
             cav_share=self.cav_share,
             cav_types=self.cav_types,
-            cars=frozenset(name for name, attributes in files.types.items() if is_car(attributes)),
+            eligible_types=self.eligible_types(files),
             cav_seed=cav_seed,
             cavs=self.cavs,
             roadside=self.roadside,
@@ -119,6 +136,22 @@ class OwnNetwork(Scenario):
         """How people drive."""
         files = "as the vehicle types of its files say"
         return f"in cars {super().people_in_words}; others {files}" if self.calibrated else files
+
+    def eligible_types(self, files: SumoFiles) -> frozenset[str]:
+        """Return the vehicle types in use of which the share picks."""
+        return frozenset(name for name in files.used_types if class_of(files, name) in self.cav_classes)
+
+    @property
+    def notes(self) -> list[str]:
+        """Which vehicles the share leaves human-driven because of their class."""
+        files = read_sumo_files(Path(self.file))
+        others = files.used_types - self.eligible_types(files) - set(self.cav_types)
+        if not self.cav_share or not others:
+            return []
+        return [
+            f"eligible to become CAVs: vehicles of the classes {', '.join(self.cav_classes)}; not those of "
+            f"the types {_list_types(files, others)} (see --cav-classes)"
+        ]
 
     def possible_cavs(self) -> tuple[str, ...]:
         """Return names for as many CAVs as there may be; what their vehicles are called SUMO alone knows.
@@ -133,7 +166,7 @@ class OwnNetwork(Scenario):
     def facts(self) -> list[tuple[str, str]]:
         """Return the road's own facts for `unjam scenarios`."""
         types = ", ".join(self.cav_types)
-        share = f"{100 * self.cav_share:g} % CAV" if self.cav_share else ""
+        share = f"{100 * self.cav_share:g} % CAV of {', '.join(self.cav_classes)}" if self.cav_share else ""
         return [
             ("road", self.file),
             ("vehicles", "as its files say (" + ", ".join(filter(None, (share, types))) + ")"),
@@ -151,6 +184,8 @@ def own_network(file: str, changes: dict[str, Any]) -> OwnNetwork:
     files = read_sumo_files(Path(file).resolve())
     if files.dropped:
         _tell_dropped(files.path.name, files.dropped)
+    if isinstance(cruise := changes.get("cruise", {}), dict):
+        changes = {**changes, "cruise": {"acceleration": None, "deceleration": None, **cruise}}
     values = {"file": str(files.path), "simulation_step": files.step, **changes}
     made = build(OwnNetwork, values, Path(file).name)
     if "horizon" in changes:
@@ -173,10 +208,16 @@ def _tell_dropped(file: str, dropped: tuple[str, ...]) -> None:
 
 def passenger_types(files: SumoFiles) -> list[str]:
     """Return the types of passenger cars that vehicles have; SUMO's default class is that one."""
-    classes = {name: files.types.get(name, {}).get("vClass", PASSENGER) for name in files.used_types}
-    return sorted(name for name, kind in classes.items() if kind == PASSENGER)
+    return sorted(name for name in files.used_types if class_of(files, name) == PASSENGER)
 
 
-def is_car(attributes: dict[str, str]) -> bool:
-    """Return whether a share may pick vehicles of a type; SUMO's default class is a passenger car."""
-    return attributes.get("vClass", "passenger") in CARS
+def class_of(files: SumoFiles, name: str) -> str:
+    """Return SUMO's vehicle class of a type; a type that names none is a passenger car."""
+    return files.types.get(name, {}).get("vClass", PASSENGER)
+
+
+def _list_types(files: SumoFiles, names: Collection[str]) -> str:
+    """Return types with their classes, as far as a line has room for them."""
+    named = [f"{name} ({class_of(files, name)})" for name in sorted(names)]
+    more = f" and {len(named) - MOST_NAMED} more" if len(named) > MOST_NAMED else ""
+    return ", ".join(named[:MOST_NAMED]) + more

@@ -13,6 +13,7 @@ from typing import Any, Literal, NamedTuple
 
 from unjam import sandbox
 from unjam.errors import InputError
+from unjam.sumo_files.program import IN_PARAMETERS, TO_FILES
 
 PROGRAM = Path(__file__).with_name("program.py")
 LARGEST_MEMORY = 4 * 2**30
@@ -74,6 +75,8 @@ class SumoFiles(NamedTuple):
     """files that SUMO gets a harmless copy of; it reads the others themselves"""
     types: dict[str, dict[str, str]]
     """attributes of all vehicle types, by id"""
+    type_parameters: dict[str, dict[str, str]]
+    """nested `<param>` elements of the types: values by key, by the type's id"""
     used_types: frozenset[str]
     """types that vehicles have"""
 
@@ -132,6 +135,16 @@ def stamp_of(file: Path) -> tuple[int, int]:
     """Return time of change and size of a file: another content has another stamp."""
     found = file.stat()
     return found.st_mtime_ns, found.st_size
+
+
+def is_harmless_attribute(name: str) -> bool:
+    """Return whether SUMO may read an attribute of a vehicle type: it names no file."""
+    return name not in TO_FILES and not name.endswith("File")
+
+
+def is_harmless_parameter(key: str) -> bool:
+    """Return whether SUMO may read a `<param>` of a vehicle type: it makes SUMO write no file."""
+    return not any(word in key.lower() for word in IN_PARAMETERS)
 
 
 def _ask(command: Literal["configuration", "lanes", "copy"], path: Path, *more: Path) -> Any:

@@ -9,6 +9,7 @@ import sys
 import zlib
 from collections.abc import Callable, Iterator
 from contextlib import suppress
+from itertools import chain
 from math import isfinite, nan
 from pathlib import Path
 from typing import IO, Any, NamedTuple
@@ -85,10 +86,10 @@ def _configuration(path: Path) -> dict[str, Any]:
     for file in files:
         if not file.is_file():
             raise Broken(f"{str(file)!r}: there is no such file")
-    stamps = {str(file): _stamp(file) for file in files}
+    stamps = {str(file): ((stat := file.stat()).st_mtime_ns, stat.st_size) for file in files}
     filters = {file: _filtered(file) for file in (network, *additional, *routes)}
     _check_network(network, filters[network])
-    demand = _Demand({}, {}, set())
+    demand = _Demand({}, {}, {}, set())
     for file in [*additional, *routes]:
         _read_demand(file, demand)
     if not demand.wanted:
@@ -113,6 +114,7 @@ def _configuration(path: Path) -> dict[str, Any]:
         "end": end,
         "step": _seconds(path, options, "step-length", 1.0) or 1.0,
         "types": demand.types,
+        "type_parameters": demand.parameters,
         "used_types": sorted(used),
         "stamps": stamps,
     }
@@ -132,12 +134,6 @@ def _lanes(path: Path) -> list[Lane]:
     except ValueError as error:
         raise Broken(f"{path.name}: cannot be read: {error}") from None
     return lanes
-
-
-def _stamp(file: Path) -> tuple[int, int]:
-    """Return time of change and size of a file: another content has another stamp."""
-    found = file.stat()
-    return found.st_mtime_ns, found.st_size
 
 
 def _seconds(path: Path, options: dict[str, str], name: str, otherwise: float | None) -> float | None:
@@ -257,6 +253,7 @@ class _Demand(NamedTuple):
     """What files of routes hold."""
 
     types: dict[str, dict[str, str]]
+    parameters: dict[str, dict[str, str]]
     mixtures: dict[str, set[str]]
     """types of each distribution; it may be used in another file than the one that defines it"""
     wanted: set[str]
@@ -268,9 +265,12 @@ def _read_demand(path: Path, demand: _Demand) -> None:
     for element in _elements(path):
         name = element.get("id", "")
         if element.tag == "vType":
-            demand.types[name] = dict(element.attrib)
+            law = (child.items() for child in element if child.tag.startswith("carFollowing-"))
+            demand.types[name] = {**element.attrib, **dict(chain(*law))}
+            pairs = ((each.get("key", ""), each.get("value", "")) for each in element.iter("param"))
+            demand.parameters[name] = dict(pairs)
         elif element.tag == "vTypeDistribution":
-            inside = [child.get("id", "") for child in element if child.tag == "vType"]
+            inside = [child.get("id", child.get("refId", "")) for child in element if child.tag == "vType"]
             demand.mixtures[name] = {*inside, *element.get("vTypes", "").split()}
         elif element.tag in DEMAND:
             demand.wanted.add(element.get("type", DEFAULT_TYPE))

@@ -316,7 +316,7 @@ def drive(
         found = evaluate(made, drivers, seeds, pool, reward, progress)
         report, notes = None, notes_on_controllers(scenario_recipe(made), drivers, found.shown)
         notes += [f"{name} {WANTS_ACC}" for name, one in drivers.items() if _lacks_acc(one, made)]
-        notes += notes_on_teleports(found.rows)
+        notes += [*made.notes, *notes_on_teleports(found.rows)]
         ran = any(row["status"] != "failed" for rows in found.rows.values() for row in rows)
         if folder is not None and ran:
             about = {"scenario": Path(scenario).name, "reward": reward or made.reward, "manifest": manifest()}
