@@ -15,11 +15,12 @@ from unjam.drivers.roadside import Messages
 from unjam.drivers.safety import Ahead
 from unjam.scenarios.road import OwnRoad
 from unjam.worlds.record import Floats
+from unjam.worlds.sumo.control import VehicleLimits
 from unjam.worlds.sumo.files import CALIBRATED_TYPES, CAV_TYPES
 from unjam.worlds.sumo.lanes import Followed, LaneTraffic
 from unjam.worlds.sumo.networks import edge_lengths, lane_counts, network_lines
 from unjam.worlds.sumo.sections import RoadAhead
-from unjam.worlds.sumo.simulation import Neighbours, VehicleLimits
+from unjam.worlds.sumo.simulation import Neighbours
 from unjam.worlds.world import OnProgress
 
 FILTER_SEES = 400.0
