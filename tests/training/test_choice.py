@@ -17,10 +17,10 @@ from unjam.training.choice import (
     PART_CHOOSING,
     UNCHANGED_ACC,
     Budget,
+    Findings,
     Option,
     Rows,
     Seed,
-    Tested,
     choose,
     judge,
     least_episodes,
@@ -67,7 +67,7 @@ def shifted(mean: float, spread: float = 0.3, **changes: Any) -> Change:
 
 def run_judge(
     drive: MadeUp, finalists: Sequence[Option], precision: float = 0.01, split: bool = False
-) -> Tested:
+) -> Findings:
     shares = tuple(dict.fromkeys(option.share for option in finalists)) or (0.1,)
     return judge(finalists, shares, split, drive, drive.budget, precision, quiet)
 

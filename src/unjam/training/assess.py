@@ -27,11 +27,11 @@ from unjam.training.choice import (
     UNCHANGED_ACC,
     Budget,
     Choice,
+    Findings,
     OnLine,
     Option,
     Rows,
     Seed,
-    Tested,
     choose,
     in_words,
     judge,
@@ -240,9 +240,9 @@ def assess(
     return Assessment(tested.judged, tested.acc, json.loads(to_json(document)), page)
 
 
-def _document(asked: Question, choice: Choice, tested: Tested, chose: int, budget: Budget) -> dict[str, Any]:
+def _document(asked: Question, choice: Choice, found: Findings, chose: int, budget: Budget) -> dict[str, Any]:
     """Return what is known in the end, but for the rows."""
-    best = recommended(tested.judged)
+    best = recommended(found.judged)
     tried = [
         {
             **option._asdict(),
@@ -254,12 +254,12 @@ def _document(asked: Question, choice: Choice, tested: Tested, chose: int, budge
         if choice.rows[option]
     ]
     return {
-        "headline": headline(tested.judged, tested.acc),
+        "headline": headline(found.judged, found.acc),
         "recommended": best and {"share": best.share, "driver": best.driver},
-        "judged": [{**asdict(each), "reasons": each.reasons, "words": each.words} for each in tested.judged],
-        "acc": [{**asdict(each), "driver": ACC, "words": each.words} for each in tested.acc],
+        "judged": [{**asdict(each), "reasons": each.reasons, "words": each.words} for each in found.judged],
+        "acc": [{**asdict(each), "driver": ACC, "words": each.words} for each in found.acc],
         "tried": tried,
-        "people": {name: asdict(estimate_of(tested.rows[HUMAN], name)) for name in METRICS_OF_PEOPLE},
+        "people": {name: asdict(estimate_of(found.rows[HUMAN], name)) for name in METRICS_OF_PEOPLE},
         "road": {**scenario_recipe(asked.road), "file": asked.file},
         "people_drive": asked.road.people_in_words,
         "drivers": {name: driver.recipe().get("parameters", {}) for name, driver in asked.drivers.items()},
@@ -267,5 +267,5 @@ def _document(asked: Question, choice: Choice, tested: Tested, chose: int, budge
         "precision": asked.precision,
         "budget": {"episodes": asked.episodes, "minutes": asked.minutes},
         "episodes": {"choosing": chose, "all": budget.spent},
-        "seeds": {"choosing": len(choice.rows[HUMAN]), "judging": len(tested.rows[HUMAN])},
+        "seeds": {"choosing": len(choice.rows[HUMAN]), "judging": len(found.rows[HUMAN])},
     }

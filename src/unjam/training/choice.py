@@ -156,7 +156,7 @@ def choose(options: Sequence[Option], drive: Drive, budget: Budget, on_line: OnL
 
 
 @dataclass(frozen=True)
-class Tested:
+class Findings:
     """What the test seeds have shown."""
 
     rows: dict[Option, Rows]
@@ -172,7 +172,7 @@ def judge(
     budget: Budget,
     precision: float,
     on_line: OnLine,
-) -> Tested:
+) -> Findings:
     """Compare human baseline, ACC vehicles and the chosen controllers on test seeds.
 
     An option is driven until its intervals are narrower than `precision`, a share of the travel time of the
@@ -208,7 +208,7 @@ def judge(
     driven = [row for option in baselines for row in rows[option]]
     if all(row["status"] == "failed" for row in driven):
         raise_failure(driven)
-    return Tested(rows, judged, acc)
+    return Findings(rows, judged, acc)
 
 
 def _judged(option: Option, rows: dict[Option, Rows], confidence: float, precision: float) -> Judged:

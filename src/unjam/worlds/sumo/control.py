@@ -35,11 +35,17 @@ class VehicleControl:
         for name in ids:
             self._sumo.vehicle.setSpeedMode(name, mode)
 
-    def change_type(self, name: str, kind: str) -> None:
-        """Give a vehicle another type; its speed factor, which SUMO draws anew, stays its own."""
+    def change_type(self, name: str, kind: str, is_changed_later: bool = False) -> None:
+        """Give a vehicle another type; its speed factor, which SUMO draws anew, stays its own.
+
+        SUMO draws it once more when the first property of the vehicle itself is changed. If one
+        `is_changed_later`, that happens here.
+        """
         vehicle = self._sumo.vehicle
         factor = vehicle.getSpeedFactor(name)
         vehicle.setType(name, kind)
+        if is_changed_later:
+            vehicle.setMaxSpeed(name, vehicle.getMaxSpeed(name))
         vehicle.setSpeedFactor(name, factor)
 
     def type_of(self, name: str) -> str:
@@ -66,5 +72,5 @@ class VehicleControl:
         """
         mode = SPEED_MODES[actuation] if right_of_way else SPEED_MODES[actuation] & WITHOUT_RIGHT_OF_WAY
         for name in ids:
-            self.change_type(name, types.format(self.type_of(name)))
+            self.change_type(name, types.format(self.type_of(name)), actuation == "cruise")
             self._sumo.vehicle.setSpeedMode(name, mode)
