@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from tests.worlds.sumo.own_roads import straight
+from tests.worlds.sumo.own_roads import SPARSE, network, straight
 from unjam.errors import InputError
 from unjam.reports.assessment import render_assessment
 from unjam.reports.results import read_results, read_rows
@@ -150,6 +150,25 @@ def test_the_answer_does_not_depend_on_the_number_of_workers(
         again = assess(asked, tmp_path / "again", workers)
     assert repr(again.judged) == repr(answer.judged)  # NaN, of what is not known, is not itself
     assert again.document["tried"] == answer.document["tried"]
+
+
+@pytest.mark.parametrize(
+    "vehicle",
+    ['<vType id="own" sigma="0"/>', '<vType id="own" vClass="truck" accel="0.5" maxSpeed="18" sigma="0"/>'],
+    ids=["drawn desired speeds", "weak engines"],
+)
+def test_where_only_the_properties_of_vehicles_could_gain_nothing_is_gained(
+    vehicle: str, tmp_path: Path
+) -> None:
+    file, changes = network(tmp_path, vehicle + SPARSE), {"cav_classes": ["passenger", "truck"]}
+    alone = question(file, [0.5], 12, 0.02, None, ["cruise"], changes)
+    with Workers(2) as workers:
+        found = assess(alone, tmp_path / "out", workers)
+    assert found.document["recommended"] is None
+    assert "ACC vehicles alone are not shown to shorten" in found.document["headline"] or (
+        "ACC vehicles alone lengthen" in found.document["headline"]
+    )
+    assert found.acc[0].effect.travel_time.mean >= -0.1
 
 
 def test_seeds_without_a_cav_are_those_of_the_human_baseline(file: str, tmp_path: Path) -> None:

@@ -95,10 +95,9 @@ class CruiseControl:
                 ACC has where it has none of its own.
         """
         xp, asked = namespace(speed), (wanted - speed) / step
-        own = (self.acceleration, self.deceleration)
-        most, braking = (
-            own if vehicle is None else (each or other for each, other in zip(own, vehicle, strict=True))
-        )
+        own_most, own_braking = vehicle or (0.0, 0.0)
+        most: Array = self.acceleration or own_most
+        braking: Array = self.deceleration or own_braking
         held = asked < at_most(most, highest) - 1e-6
         acc = IDMRows(0.0, self.time_headway, most, braking, IDMParameters().exponent, self.gap)
         faster = desired_speed_for(xp.where(held, asked, 0.0 * asked), speed, acc)

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.worlds.sumo.own_roads import straight
+from tests.worlds.sumo.own_roads import SPARSE, network
 from unjam.controller import make_driver
 from unjam.drivers import Constant, Human
 from unjam.drivers.command import Command
@@ -21,18 +21,7 @@ from unjam.worlds.sumo.simulation import Simulation
 
 LAW = 'carFollowModel="IDM" tau="1.1" minGap="2"'
 """the law of a CAV's own ACC, so that nothing at all may change"""
-FLOW = '<flow id="f" type="own" route="along" begin="0" end="50" period="4" departSpeed="max"/>'
 ACCS = {**WITH_OWN_ACC, "cav_share": 1.0, "end": 60.0}
-
-
-def network(folder: Path, demand: str, more: str = "", options: str = "") -> str:
-    """A road with vehicles, further elements in an additional file, and further options."""
-    file = straight(folder, "", length=800.0)
-    (folder / "demand.rou.xml").write_text(f'<routes><route id="along" edges="road"/>{demand}</routes>')
-    (folder / "more.add.xml").write_text(f"<additional>{more}</additional>")
-    text = file.read_text().replace("<end ", f'<additional-files value="more.add.xml"/>{options}<end ')
-    file.write_text(text)
-    return str(file)
 
 
 def drive(simulation: Simulation, file: str, driver: Driver, **changes: Any) -> Episode:
@@ -56,25 +45,26 @@ PASSENGERS = (
 @pytest.mark.parametrize(
     ("demand", "more", "options"),
     [
-        ('<vType id="own" {law}/>' + FLOW, "", ""),
-        ('<vType id="own" {law} speedFactor="normc(0.9,0.2,0.5,1.5)"/>' + FLOW, "", ""),
+        ('<vType id="own" {law}/>' + SPARSE, "", ""),
+        ('<vType id="own" {law} speedFactor="normc(0.9,0.2,0.5,1.5)"/>' + SPARSE, "", ""),
         (
             '<vType id="own" {law}/><vehicle id="v" type="own" route="along" depart="0" speedFactor="0.7"/>',
             "",
             "",
         ),
         (
-            '<vType id="own" vClass="truck" accel="0.5" decel="4" length="12" maxSpeed="18" {law}/>' + FLOW,
+            '<vType id="own" vClass="truck" accel="0.5" decel="4" length="12" maxSpeed="18" {law}/>' + SPARSE,
             "",
             "",
         ),
         (
-            '<vType id="own" accel="2" emergencyDecel="5" jmTimegapMinor="3" impatience="0.5" {law}/>' + FLOW,
+            '<vType id="own" accel="2" emergencyDecel="5" jmTimegapMinor="3" impatience="0.5" {law}/>'
+            + SPARSE,
             "",
             "",
         ),
         (
-            '<vType id="own" actionStepLength="0.7" {law}/>' + FLOW,
+            '<vType id="own" actionStepLength="0.7" {law}/>' + SPARSE,
             "",
             '<step-method.ballistic value="true"/>',
         ),
@@ -82,21 +72,21 @@ PASSENGERS = (
             '<vType id="own" laneChangeModel="SL2015" latAlignment="arbitrary" minGapLat="0.1" width="0.8" '
             'maxSpeedLat="2" lcPushy="1" {law}/><vType id="slow" vClass="bicycle" maxSpeed="4" width="0.6" '
             'latAlignment="right"/>'
-            + FLOW
+            + SPARSE
             + '<flow id="s" type="slow" route="along" begin="0" end="50" period="9"/>',
             "",
             '<lateral-resolution value="0.4"/>',
         ),
         (PASSENGERS, BUS_STOPS, ""),
         (
-            '<vType id="own" {law}><carFollowing-IDM tau="1.1" minGap="2" accel="0.8"/></vType>' + FLOW,
+            '<vType id="own" {law}><carFollowing-IDM tau="1.1" minGap="2" accel="0.8"/></vType>' + SPARSE,
             "",
             "",
         ),
         (
             '<vTypeDistribution id="mix"><vType id="own" accel="0.6" probability="0.5" {law}/>'
             '<vType id="other" maxSpeed="12" probability="0.5" {law}/></vTypeDistribution>'
-            + FLOW.replace('"own"', '"mix"'),
+            + SPARSE.replace('"own"', '"mix"'),
             "",
             "",
         ),
@@ -141,7 +131,7 @@ def test_each_vehicle_keeps_its_speed_factor_and_others_draw_the_same(
 ) -> None:
     own = '<vehicle id="it" type="own" route="along" depart="1" speedFactor="1.3"/>'
     file = network(
-        tmp_path, '<vType id="own" speedDev="0.3"/>' + FLOW.replace('period="4"', 'period="3"') + own
+        tmp_path, '<vType id="own" speedDev="0.3"/>' + SPARSE.replace('period="4"', 'period="3"') + own
     )
 
     def factors(share: float) -> dict[str, float]:
