@@ -90,11 +90,12 @@ def test_without_a_tested_controller_nothing_is_recommended_or_shown() -> None:
 def test_without_a_verdict_the_words_say_how_wide_the_interval_is_and_what_is_missing() -> None:
     open_one = replace(HELPS, beyond_acc=between(-5.0, 3.0), missing=300.0)
     assert open_one.words.endswith(
-        "; no verdict yet: the interval is ±4.0 s, and a verdict needs about 300 more test seeds."
+        "; no verdict yet: the interval is ±4.0 s, and a verdict needs about 300 more test seeds (900 "
+        "episodes)."
     )
     assert headline([open_one], []).startswith("No controller is recommended on this road so far: ")
     assert "too few for an interval" in replace(open_one, missing=inf).words
-    assert replace(ACC_CHANGES_NOTHING, missing=7.0).words.endswith("about 7 more test seeds.")
+    assert replace(ACC_CHANGES_NOTHING, missing=7.0).words.endswith("about 7 more test seeds (14 episodes).")
 
 
 @pytest.mark.parametrize(

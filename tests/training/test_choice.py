@@ -119,11 +119,15 @@ def test_an_option_that_fails_is_set_aside_with_the_reason() -> None:
         choose([IDM, PI], drive, drive.budget, quiet)
 
 
-@pytest.mark.parametrize("episodes", [least_episodes(2, 2), 40, 200])
-def test_no_step_exceeds_its_part_of_the_budget(episodes: int) -> None:
-    drive = MadeUp({option: shifted(0.0, 40.0) for option in OPTIONS}, episodes)
-    found = choose(OPTIONS, drive, drive.budget, quiet)
-    assert drive.budget.spent <= max(PART_CHOOSING * episodes, 1 + len(OPTIONS))
+@pytest.mark.parametrize("drivers", [2, 5])
+@pytest.mark.parametrize("more", [0, 20, 200])
+def test_no_step_exceeds_its_part_of_the_budget(drivers: int, more: int) -> None:
+    episodes = least_episodes(2, drivers) + more
+    options = [Option(share, f"driver {number}") for share in SHARES for number in range(drivers)]
+    drive = MadeUp({option: shifted(0.0, 40.0) for option in options}, episodes)
+    found = choose(options, drive, drive.budget, quiet)
+    assert [option.share for option in found.finalists] == [*SHARES]
+    assert drive.budget.spent <= max(PART_CHOOSING * episodes, 1 + len(options))
     rows = run_judge(drive, found.finalists, 0.001).rows
     assert drive.budget.spent == len(drive.driven) <= episodes
     assert len(rows[HUMAN]) >= LEAST_TESTED

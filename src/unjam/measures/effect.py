@@ -200,7 +200,7 @@ class AccResult:
         words = (
             f"ACC vehicles alone at a penetration rate of {percent(self.share)}: travel time is {shown} "
             "compared with the human baseline. "
-            f"Differences: {self.effect.words}{_undecided(self.missing, time)}."
+            f"Differences: {self.effect.words}{_undecided(self.missing, time, 2)}."
         )
         if self.of_properties is None:
             return words
@@ -237,7 +237,7 @@ class Judged:
         """What is said of this penetration rate, in a sentence or two."""
         name = f"{self.driver} at a penetration rate of {percent(self.share)}"
         if self.reasons:
-            unknown = _undecided(self.missing, self.beyond_acc)
+            unknown = _undecided(self.missing, self.beyond_acc, 3)
             return f"{name}: not recommended: {'; '.join(self.reasons)}{unknown}."
         found = self.effect
         return (
@@ -249,14 +249,14 @@ class Judged:
         )
 
 
-def _undecided(missing: float, difference: Estimate) -> str:
-    """Return how wide an interval still is, and how many seeds more a verdict would need."""
+def _undecided(missing: float, difference: Estimate, episodes: int) -> str:
+    """Return how wide an interval is, and what a verdict needs at so many `episodes` a seed."""
     if not missing:
         return ""
     half = (difference.high - difference.low) / 2.0
     if not isfinite(missing):
         return f"; no verdict yet: {difference.count} test seeds are too few for an interval"
-    needed = f"a verdict needs about {missing:.0f} more test seeds"
+    needed = f"a verdict needs about {missing:.0f} more test seeds ({episodes * missing:.0f} episodes)"
     return f"; no verdict yet: the interval is ±{half:.1f} s, and {needed}"
 
 

@@ -21,7 +21,7 @@ from unjam.measures.effect import (
     percent,
     seeds_for_verdict,
 )
-from unjam.measures.statistics import CONFIDENCE, paired_difference
+from unjam.measures.statistics import CONFIDENCE, Estimate, paired_difference
 from unjam.training.evaluate import raise_failure
 from unjam.training.seeds import choosing_seeds, held_out_seeds
 
@@ -133,8 +133,9 @@ def choose(options: Sequence[Option], drive: Drive, budget: Budget, on_line: OnL
     rounds = ceil(log2(most)) if most > 1 else 0
     for number in range(rounds):
         fit = budget.seeds(1 + len(left), PART_CHOOSING * (number + 1) / rounds)
-        count = max(1, min(MOST_CHOOSING, fit))
-        _extend(rows, drive([HUMAN, *left], choosing_seeds(count, len(rows[HUMAN]))))
+        count = max(min(MOST_CHOOSING, fit), int(number == 0))
+        if count:
+            _extend(rows, drive([HUMAN, *left], choosing_seeds(count, len(rows[HUMAN]))))
         set_aside |= _failed(rows, left)
         seeds = len(rows[HUMAN])
         if seeds >= LEAST_HARMED:
@@ -196,12 +197,17 @@ def judge(
         judged = [_judged(option, rows, confidence, precision) for option in finalists]
         acc = [_acc_result(option, rows, confidence, precision) for option in baselines]
         affordable = len(rows[HUMAN]) + budget.seeds(1 + len(active))
-        goes_on = {each.share for each in judged if _is_open(each, affordable, precision)}
-        goes_on |= {
+        open_ones = {
+            Option(each.share, each.driver) for each in judged if _is_open(each, affordable, precision)
+        }
+        open_shares = {option.share for option in open_ones} | {
             each.share for each in acc if 0 < each.missing <= affordable - each.effect.travel_time.count
         }
-        ended = {(each.share, each.driver) for each in judged if not _is_open(each, affordable, precision)}
-        active = [each for each in active if each.share in goes_on and each not in ended]
+        active = [
+            option
+            for option in active
+            if option in open_ones or (option not in finalists and option.share in open_shares)
+        ]
         widths = [each.effect.width for each in (*judged, *acc)]
         said = f"{len(rows[HUMAN])} test seeds: {_wide(widths, precision)}, {len(active)} options left"
         on_line(f"{said}{_time_left(budget) if active else ''}")
@@ -217,8 +223,16 @@ def _judged(option: Option, rows: dict[Option, Rows], confidence: float, precisi
     beyond = paired_difference(
         rows[option], rows[Option(option.share, ACC)][: len(rows[option])], "travel_time", confidence
     )
-    needed = seeds_for_verdict(beyond, precision * effect.people_time)
-    return Judged(*option, effect, beyond, max(0.0, needed - beyond.count))
+    narrow = precision * effect.people_time
+    needed = max(seeds_for_verdict(each, narrow) for each in (beyond, effect.travel_time))
+    missing = 0.0 if _is_refused(effect, beyond) else max(0.0, needed - beyond.count)
+    return Judged(*option, effect, beyond, missing)
+
+
+def _is_refused(effect: Effect, beyond_acc: Estimate) -> bool:
+    """Return whether more test seeds can hardly lead to a recommendation."""
+    harms = bool(harm_of(effect)) or beyond_acc.low > 0
+    return bool(effect.failed) or harms or effect.drivable != DRIVABLE
 
 
 def _acc_result(option: Option, rows: dict[Option, Rows], confidence: float, precision: float) -> AccResult:
@@ -235,11 +249,9 @@ def _acc_result(option: Option, rows: dict[Option, Rows], confidence: float, pre
 def _is_open(found: Judged, affordable: int, precision: float) -> bool:
     """Return whether more test seeds may still lead to a recommendation, or make it more precise."""
     effect, beyond = found.effect, found.beyond_acc
-    if effect.failed:
-        return False
     if beyond.count < LEAST_JUDGED:
-        return True
-    hopeless = beyond.mean >= 0 or harm_of(effect) or effect.drivable != DRIVABLE
+        return not effect.failed
+    hopeless = beyond.mean >= 0 or _is_refused(effect, beyond)
     unreachable = found.missing > affordable - beyond.count
     half = (beyond.high - beyond.low) / 2.0
     narrow = max(half / effect.people_time, effect.width) <= precision
