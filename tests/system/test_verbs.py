@@ -175,7 +175,7 @@ def test_assess_answers_in_words_in_json_and_on_a_page(unjam: Run, tmp_path: Pat
     starts = ("- acc at a penetration rate of 50 %: ", "- ACC vehicles alone at a penetration rate of 50 %: ")
     assert [line.startswith(start) for line, start in zip(shares, starts, strict=True)] == [True, True]
     assert "an episode of the human baseline took " in ran.stderr
-    assert "10 test seeds: travel time known to ±" in ran.stderr
+    assert "test seeds: 10; travel time known to ±" in ran.stderr
     assert "report: said/assessment.html" in ran.stderr
     found = document(unjam(*QUESTION, "-n", 36, "--json", pictures=False))
     assert found["folder"] == "runs/assess-straight-001"

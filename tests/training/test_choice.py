@@ -76,7 +76,7 @@ def test_the_best_of_each_penetration_rate_is_chosen_on_tuning_seeds() -> None:
     drive = MadeUp({IDM: shifted(-2), PI: shifted(-4), IDM_MORE: shifted(-3), PI_MORE: shifted(-1)})
     found = choose(OPTIONS, drive, drive.budget, quiet)
     assert found.finalists == [PI, IDM_MORE]
-    assert found.set_aside[IDM].startswith("behind pi on ")
+    assert found.set_aside[IDM].startswith("behind pi (tuning seeds: ")
     assert {seed[0] for _, seed in drive.driven} == {CHOOSE}
     assert drive.seeds_of(HUMAN) == [(CHOOSE, number) for number in range(len(found.rows[HUMAN]))]
 
@@ -230,5 +230,5 @@ def test_each_round_is_told_in_a_line_with_the_time_that_is_left() -> None:
 
     choose([IDM, PI], timed, budget, lines.append)
     judge([PI], (0.1,), False, timed, budget, 0.001, lines.append)
-    assert lines[0] == "5 tuning seeds: 1 of 2 options left; at most 4 min more"
-    assert lines[1].startswith("8 test seeds: travel time known to ±")
+    assert lines[0] == "tuning seeds: 5; 1 of 2 options left; at most 4 min more"
+    assert lines[1].startswith("test seeds: 8; travel time known to ±")

@@ -146,9 +146,9 @@ def choose(options: Sequence[Option], drive: Drive, budget: Budget, on_line: OnL
                 (each for each in left if each.share == share), key=lambda each: _order(found.effect(each))
             )
             for option in ranked[ceil(len(ranked) / 2) :]:
-                set_aside[option] = f"behind {ranked[0].driver} on {seeds} tuning seeds"
+                set_aside[option] = f"behind {ranked[0].driver} (tuning seeds: {seeds})"
         left = [option for option in left if option not in set_aside]
-        on_line(f"{seeds} tuning seeds: {len(left)} of {len(options)} options left{_time_left(budget)}")
+        on_line(f"tuning seeds: {seeds}; {len(left)} of {len(options)} options left{_time_left(budget)}")
         if not left:
             break
     if options and len(_failed(rows, options)) == len(options):
@@ -209,7 +209,7 @@ def judge(
             if option in open_ones or (option not in finalists and option.share in open_shares)
         ]
         widths = [each.effect.width for each in (*judged, *acc)]
-        said = f"{len(rows[HUMAN])} test seeds: {_wide(widths, precision)}, {len(active)} options left"
+        said = f"test seeds: {len(rows[HUMAN])}; {_wide(widths, precision)}, {len(active)} options left"
         on_line(f"{said}{_time_left(budget) if active else ''}")
     driven = [row for option in baselines for row in rows[option]]
     if all(row["status"] == "failed" for row in driven):
