@@ -145,7 +145,7 @@ def people_changes(
     end: EndOption = None,
     humans: HumansOption = None,
 ) -> dict[str, Any]:
-    """Return the changes to a scenario to a network of the user's own: time, human drivers, eligible CAVs."""
+    """Return the changes to a network of the user's own: eligible vehicles, time, human drivers."""
     file = humans if humans is None or humans.startswith(SHIPPED) else str(Path(humans).absolute())
     classes = cav_classes.split(",") if cav_classes else None
     asked = {"cav_classes": classes, "begin": begin, "end": end, "population": file}

@@ -108,7 +108,7 @@ def _motorway_types(scenario: Scenario, road: MotorwayRoad) -> list[str]:
 
 
 def _own_types_xml(scenario: Scenario, road: OwnRoad) -> str:
-    """Return the XML of a CAV type for each of the user's types: all alike but for the car-following law.
+    """Return the XML of a CAV type for each type that may become one: alike but for the car-following law.
 
     Each calibrated driver has such a type for each type of passenger cars. SUMO draws a new speed factor for
     a vehicle that gets another type. From these types it draws none, and the vehicle gets its own back.
@@ -117,11 +117,12 @@ def _own_types_xml(scenario: Scenario, road: OwnRoad) -> str:
     if scenario.actuation != "cruise":
         layer["accel"] = None  # no command makes a vehicle accelerate harder than it can
     layer = {key: value for key, value in layer.items() if value is not None}
-    files, lines = road.files, list[str]()
+    files, lines, cavs = road.files, list[str](), road.eligible_types.union(road.cav_types)
     for name, attributes in files.types.items():
         drivers = enumerate(road.drivers if name in road.driven_types else ())
         laws = {CALIBRATED_TYPES.format(name, number): _idm_layer(one) for number, one in drivers}
-        laws |= {CAV_TYPES.format(own): {**law, **layer} for own, law in {name: {}, **laws}.items()}
+        if name in cavs:
+            laws |= {CAV_TYPES.format(own): {**law, **layer} for own, law in {name: {}, **laws}.items()}
         for variant, law in laws.items():
             lines.append(_variant(variant, attributes, law, files.type_parameters.get(name, {})))
     return "\n".join(["<additional>", *lines, "</additional>"])
