@@ -119,21 +119,24 @@ def test_nothing_speaks_against_what_helps_and_harms_nobody() -> None:
 @pytest.mark.parametrize(
     ("changes", "reason"),
     [
-        ({"travel_time": between(-6, -2, LEAST_JUDGED - 1)}, "9 fresh seeds are too few"),
+        ({"travel_time": between(-6, -2, LEAST_JUDGED - 1)}, "9 test seeds are too few"),
         ({"failed": 3}, "3 episodes failed"),
-        ({"travel_time": between(1, 3)}, "travel time is longer than people's alone: +2.0 [+1.0, +3.0] s"),
+        (
+            {"travel_time": between(1, 3)},
+            "travel time is longer than that of the human baseline: +2.0 [+1.0, +3.0] s",
+        ),
         (
             {"travel_time": between(-6, 0)},
-            "travel time is not shown to be shorter: -3.0 [-6.0, +0.0] s",
+            "travel time is not shown to be shorter than that of the human baseline: -3.0 [-6.0, +0.0] s",
         ),
-        ({"flow": between(-8, -2)}, "flow is lower than people's alone: -5 [-8, -2] veh/h"),
+        ({"flow": between(-8, -2)}, "flow is lower than that of the human baseline: -5 [-8, -2] veh/h"),
         ({"flow": between(-21, 40)}, "flow may be lower by more than 1 %: +10 [-21, +40] veh/h"),
-        ({"drivable": "brakes with 7 m/s2 (1 of 9)"}, "no car could drive so: brakes with 7 m/s2 (1 of 9)"),
-        ({"drivable": ""}, "no car could drive so: no CAV drove"),
+        ({"drivable": "brakes with 7 m/s2 (1 of 9)"}, "infeasible: brakes with 7 m/s2 (1 of 9)"),
+        ({"drivable": ""}, "infeasible: no CAV drove"),
         (
             {"hard_braking": between(-1, 9)},
-            "people brake beyond 4.5 m/s² more often than alone: +4 [-1, +9] times in a million moments, "
-            "of which the mean's sign is asked",
+            "human drivers brake beyond 4.5 m/s² more often than in the human baseline: +4 [-1, +9] times "
+            "in a million moments (only the sign of the mean counts)",
         ),
     ],
 )
@@ -144,8 +147,8 @@ def test_each_failing_is_one_reason(changes: dict[str, Any], reason: str) -> Non
 def test_speed_does_not_excuse_a_loss_of_flow_and_all_reasons_are_told() -> None:
     found = replace(GOOD, travel_time=between(-60, -50), flow=between(-99, -50), drivable="2 in contact")
     assert [reason.split(":")[0] for reason in reasons_against(found)] == [
-        "flow is lower than people's alone",
-        "no car could drive so",
+        "flow is lower than that of the human baseline",
+        "infeasible",
     ]
 
 
@@ -160,6 +163,6 @@ def test_one_seed_has_no_interval_and_proves_nothing() -> None:
 def test_both_harms_are_told_where_both_are_shown() -> None:
     both = replace(GOOD, travel_time=between(2.0, 8.0), flow=between(-150.0, -50.0))
     longer, lower = reasons_against(both)
-    assert longer == "travel time is longer than people's alone: +5.0 [+2.0, +8.0] s"
-    assert lower == "flow is lower than people's alone: -100 [-150, -50] veh/h"
+    assert longer == "travel time is longer than that of the human baseline: +5.0 [+2.0, +8.0] s"
+    assert lower == "flow is lower than that of the human baseline: -100 [-150, -50] veh/h"
     assert harm_of(both) == f"{longer}; {lower}"

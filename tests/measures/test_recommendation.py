@@ -1,53 +1,120 @@
 """Do the words say what the numbers say, whichever way they went?"""
 
 from dataclasses import replace
+from math import inf, nan
+
+import pytest
 
 from tests.measures.test_effect import GOOD, between
-from unjam.measures.effect import Judged, headline, recommended, shown_beside
-
-HELPS = Judged(0.05, "acc", GOOD)
-HELPS_MORE = Judged(0.2, "pi", replace(GOOD, travel_time=between(-12.0, -8.0)))
-QUICK_AND_WRONG = Judged(
-    0.1, "mine.py:bold", replace(GOOD, travel_time=between(-50, -40), flow=between(-90, -50))
+from unjam.measures.effect import (
+    LEAST_JUDGED,
+    AccResult,
+    Judged,
+    headline,
+    recommended,
+    seeds_for_verdict,
+    shown_beside,
 )
+from unjam.measures.statistics import Estimate
+
+BEYOND = between(-3.0, -1.0)
+HELPS = Judged(0.05, "acc", GOOD, BEYOND)
+HELPS_MORE = Judged(0.2, "pi", replace(GOOD, travel_time=between(-12.0, -8.0)), BEYOND)
+QUICK_AND_WRONG = Judged(
+    0.1, "mine.py:bold", replace(GOOD, travel_time=between(-50, -40), flow=between(-90, -50)), BEYOND
+)
+ACC_HELPS = AccResult(0.2, GOOD)
+ACC_CHANGES_NOTHING = AccResult(0.2, replace(GOOD, travel_time=between(-1.0, 1.0)))
 
 
 def test_what_passes_is_recommended_with_its_numbers() -> None:
     assert HELPS.words == (
-        "5 % CAVs that drive as acc: recommended. Travel time -4.0 [-6.0, -2.0] s (-4.0 %), flow "
-        "+10 [-10, +30] veh/h, fuel +0.0 [+0.0, +0.0] ml/km, on 20 fresh seeds."
+        "acc at a penetration rate of 5 %: recommended. Travel time -4.0 [-6.0, -2.0] s (-4.0 %), flow "
+        "+10 [-10, +30] veh/h, fuel +0.0 [+0.0, +0.0] ml/km compared with the human baseline; travel time "
+        "-2.0 [-3.0, -1.0] s compared with ACC vehicles alone; 20 test seeds."
     )
 
 
 def test_a_refusal_says_why() -> None:
     assert QUICK_AND_WRONG.words == (
-        "10 % CAVs that drive as mine.py:bold: not recommended, for flow is lower than people's alone: "
-        "-70 [-90, -50] veh/h."
+        "mine.py:bold at a penetration rate of 10 %: not recommended: flow is lower than that of the human "
+        "baseline: -70 [-90, -50] veh/h."
     )
+
+
+@pytest.mark.parametrize(
+    ("beyond", "shown"),
+    [
+        (between(-1.0, 3.0), "not shown to be shorter than with ACC vehicles alone"),
+        (between(1.0, 3.0), "longer than with ACC vehicles alone"),
+        (Estimate(nan, nan, nan, 0), "not shown to be shorter than with ACC vehicles alone"),
+    ],
+)
+def test_a_gain_that_acc_vehicles_have_too_is_no_reason_for_a_controller(
+    beyond: Estimate, shown: str
+) -> None:
+    found = replace(HELPS, beyond_acc=beyond)
+    assert [shown in reason for reason in found.reasons] == [True]
+    assert recommended([found]) is None
 
 
 def test_the_answer_is_the_largest_gain_among_those_that_pass() -> None:
     judged = [HELPS, QUICK_AND_WRONG, HELPS_MORE]
     assert recommended(judged) == shown_beside(judged) == HELPS_MORE
-    assert headline(judged) == (
-        "20 % CAVs are recommended on this road, driving as pi: travel time -10.0 [-12.0, -8.0] s a vehicle "
-        "(-10.0 %)."
+    assert headline(judged, [ACC_CHANGES_NOTHING]) == (
+        "Recommended on this road: pi at a penetration rate of 20 %. Travel time -10.0 [-12.0, -8.0] s a "
+        "vehicle (-10.0 %) compared with the human baseline, -2.0 [-3.0, -1.0] s compared with ACC vehicles "
+        "alone. ACC vehicles alone are not shown to shorten travel time."
     )
 
 
 def test_where_nothing_passes_nothing_is_recommended_and_the_quickest_is_shown() -> None:
-    judged = [QUICK_AND_WRONG, Judged(0.2, "pi", replace(GOOD, failed=1))]
+    judged = [QUICK_AND_WRONG, Judged(0.2, "pi", replace(GOOD, failed=1), BEYOND)]
     assert recommended(judged) is None
-    assert headline(judged) == (
-        "No CAVs are recommended on this road: none of the shares judged on fresh seeds passes the rule "
-        "(1 of 2 slow traffic or lose flow)."
+    assert headline(judged, [ACC_HELPS]) == (
+        "No controller is recommended on this road: none passes the rule. ACC vehicles alone shorten travel "
+        "time: -4.0 [-6.0, -2.0] s (-4.0 %) at 20 %."
     )
     assert shown_beside(judged) == QUICK_AND_WRONG
 
 
-def test_where_nobody_was_judged_nothing_is_recommended_or_shown() -> None:
+def test_without_a_tested_controller_nothing_is_recommended_or_shown() -> None:
     assert shown_beside([]) is None
-    assert headline([]) == (
-        "No CAVs are recommended on this road: all that was tried did worse than people alone on the seeds "
-        "that choose, or failed."
+    worse = AccResult(0.1, replace(GOOD, travel_time=between(1.0, 2.0)))
+    assert headline([], [worse, ACC_CHANGES_NOTHING]) == (
+        "No controller is recommended on this road: none was tested, or all were set aside before the test. "
+        "ACC vehicles alone lengthen travel time."
     )
+
+
+def test_without_a_verdict_the_words_say_how_wide_the_interval_is_and_what_is_missing() -> None:
+    open_one = replace(HELPS, beyond_acc=between(-5.0, 3.0), missing=300.0)
+    assert open_one.words.endswith(
+        "; no verdict yet: the interval is ±4.0 s, and a verdict needs about 300 more test seeds (900 "
+        "episodes)."
+    )
+    assert headline([open_one], []).startswith("No controller is recommended on this road so far: ")
+    assert "too few for an interval" in replace(open_one, missing=inf).words
+    assert replace(ACC_CHANGES_NOTHING, missing=7.0).words.endswith("about 7 more test seeds (14 episodes).")
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "count", "narrow", "needed"),
+    [
+        (-5.0, 3.0, 20, 0.1, 20 * 4.0**2),  # ±4 around -1: as wide as the mean with a quarter of the width
+        (-5.0, 3.0, 20, 2.0, 20 * 2.0**2),  # narrow enough before it excludes zero
+        (-3.0, -1.0, 40, 0.1, LEAST_JUDGED),
+        (0.0, 0.0, 3, 0.1, LEAST_JUDGED),
+    ],
+)
+def test_seeds_for_a_verdict_follow_from_the_width(
+    low: float, high: float, count: int, narrow: float, needed: float
+) -> None:
+    assert seeds_for_verdict(between(low, high, count), narrow) == needed
+    assert seeds_for_verdict(Estimate(-1.0, nan, nan, 2), narrow) == inf
+
+
+def test_only_with_properties_set_for_cavs_the_gain_is_split() -> None:
+    split = replace(ACC_HELPS, of_properties=between(-4.0, -2.0))
+    assert split.words.endswith("change -3.0 [-4.0, -2.0] s of travel time.")
+    assert "properties" not in ACC_HELPS.words

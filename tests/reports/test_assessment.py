@@ -12,7 +12,7 @@ import pytest
 from tests.measures.test_effect import GOOD, between
 from unjam.errors import InputError
 from unjam.manifest import manifest
-from unjam.measures.effect import Judged, headline, recommended
+from unjam.measures.effect import AccResult, Judged, headline, recommended
 from unjam.measures.metrics import METRICS
 from unjam.measures.statistics import Estimate
 from unjam.reports.assessment import ASSESSMENT_FILE, effects, render_assessment, write_assessment
@@ -20,11 +20,14 @@ from unjam.scenarios import OnRamp, Ring, scenario_recipe
 from unjam.training.evaluate import Evaluation, save_evaluation
 from unjam.worlds.record import Episode
 
-HELPS = Judged(0.1, "acc", GOOD)
+BEYOND = between(-3.0, -1.0)
+HELPS = Judged(0.1, "acc", GOOD, BEYOND)
+WITH_ACC = [AccResult(0.1, GOOD), AccResult(0.2, GOOD)]
 HARMS = Judged(
     0.2,
     "idm:time_headway=1,max_acceleration=2.5,b=<2>",
     replace(GOOD, travel_time=between(3, 5), drivable="brakes with 9 m/s2"),
+    BEYOND,
 )
 UNKNOWN = replace(GOOD, travel_time=Estimate(float("nan"), float("nan"), float("nan"), 0), drivable="")
 
@@ -46,19 +49,20 @@ def folder_of(folder: Path, judged: list[Judged]) -> Path:
     people: dict[str, Any] = dict.fromkeys(METRICS, asdict(Estimate(78.5, 70.0, 80.0, 20)))
     document = {
         "scenario": "my & road.sumocfg",
-        "headline": headline(judged),
+        "headline": headline(judged, WITH_ACC),
         "recommended": best and {"share": best.share, "driver": best.driver},
         "judged": [{**asdict(each), "reasons": each.reasons, "words": each.words} for each in judged],
+        "acc": [{**asdict(each), "driver": "cruise", "words": each.words} for each in WITH_ACC],
         "tried": tried,
         "people": people,
-        "road": scenario_recipe(Ring()),
+        "road": {**scenario_recipe(Ring()), "cav_classes": ["passenger"]},
         "people_drive": "as the vehicle types of its files say",
         "drivers": {"acc": {"time_gap": 1.1}, "pi": {}, HARMS.driver: {}},
         "shares": [0.1, 0.2],
         "precision": 0.02,
         "budget": {"episodes": 400, "minutes": 30.0},
         "episodes": {"choosing": 60, "all": 120},
-        "seeds": {"choosing": 12, "judging": 20 if judged else 0},
+        "seeds": {"choosing": 12, "judging": 20},
         "manifest": manifest(),
     }
     rows = [{"seed": 1, "status": "completed", **dict.fromkeys(METRICS, 1.0)}]
@@ -81,9 +85,10 @@ def cells_of(page: str, label: str) -> list[str]:
 
 
 def test_the_page_leads_with_the_words_of_the_rule(page: str) -> None:
-    assert headline([HELPS, HARMS]) in page
+    assert headline([HELPS, HARMS], WITH_ACC) in page
+    assert WITH_ACC[1].words in page
     assert HELPS.words in page
-    assert "max_acceleration=2.5,b=&lt;2&gt;: not recommended, for travel time is longer" in page
+    assert "b=&lt;2&gt; at a penetration rate of 20 %: not recommended: travel time is longer" in page
     assert "The CAVs are those recommended." in page
 
 
@@ -91,7 +96,7 @@ def test_the_page_says_that_cavs_have_accs_of_their_own_where_they_have(tmp_path
     assert "an ACC of its own" not in page
     folder = folder_of(tmp_path, [HELPS])
     found = json.loads((folder / ASSESSMENT_FILE).read_text())
-    found["road"] = scenario_recipe(OnRamp())
+    found["road"] = {**scenario_recipe(OnRamp()), "cav_classes": ["passenger"]}
     (folder / ASSESSMENT_FILE).write_text(json.dumps(found, default=float).replace("NaN", "null"))
     said = " ".join(render_assessment(folder).split())
     assert (
@@ -101,12 +106,14 @@ def test_the_page_says_that_cavs_have_accs_of_their_own_where_they_have(tmp_path
 
 
 def test_the_tables_have_people_as_they_are_and_cavs_beside_them(page: str) -> None:
-    assert cells_of(page, "recommended") == ["", "yes", "no"]
-    assert cells_of(page, "could a car drive so") == ["", "drivable", "brakes with 9 m/s2"]
-    assert cells_of(page, "travel time, waiting") == ["78.5", "-4.0 [-6.0, -2.0]", "+4.0 [+3.0, +5.0]"]
-    assert cells_of(page, "travel time, of people") == ["", "-4.0", "+4.0"]
-    assert cells_of(page, "flow")[1:] == ["+10 [-10, +30]"] * 2
-    assert cells_of(page, "fresh seeds") == ["20", "20", "20"]
+    assert cells_of(page, "recommended") == ["", "–", "yes", "–", "no"]
+    assert cells_of(page, "feasible") == ["", "drivable", "drivable", "drivable", "brakes with 9 m/s2"]
+    helps, harms = "-4.0 [-6.0, -2.0]", "+4.0 [+3.0, +5.0]"
+    assert cells_of(page, "travel time, waiting") == ["78.5", helps, helps, helps, harms]
+    assert cells_of(page, "travel time, relative to") == ["", "-4.0", "-4.0", "-4.0", "+4.0"]
+    assert cells_of(page, "travel time, compared with ACC") == ["", *["–", "-2.0 [-3.0, -1.0]"] * 2]
+    assert cells_of(page, "flow")[1:] == ["+10 [-10, +30]"] * 4
+    assert cells_of(page, "test seeds") == ["20"] * 5
     *numbers, seeds, drives, became = cells_of(page, "10 %:<wbr> pi")
     assert numbers == ["–", "+10 [-10, +30]", "+0.0 [+0.0, +0.0]", "0"]
     assert (seeds, drives, became) == ("0", "–", "failed: no CAV")
@@ -116,8 +123,8 @@ def test_the_page_says_what_was_assumed_and_needs_no_network(page: str) -> None:
     for words in (
         "as the vehicle types of its files say",
         "time_gap 1.1",
-        "12 chose, 20 others judged; 120 episodes of at most 400 or 30 minutes",
-        "±2 % of people's",
+        "12 tuning seeds, 20 test seeds; 120 episodes of at most 400 or 30 minutes",
+        "±2 % of that of the human baseline",
         "time headway of 1 s",
     ):
         assert words in page.replace("&#39;", "'"), words
@@ -128,21 +135,21 @@ def test_the_page_says_what_was_assumed_and_needs_no_network(page: str) -> None:
 
 def test_where_nothing_is_recommended_the_page_says_so_and_why(tmp_path: Path) -> None:
     page = render_assessment(folder_of(tmp_path, [HARMS]))
-    assert "No CAVs are recommended on this road" in page
-    assert "they are not recommended" in page
-    assert "10 % CAVs: not recommended, for every driver was set aside" in page
+    assert "No controller is recommended on this road" in page
+    assert "it is not recommended" in page
+    assert "10 % CAVs: no controller is recommended; each was set aside" in page
     assert "The quickest, acc: slower than people." in page
 
 
-def test_where_nothing_was_judged_there_is_still_a_page(tmp_path: Path) -> None:
+def test_without_a_tested_controller_the_page_has_the_acc_vehicles(tmp_path: Path) -> None:
     page = render_assessment(folder_of(tmp_path, []))
-    assert "Judged on fresh seeds" not in page
-    assert "All that was tried" in page
+    assert cells_of(page, "recommended") == ["", "–", "–"]
+    assert WITH_ACC[0].words in page
 
 
 def test_where_nobody_reached_the_end_there_is_still_a_picture() -> None:
     judged = {"share": 0.1, "driver": "acc", "effect": {**vars(GOOD), "people_flow": 0.0}}
-    found = {"drivers": {"acc": {}}, "shares": [0.1], "tried": [], "judged": [judged]}
+    found = {"drivers": {"acc": {}}, "shares": [0.1], "tried": [], "acc": [], "judged": [judged]}
     time, flow = effects(found).axes
     assert len(time.lines) > len([line for line in flow.lines if np.isfinite(line.get_ydata()).any()]) == 1
 

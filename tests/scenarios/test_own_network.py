@@ -11,7 +11,7 @@ from tests.worlds.sumo.own_roads import straight
 from unjam.drivers import Human
 from unjam.errors import InputError
 from unjam.scenarios import make_scenario, scenario_from_recipe, scenario_recipe
-from unjam.scenarios.own_network import OwnNetwork, notes_on_network, own_network, passenger_types
+from unjam.scenarios.own_network import OwnNetwork, own_network, passenger_types
 from unjam.scenarios.road import OwnRoad
 from unjam.sumo_files import read_sumo_files
 from unjam.worlds.episode import run_episode
@@ -101,21 +101,97 @@ def test_without_an_end_an_episode_is_an_hour(tmp_path: Path) -> None:
     assert own(tmp_path).horizon == 3600
 
 
-def test_each_type_has_a_cav_type_as_large_and_as_fast(tmp_path: Path) -> None:
-    types = files_of(own(tmp_path), drawn(tmp_path)).traffic
-    kinds = {kind.get("id"): kind.attrib for kind in ElementTree.fromstring(types)}
-    assert set(kinds) == {f"cav_of_{name}" for name in ("car", "truck", "bike", "unused", "DEFAULT_VEHTYPE")}
-    car, truck = kinds["cav_of_car"], kinds["cav_of_truck"]
-    assert (car["length"], car["lcStrategic"], car["carFollowModel"]) == ("4.2", "2", "Krauss")
-    assert (float(car["sigma"]), float(car["speedDev"]), car["minGap"]) == (0.0, 0.0, "0.5")
-    assert (truck["vClass"], truck["maxSpeed"]) == ("truck", "22")
+EVERYTHING = {
+    **{"vClass": "passenger", "length": "4.2", "mass": "3000", "personCapacity": "7", "emergencyDecel": "8"},
+    **{"accel": "1.9", "decel": "3.9", "lcStrategic": "2", "jmDriveAfterRedTime": "3", "minGapLat": "0.3"},
+    **{
+        "latAlignment": "left",
+        "actionStepLength": "1",
+        "boardingDuration": "2",
+        "collisionMinGapFactor": "0.5",
+    },
+}
+LAW = {"carFollowModel": "EIDM", "tau": "0.7", "minGap": "3", "sigma": "0.7", "delta": "7", "stepping": "0.1"}
+ATTRIBUTES = " ".join(f'{name}="{value}"' for name, value in {**EVERYTHING, **LAW}.items())
+TYPE = (
+    f'<routes><vType id="car" {ATTRIBUTES} speedDev="0.4" imgFile="car.png">'
+    '<param key="has.battery.device" value="true"/><param key="device.ssm.file" value="x"/>'
+    '</vType><flow id="f" type="car"/></routes>'
+)
 
 
-def test_a_share_picks_cars_and_the_like_alone(tmp_path: Path) -> None:
-    road = drawn(tmp_path)
-    assert road.cars == {"car", "truck", "unused", "DEFAULT_VEHTYPE"}
+@pytest.mark.parametrize(
+    ("changes", "law", "replaced"),
+    [
+        ({"actuation": "cruise"}, {"carFollowModel": "IDM", "tau": 1.1, "minGap": 2.0, "delta": 4.0}, set()),
+        ({"actuation": "cruise", "cruise.acceleration": 1.0}, {"accel": 1.0}, {"accel"}),
+        ({}, {"carFollowModel": "Krauss", "minGap": 0.5}, {"decel", "emergencyDecel", "actionStepLength"}),
+    ],
+)
+def test_a_cav_type_has_all_attributes_and_parameters_of_its_type_but_the_law(
+    changes: dict[str, Any], law: dict[str, Any], replaced: set[str], tmp_path: Path
+) -> None:
+    scenario = own(tmp_path, routes=TYPE, cav_share=0.5, **changes)
+    types = files_of(scenario, scenario.draw(np.random.default_rng(0))).traffic
+    (car,) = (kind for kind in ElementTree.fromstring(types) if kind.get("id") == "cav_of_car")
+    kept = {name: value for name, value in EVERYTHING.items() if name not in replaced}
+    assert {name: car.get(name) for name in kept} == kept
+    assert {name: car.get(name) for name in law} == {name: str(value) for name, value in law.items()}
+    assert {car.get("stepping"), car.get("imgFile")} == {None}
+    assert float(car.get("sigma", "nan")) == float(car.get("speedDev", "nan")) == 0.0
+    assert [dict(each.items()) for each in car] == [{"key": "has.battery.device", "value": "true"}]
+
+
+@pytest.mark.parametrize(
+    ("changes", "eligible"),
+    [
+        ({}, {"car"}),
+        ({"cav_classes": ["truck"]}, {"truck"}),
+        ({"cav_classes": ["passenger", "truck"]}, {"car", "truck"}),
+    ],
+)
+def test_a_share_picks_passenger_cars_unless_other_classes_are_named(
+    changes: dict[str, Any], eligible: set[str], tmp_path: Path
+) -> None:
+    scenario = own(tmp_path, cav_share=0.5, **changes)
+    road = scenario.draw(np.random.default_rng(0))
+    assert road.eligible_types == eligible
     assert (road.cav_share, road.cav_types) == (0.5, ())
-    assert drawn(tmp_path, cav_types=["bike"]).cav_types == ("bike",)
+    (note,) = scenario.notes
+    others = sorted({"car", "truck", "bike"} - eligible)
+    assert [name for name in ("bike", "car", "truck") if f"{name} (" in note] == others
+    assert not own(tmp_path, cav_types=["bike"]).notes
+
+
+@pytest.mark.parametrize("name", ["passenger", "private", "hov", "taxi", "evehicle", None])
+def test_all_kinds_of_passenger_cars_are_eligible(name: str | None, tmp_path: Path) -> None:
+    kind = f'vClass="{name}"' if name else ""
+    routes = f'<routes><vType id="it" {kind}/><flow id="g" type="it"/></routes>'
+    scenario = own(tmp_path, routes=routes, cav_share=0.5)
+    assert (scenario.draw(np.random.default_rng(0)).eligible_types, scenario.notes) == ({"it"}, [])
+
+
+def test_types_within_distributions_are_eligible_by_their_own_class(tmp_path: Path) -> None:
+    routes = (
+        '<routes><vType id="a"/><vType id="t" vClass="truck"/><vTypeDistribution id="mix">'
+        '<vType refId="a" probability="1"/><vType id="b" vClass="hov" probability="1"/></vTypeDistribution>'
+        '<vTypeDistribution id="more" vTypes="a t"/><flow id="f" type="mix"/><flow id="g" type="more"/>'
+        "</routes>"
+    )
+    assert drawn(tmp_path, routes=routes, cav_share=0.5).eligible_types == {"a", "b"}
+
+
+def test_the_acc_has_the_limits_of_its_vehicle_unless_it_is_given_others(tmp_path: Path) -> None:
+    def cruise(**changes: Any) -> tuple[float | None, float | None]:
+        found = own(tmp_path, cav_share=0.1, **changes).cruise
+        return found.acceleration, found.deceleration
+
+    assert cruise() == cruise(**{"cruise.time_headway": 2.0}) == (None, None)
+    assert cruise(**{"cruise.acceleration": 1.5}) == (1.5, None)
+    with pytest.raises(
+        InputError, match=r"cruise.acceleration: None is not allowed on on-ramp; allowed: > 0"
+    ):
+        make_scenario("on-ramp", {"cruise.acceleration": None})
 
 
 def test_other_episodes_pick_other_vehicles(tmp_path: Path) -> None:
@@ -128,7 +204,10 @@ def test_other_episodes_pick_other_vehicles(tmp_path: Path) -> None:
 def test_recipe_makes_the_same_scenario_again(tmp_path: Path) -> None:
     scenario = own(tmp_path, TIMES, cav_types=["car", "truck"], cav_share=0.25)
     assert scenario_from_recipe(scenario_recipe(scenario)) == scenario
-    assert dict(scenario.facts())["vehicles"] == "as its files say (25 % CAV, car, truck)"
+    assert (
+        dict(scenario.facts())["vehicles"]
+        == "as its files say (25 % CAV of passenger, private, hov, taxi, evehicle, car, truck)"
+    )
 
 
 def test_its_vehicles_are_not_known_before(tmp_path: Path) -> None:
@@ -148,7 +227,17 @@ BIKES = '<routes><vType id="bike" vClass="bicycle"/><flow id="g" type="bike"/></
         ({"cav_share": "some"}, TYPES, "cav_share: 'some'"),
         ({"cav_types": ["tank"]}, TYPES, "no vehicle has the type 'tank'; allowed: bike, car, truck"),
         ({"cav_types": ["unused"]}, TYPES, "no vehicle has the type 'unused'"),
-        ({"cav_share": 0.1}, BIKES, "no vehicle is a car; its types are bike; name cav_types"),
+        (
+            {"cav_share": 0.1},
+            BIKES,
+            "no vehicle has one of the classes passenger, private, hov, taxi, evehicle; its types are bike "
+            "(bicycle); name cav_classes or cav_types",
+        ),
+        (
+            {"cav_share": 0.1, "cav_classes": ["car"]},
+            TYPES,
+            "cav_classes: 'car' is not allowed; allowed: pass",
+        ),
         (
             {"cav_share": 0.1, "human_control": "commanded"},
             TYPES,
@@ -171,7 +260,7 @@ def test_wrong_values_get_one_clear_line(
 
 def test_a_type_that_sumo_has_by_itself_may_be_a_cav(tmp_path: Path) -> None:
     routes = '<routes><flow id="g" type="DEFAULT_BIKETYPE"/></routes>'
-    with pytest.raises(InputError, match="no vehicle is a car"):
+    with pytest.raises(InputError, match="no vehicle has one of the classes"):
         own(tmp_path, routes=routes)
     road = drawn(tmp_path, routes=routes, cav_types=["DEFAULT_BIKETYPE"])
     types = ElementTree.fromstring(files_of(own(tmp_path), road).traffic)
@@ -188,11 +277,11 @@ def test_trains_ships_and_aircraft_never_become_cavs(attributes: str, tmp_path: 
     )
     with pytest.raises(InputError, match="cav_types: 'train' is not allowed, for it is no type of road"):
         own(tmp_path, routes=routes.format(""), cav_types=("train",))
-    with pytest.raises(InputError, match="cav_share: no vehicle is a car"):
+    with pytest.raises(InputError, match="cav_share: no vehicle has one of the classes"):
         own(tmp_path, routes=routes.format(""), cav_share=1.0)
     found = own(tmp_path, routes=routes.format('<trip id="c" type="car"/>'), cav_share=1.0)
     files = read_sumo_files(tmp_path / "road.sumocfg")
-    assert found.draw(np.random.default_rng(0)).cars == {"car", "DEFAULT_VEHTYPE"}
+    assert found.draw(np.random.default_rng(0)).eligible_types == {"car"}
     assert passenger_types(files) == ["car"]
 
 
@@ -208,8 +297,8 @@ def test_demand_that_begins_after_the_end_is_refused(changes: dict[str, Any], tm
 
 def test_what_differs_from_sumo_alone_is_noted(tmp_path: Path) -> None:
     inside = '<seed value="7"/><max-depart-delay value="9"/><fcd-output value="x"/><tripinfo value="y"/>'
-    assert notes_on_network(own(tmp_path, inside)) == [
+    assert own(tmp_path, inside).notes[:-1] == [
         "road.sumocfg: left out, for they only write or listen: option fcd-output, option tripinfo",
         "road.sumocfg: unjam has a value of its own for: seed, max-depart-delay",
     ]
-    assert notes_on_network(make_scenario("ring")) == []
+    assert make_scenario("ring").notes == []

@@ -172,14 +172,15 @@ def test_assess_answers_in_words_in_json_and_on_a_page(unjam: Run, tmp_path: Pat
     assert ran.returncode == 0, ran.stderr
     answer, *shares = ran.stdout.splitlines()
     assert "recommended on this road" in answer
-    assert [line.startswith("- 50 % CAVs that drive as acc: ") for line in shares] == [True]
-    assert "choosing, 2 seeds: 1 of 1 left" in ran.stderr
-    assert "judging, 10 fresh seeds" in ran.stderr
+    starts = ("- acc at a penetration rate of 50 %: ", "- ACC vehicles alone at a penetration rate of 50 %: ")
+    assert [line.startswith(start) for line, start in zip(shares, starts, strict=True)] == [True, True]
+    assert "an episode of the human baseline took " in ran.stderr
+    assert "test seeds: 10; travel time known to ±" in ran.stderr
     assert "report: said/assessment.html" in ran.stderr
     found = document(unjam(*QUESTION, "-n", 36, "--json", pictures=False))
     assert found["folder"] == "runs/assess-straight-001"
     assert found["headline"] == answer
-    assert [f"- {each['words']}" for each in found["judged"]] == shares
+    assert [f"- {each['words']}" for each in (*found["judged"], *found["acc"])] == shares
     kept = {path.name for path in (tmp_path / "said").iterdir()}
     assert kept == {
         *("assessment.html", "assessment.json", "choosing"),
@@ -194,7 +195,7 @@ def test_assess_answers_in_words_in_json_and_on_a_page(unjam: Run, tmp_path: Pat
     [
         pytest.param(
             (*QUESTION, "-n", "5000", "--precision", "1e-9"),
-            ("assessing", "choosing"),
+            ("assessing", "an episode"),
             marks=pytest.mark.slow,
         ),
         (("drive", "ring", "-d", "pi", "-n", "5000"), ("driving",)),

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from tests.worlds.sumo.own_roads import straight
+from tests.worlds.sumo.own_roads import SPARSE, network, straight
 from unjam.errors import InputError
 from unjam.reports.assessment import render_assessment
 from unjam.reports.results import read_results, read_rows
@@ -19,7 +19,7 @@ from unjam.training.assess import (
     assess,
     question,
 )
-from unjam.training.choice import PEOPLE, Option
+from unjam.training.choice import ACC, HUMAN, UNCHANGED_ACC, Option
 from unjam.worlds.workers import Workers
 
 HELD = {"horizon": 150, "actuation": "shielded", "safety.active": True}
@@ -45,15 +45,33 @@ def answer(asked: Question, tmp_path_factory: pytest.TempPathFactory) -> Iterato
         yield assess(asked, tmp_path_factory.mktemp("answer") / "out", workers)
 
 
-def test_a_question_has_all_shares_and_drivers_and_people_alone(file: str) -> None:
+def test_a_question_has_all_penetration_rates_and_controllers_and_two_baselines(file: str) -> None:
     usual = question(file, [0.2, 0.0, 0.1], 400, 0.02)
     assert usual.shares == (0.1, 0.2)
     assert len(usual.options) == 2 * len(DRIVERS_OF_OPEN_ROADS)
-    road, driver = usual.setup(PEOPLE)
+    road, driver = usual.setup(HUMAN)
     assert (road, driver.native) == (usual.road, True)
+    assert set(question(file, [0.1], 400, 0.02, None, ["cruise", "pi"]).drivers) == {"pi"}
     road, driver = usual.setup(Option(0.2, "pi"))
     assert road.cav_share == 0.2  # pyright: ignore[reportAttributeAccessIssue]
     assert driver.name == "pi"
+
+
+def test_acc_vehicles_are_the_baseline_of_controllers_that_drive_without_an_acc_too(file: str) -> None:
+    road, driver = question(file, [0.1], 400, 0.02, None, ["pi"], HELD).setup(Option(0.1, ACC))
+    assert (road.actuation, road.safety.active, driver.name) == ("cruise", False, "cruise")
+    assert (road.cruise.acceleration, road.cruise.deceleration) == (None, None)
+
+
+@pytest.mark.parametrize("name", ["acceleration", "deceleration", "keep_right", "overtake"])
+def test_a_property_that_is_set_for_cavs_is_compared_with_unchanged_vehicles(name: str, file: str) -> None:
+    plain = question(file, [0.1], 400, 0.02, None, ["pi"], {"cruise.time_headway": 1.5})
+    assert not plain.sets_properties
+    found = question(file, [0.1], 400, 0.02, None, ["pi"], {f"cruise.{name}": 3.0, "cruise.gap": 2.5})
+    assert found.sets_properties
+    roads = [found.setup(Option(0.1, driver))[0].cruise for driver in (ACC, UNCHANGED_ACC)]
+    assert [getattr(road, name) for road in roads] == [3.0, None]
+    assert [road.gap for road in roads] == [2.5, 2.5]
 
 
 @pytest.mark.parametrize(
@@ -62,10 +80,16 @@ def test_a_question_has_all_shares_and_drivers_and_people_alone(file: str) -> No
         ({"shares": [0.1, 1.2]}, "shares: 1.2 is not allowed; allowed: >= 0, <= 1"),
         ({"shares": [float("nan")]}, "shares: nan"),
         ({"shares": [0.0]}, "shares: '0' is not allowed; allowed: one above 0"),
-        ({"episodes": 109}, "episodes: 109 is not allowed; allowed: >= 110 for 2 shares and 4 drivers"),
+        (
+            {"episodes": 23},
+            "episodes: 23 is not allowed; allowed: >= 24 for 2 penetration rates and 3 control",
+        ),
         ({"minutes": 0.0}, "minutes: 0.0"),
         ({"precision": 1.0}, "precision: 1.0"),
-        ({"drivers": ["human"]}, "driver: 'human' is not allowed; allowed: people alone are driven anyway"),
+        (
+            {"drivers": ["human"]},
+            "driver: 'human' is not allowed; allowed: the human baseline is driven anyway",
+        ),
         ({"drivers": ["pacer"]}, "driver: 'pacer' is not allowed; allowed: one that needs no closed road"),
         ({"drivers": ["ghost"]}, "driver: 'ghost'"),
         ({"changes": {"cav_share": 0.5}}, "cav_share: it is not allowed here"),
@@ -90,12 +114,12 @@ def test_all_rows_are_kept_those_that_chose_apart(asked: Question, answer: Asses
     chose, judged = read_rows(folder / CHOOSING), read_rows(folder)
     (found,) = answer.judged
     assert set(chose) == {"human", "acc, 50 %", "idm, 50 %"}
-    assert set(judged) == {"human", f"{found.driver}, 50 %"}
+    assert set(judged) == {"human", "cruise, 50 %", f"{found.driver}, 50 %"}
     assert not {str(row["seed"]) for row in chose["human"]} & {str(row["seed"]) for row in judged["human"]}
     driven = sum(map(len, [*chose.values(), *judged.values()])) + 2
     assert answer.document["episodes"]["all"] == driven <= asked.episodes
     assert all(row["status"] == "completed" for rows in judged.values() for row in rows)
-    assert [*read_results(folder).shown] == list(judged)
+    assert [*read_results(folder).shown] == ["human", f"{found.driver}, 50 %"]
 
 
 def test_the_document_is_that_of_the_folder_and_says_what_is_judged(answer: Assessment) -> None:
@@ -105,8 +129,11 @@ def test_the_document_is_that_of_the_folder_and_says_what_is_judged(answer: Asse
     (said,) = written["judged"]
     assert (said["driver"], said["reasons"], said["words"]) == (found.driver, found.reasons, found.words)
     assert said["effect"]["travel_time"]["mean"] == found.effect.travel_time.mean
+    assert said["beyond_acc"]["mean"] == found.beyond_acc.mean
+    (acc,) = written["acc"]
+    assert (acc["share"], acc["words"]) == (0.5, answer.acc[0].words)
     assert (written["recommended"] is None) == bool(found.reasons)
-    assert written["people"]["travel_time"]["count"] == written["seeds"]["judging"] >= 10
+    assert written["people"]["travel_time"]["count"] == written["seeds"]["judging"] >= 5
     assert written["manifest"]["packages"]["libsumo"]
     assert written["notes"] == ["straight.sumocfg: unjam has a value of its own for: seed"]
     page = render_assessment(answer.page.parent)
@@ -127,17 +154,34 @@ def test_the_answer_does_not_depend_on_the_number_of_workers(
     assert again.document["tried"] == answer.document["tried"]
 
 
-def test_seeds_without_a_cav_are_those_of_people_alone(file: str, tmp_path: Path) -> None:
-    few = question(file, [0.06], 40, 0.02, None, ["acc"], HELD)
+@pytest.mark.parametrize(
+    "vehicle",
+    ['<vType id="own" sigma="0"/>', '<vType id="own" vClass="truck" accel="0.5" maxSpeed="18" sigma="0"/>'],
+    ids=["drawn desired speeds", "weak engines"],
+)
+def test_where_only_the_properties_of_vehicles_could_gain_nothing_is_gained(
+    vehicle: str, tmp_path: Path
+) -> None:
+    file, changes = network(tmp_path, vehicle + SPARSE), {"cav_classes": ["passenger", "truck"]}
+    alone = question(file, [0.5], 12, 0.02, None, ["cruise"], changes)
     with Workers(2) as workers:
-        found = assess(few, tmp_path / "out", workers)
-    [tried] = found.document["tried"]
-    assert tried["set_aside"] == ""
-    rows = read_rows(tmp_path / "out" / CHOOSING)
-    people, driven = rows.values()
-    same = [one["travel_time"] == other["travel_time"] for one, other in zip(people, driven, strict=True)]
-    assert any(same)
-    assert not any(row["status"] == "failed" for row in driven)
+        found = assess(alone, tmp_path / "out", workers)
+    assert found.document["recommended"] is None
+    assert "ACC vehicles alone are not shown to shorten" in found.document["headline"] or (
+        "ACC vehicles alone lengthen" in found.document["headline"]
+    )
+    assert found.acc[0].effect.travel_time.mean >= -0.1
+
+
+def test_seeds_without_a_cav_are_those_of_the_human_baseline(file: str, tmp_path: Path) -> None:
+    few = question(file, [0.06], 20, 0.02, None, ["acc"], HELD)
+    with Workers(2) as workers:
+        assess(few, tmp_path / "out", workers)
+    people, acc, driven = read_rows(tmp_path / "out").values()
+    for found in (acc, driven):
+        assert not any(row["status"] == "failed" for row in found)
+    pairs = zip(people, driven, strict=False)
+    assert any(one["travel_time"] == other["travel_time"] for one, other in pairs)
 
 
 def test_a_folder_with_something_in_it_is_left_alone(asked: Question, tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Is the best driver of each share found, judged where nothing was chosen, and the budget kept?"""
+"""Is the best controller of each penetration rate found, tested on other seeds, and the budget kept?"""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -10,9 +10,14 @@ from tests.measures.test_effect import USUAL
 from unjam.errors import InputError
 from unjam.measures.effect import LEAST_JUDGED
 from unjam.training.choice import (
-    LEAST_CHOOSING,
-    PEOPLE,
+    ACC,
+    HUMAN,
+    LEAST_TESTED,
+    MOST_CHOOSING,
+    PART_CHOOSING,
+    UNCHANGED_ACC,
     Budget,
+    Findings,
     Option,
     Rows,
     Seed,
@@ -22,9 +27,11 @@ from unjam.training.choice import (
 )
 from unjam.training.seeds import CHOOSE, JUDGE
 
-ACC, PI = (Option(0.1, name) for name in ("acc", "pi"))
-ACC_MORE, PI_MORE = (Option(0.2, name) for name in ("acc", "pi"))
-OPTIONS = [ACC, PI, ACC_MORE, PI_MORE]
+SHARES = (0.1, 0.2)
+IDM, PI = (Option(0.1, name) for name in ("idm", "pi"))
+IDM_MORE, PI_MORE = (Option(0.2, name) for name in ("idm", "pi"))
+OPTIONS = [IDM, PI, IDM_MORE, PI_MORE]
+BASELINE = Option(0.1, ACC)
 Change = Callable[[np.random.Generator], dict[str, Any]]
 
 
@@ -33,11 +40,11 @@ def quiet(line: str) -> None:
 
 
 class MadeUp:
-    """Traffic of no simulator: people take a random time on each seed, CAVs change it."""
+    """Traffic without a simulator: human drivers take a random time on each seed, and CAVs change it."""
 
-    def __init__(self, changes: dict[Option, Change], episodes: int = 1000) -> None:
+    def __init__(self, changes: dict[Option, Change], episodes: int = 1000, **budget: Any) -> None:
         self.changes, self.driven = changes, list[tuple[Option, Seed]]()
-        self.budget = Budget(episodes)
+        self.budget = Budget(episodes, **budget)
 
     def __call__(self, options: Sequence[Option], seeds: Sequence[Seed]) -> dict[Option, Rows]:
         self.driven += [(option, seed) for option in options for seed in seeds]
@@ -58,107 +65,170 @@ def shifted(mean: float, spread: float = 0.3, **changes: Any) -> Change:
     return lambda generator: {"travel_time": generator.normal(mean, spread), **changes}
 
 
-def test_the_best_of_each_share_is_chosen_and_what_harms_is_set_aside_early() -> None:
-    drive = MadeUp({ACC: shifted(-2), PI: shifted(-4), ACC_MORE: shifted(3), PI_MORE: shifted(-1, 4.0)})
-    found = choose(OPTIONS, drive, drive.budget, 0.001, quiet)
-    assert found.finalists == [PI, PI_MORE]
-    assert found.set_aside[ACC].startswith("slower than pi: travel time +")
-    assert found.set_aside[ACC_MORE].startswith("travel time is longer than people's alone")
-    assert len(drive.seeds_of(ACC)) == LEAST_CHOOSING
+def run_judge(
+    drive: MadeUp, finalists: Sequence[Option], precision: float = 0.01, split: bool = False
+) -> Findings:
+    shares = tuple(dict.fromkeys(option.share for option in finalists)) or (0.1,)
+    return judge(finalists, shares, split, drive, drive.budget, precision, quiet)
+
+
+def test_the_best_of_each_penetration_rate_is_chosen_on_tuning_seeds() -> None:
+    drive = MadeUp({IDM: shifted(-2), PI: shifted(-4), IDM_MORE: shifted(-3), PI_MORE: shifted(-1)})
+    found = choose(OPTIONS, drive, drive.budget, quiet)
+    assert found.finalists == [PI, IDM_MORE]
+    assert found.set_aside[IDM].startswith("behind pi (tuning seeds: ")
     assert {seed[0] for _, seed in drive.driven} == {CHOOSE}
-    assert drive.seeds_of(PEOPLE) == [(CHOOSE, number) for number in range(len(found.rows[PEOPLE]))]
+    assert drive.seeds_of(HUMAN) == [(CHOOSE, number) for number in range(len(found.rows[HUMAN]))]
+
+
+def test_half_of_the_controllers_stop_after_each_round() -> None:
+    many = [Option(0.1, name) for name in ("a", "b", "c", "d", "e")]
+    drive = MadeUp({option: shifted(-number) for number, option in enumerate(many)})
+    found = choose(many, drive, drive.budget, quiet)
+    assert found.finalists == [many[-1]]
+    counts = [len(drive.seeds_of(option)) for option in (*many, HUMAN)]
+    assert counts == [MOST_CHOOSING * rounds for rounds in (1, 1, 2, 3, 3, 3)]
+
+
+def test_a_single_controller_costs_no_tuning_seeds() -> None:
+    drive = MadeUp({})
+    assert choose([PI, IDM_MORE], drive, drive.budget, quiet).finalists == [PI, IDM_MORE]
+    assert not drive.driven
 
 
 def test_less_flow_is_a_loss_however_quick() -> None:
-    drive = MadeUp({ACC: shifted(-30, throughput_veh_per_h=1900.0), PI: shifted(-1)})
-    found = choose([ACC, PI], drive, drive.budget, 0.01, quiet)
+    drive = MadeUp({IDM: shifted(-30, throughput_veh_per_h=1900.0), PI: shifted(-1)})
+    found = choose([IDM, PI], drive, drive.budget, quiet)
     assert found.finalists == [PI]
-    assert found.set_aside[ACC].startswith("flow is lower than people's alone")
+    assert found.set_aside[IDM].startswith("flow is lower than that of the human baseline")
 
 
-def test_who_could_be_driven_by_a_car_comes_before_who_is_quick() -> None:
-    drive = MadeUp({ACC: shifted(-9, 20.0, min_headway=0.1), PI: shifted(0, 20.0)})
-    assert choose([ACC, PI], drive, drive.budget, 0.001, quiet).finalists == [PI]
-
-
-def test_choosing_ends_when_all_is_known_well_enough() -> None:
-    drive = MadeUp({option: shifted(0.0, 1.0) for option in OPTIONS})
-    choose(OPTIONS, drive, drive.budget, 0.02, quiet)
-    assert len(drive.seeds_of(PEOPLE)) == LEAST_CHOOSING
-
-
-@pytest.mark.parametrize("episodes", [least_episodes(2, 2), 200])
-def test_choosing_leaves_half_of_the_budget_and_judging_does_not_exceed_it(episodes: int) -> None:
-    drive = MadeUp({option: shifted(0.0, 40.0) for option in OPTIONS}, episodes)
-    found = choose(OPTIONS, drive, drive.budget, 0.001, quiet)
-    assert len(found.rows[PEOPLE]) >= LEAST_CHOOSING
-    assert drive.budget.spent <= episodes / 2
-    rows, _ = judge(found.finalists, drive, drive.budget, 0.001, quiet)
-    assert drive.budget.spent == len(drive.driven) <= episodes
-    assert len(rows[PEOPLE]) >= LEAST_JUDGED
-
-
-def test_judging_is_on_fresh_seeds_and_ends_when_intervals_are_narrow() -> None:
-    drive = MadeUp({ACC: shifted(-2.0, 0.5), PI_MORE: shifted(-3.0, 3.0)})
-    rows, judged = judge([ACC, PI_MORE], drive, drive.budget, 0.01, quiet)
-    assert {seed[0] for _, seed in drive.driven} == {JUDGE}
-    assert [(each.share, each.driver) for each in judged] == [ACC, PI_MORE]
-    assert all(each.effect.width <= 0.01 for each in judged)
-    assert LEAST_JUDGED <= len(rows[PEOPLE]) < 100
-    assert judged[0].reasons == []
+def test_feasible_controllers_come_before_quick_ones() -> None:
+    drive = MadeUp({IDM: shifted(-9, 20.0, min_headway=0.1), PI: shifted(0, 20.0)})
+    assert choose([IDM, PI], drive, drive.budget, quiet).finalists == [PI]
 
 
 def test_an_option_that_fails_is_set_aside_with_the_reason() -> None:
     failed = {"status": "failed", "reason": "no CAV was on the road", "error": "InputError"}
-    drive = MadeUp({ACC: lambda generator: failed, PI: shifted(-1)})
-    found = choose([ACC, PI], drive, drive.budget, 0.01, quiet)
-    assert found.set_aside == {ACC: "failed: no CAV was on the road"}
+    drive = MadeUp({IDM: lambda generator: failed, PI: shifted(-1)})
+    found = choose([IDM, PI], drive, drive.budget, quiet)
+    assert found.set_aside == {IDM: "failed: no CAV was on the road"}
     assert found.finalists == [PI]
+    drive.changes[PI] = lambda generator: failed
     with pytest.raises(InputError, match="no CAV was on the road"):
-        choose([ACC], drive, drive.budget, 0.01, quiet)
+        choose([IDM, PI], drive, drive.budget, quiet)
 
 
-def test_where_all_harm_nobody_is_chosen() -> None:
-    drive = MadeUp({ACC: shifted(5), PI: shifted(6)})
+@pytest.mark.parametrize("drivers", [2, 5])
+@pytest.mark.parametrize("more", [0, 20, 200])
+def test_no_step_exceeds_its_part_of_the_budget(drivers: int, more: int) -> None:
+    episodes = least_episodes(2, drivers) + more
+    options = [Option(share, f"driver {number}") for share in SHARES for number in range(drivers)]
+    drive = MadeUp({option: shifted(0.0, 40.0) for option in options}, episodes)
+    found = choose(options, drive, drive.budget, quiet)
+    assert [option.share for option in found.finalists] == [*SHARES]
+    assert drive.budget.spent <= max(PART_CHOOSING * episodes, 1 + len(options))
+    rows = run_judge(drive, found.finalists, 0.001).rows
+    assert drive.budget.spent == len(drive.driven) <= episodes
+    assert len(rows[HUMAN]) >= LEAST_TESTED
+
+
+def test_the_human_baseline_is_driven_once_a_seed_for_all_penetration_rates() -> None:
+    drive = MadeUp({PI: shifted(-2.0), IDM_MORE: shifted(-3.0)})
+    found = run_judge(drive, [PI, IDM_MORE])
+    assert {seed[0] for _, seed in drive.driven} == {JUDGE}
+    assert drive.seeds_of(HUMAN) == [(JUDGE, number) for number in range(len(found.rows[HUMAN]))]
+    assert [(each.share, each.driver) for each in found.judged] == [PI, IDM_MORE]
+    assert [each.share for each in found.acc] == [0.1, 0.2]
+
+
+def test_what_gains_beyond_acc_vehicles_is_driven_until_its_interval_is_narrow() -> None:
+    drive = MadeUp({PI: shifted(-6.0, 6.0), BASELINE: shifted(-2.0, 0.1)}, 4000)
+    (judged,) = run_judge(drive, [PI]).judged
+    assert judged.reasons == []
+    assert judged.effect.width <= 0.01
+    assert LEAST_JUDGED < judged.beyond_acc.count < 1000
+    assert judged.beyond_acc.mean == pytest.approx(-4.0, abs=1.0)
+
+
+def test_the_same_gain_as_that_of_acc_vehicles_is_no_gain_of_the_controller() -> None:
+    drive = MadeUp({PI: shifted(-5.0, 0.01), BASELINE: shifted(-5.5, 0.01)})
+    found = run_judge(drive, [PI])
+    (judged,), (acc,) = found.judged, found.acc
+    assert acc.effect.travel_time.high < 0
+    assert [reason.startswith("travel time is longer than with ACC") for reason in judged.reasons] == [True]
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        shifted(5.0),
+        shifted(-9.0, throughput_veh_per_h=1900.0),
+        shifted(-9.0, min_headway=0.1),
+        shifted(-0.01, 30.0),
+        lambda generator: {"status": "failed", "reason": "lost", "error": "EpisodeError"},
+    ],
+    ids=["slower", "less flow", "infeasible", "out of reach", "failed"],
+)
+def test_a_hopeless_controller_ends_early_and_leaves_the_budget_to_others(change: Change) -> None:
+    drive = MadeUp({PI: change, IDM_MORE: shifted(-6.0, 6.0), Option(0.2, ACC): shifted(0.0, 0.1)}, 800)
+    found = run_judge(drive, [PI, IDM_MORE])
+    hopeless, good = found.judged
+    assert hopeless.reasons
+    assert good.reasons == []
+    assert len(drive.seeds_of(PI)) <= 2 * LEAST_JUDGED < len(drive.seeds_of(IDM_MORE))
+    assert len(drive.seeds_of(BASELINE)) <= 2 * LEAST_JUDGED
+
+
+def test_a_small_budget_gets_an_answer_that_says_what_a_verdict_would_need() -> None:
+    drive = MadeUp({PI: shifted(-1.0, 9.0)}, 12)
+    (judged,) = run_judge(drive, [PI], 0.001).judged
+    assert judged.beyond_acc.count == 4
+    assert judged.missing > 0
+    assert "no verdict yet: the interval is ±" in judged.words
+
+
+def test_acc_vehicles_alone_are_tested_without_any_controller() -> None:
+    found = run_judge(MadeUp({BASELINE: shifted(-3.0)}), [])
+    assert (found.judged, len(found.acc)) == ([], 1)
+    assert found.acc[0].effect.travel_time.high < 0
+    assert found.acc[0].of_properties is None
+
+
+def test_the_gain_of_properties_that_are_set_for_cavs_is_split_off() -> None:
+    unchanged = Option(0.1, UNCHANGED_ACC)
+    drive = MadeUp({BASELINE: shifted(-5.0), unchanged: shifted(-1.0)})
+    (acc,) = run_judge(drive, [PI], split=True).acc
+    assert acc.of_properties is not None
+    assert acc.of_properties.mean == pytest.approx(-4.0, abs=0.5)
+
+
+def test_seeds_that_fit_into_the_time_follow_from_those_before() -> None:
+    now = [0.0]
+    budget = Budget(1000, minutes=1.0, workers=4, clock=lambda: now[0])
+    assert budget.seeds(10) == 100
+    now[0] = 5.0
+    budget.spend(1)  # alone: it took as long as four at once would
+    assert budget.seeds(4) == 11
+    assert budget.seeds(4, part=0.5) == 5
+    assert budget.seconds_for(8) == 10.0
+    now[0] = 59.0
+    assert budget.seeds(4) == 0
+
+
+def test_each_round_is_told_in_a_line_with_the_time_that_is_left() -> None:
     lines: list[str] = []
-    found = choose([ACC, PI], drive, drive.budget, 0.01, lines.append)
-    assert found.finalists == []
-    assert set(found.set_aside) == {ACC, PI}
-    assert lines[-1] == "choosing, 6 seeds: 0 of 2 left, all are set aside"
+    now = [0.0]
+    budget = Budget(40, clock=lambda: now[0])
+    drive = MadeUp({PI: shifted(-1.0, 9.0)})
 
+    def timed(options: Sequence[Option], seeds: Sequence[Seed]) -> dict[Option, Rows]:
+        found = drive(options, seeds)
+        budget.spend(len(options) * len(seeds))
+        now[0] += 10.0 * len(options) * len(seeds)
+        return found
 
-def test_each_batch_is_told_in_a_line() -> None:
-    lines: list[str] = []
-    choose([ACC, PI], MadeUp({}), Budget(60), 0.02, lines.append)
-    assert lines[:2] == [
-        "choosing, 2 seeds: 2 of 2 left, too few for an interval of travel time (wanted: ±2 %)",
-        "choosing, 4 seeds: 2 of 2 left, travel time known to ±0.0 % of people's (wanted: ±2 %)",
-    ]
-
-
-FAILED: dict[str, Any] = {"status": "failed", "reason": "lost", "error": "EpisodeError"}
-
-
-@pytest.mark.parametrize("later", [FAILED, {"min_headway": 0.1}], ids=["failed", "no car could drive so"])
-@pytest.mark.parametrize("ends", [False, True], ids=["goes on", "ends at once"])
-def test_who_was_slower_comes_back_when_the_quicker_one_turns_out_worse(
-    later: dict[str, Any], ends: bool
-) -> None:
-    def turning(mean: float, spread: float, otherwise: dict[str, Any]) -> Change:
-        """Drives so, but otherwise on the first seed after some may be set aside."""
-        driven = list[int]()
-
-        def change(generator: np.random.Generator) -> dict[str, Any]:
-            driven.append(1)
-            return shifted(mean, spread, **(otherwise if len(driven) == LEAST_CHOOSING + 1 else {}))(
-                generator
-            )
-
-        return change
-
-    others = {ACC_MORE: turning(0.0, 20.0, FAILED if ends else {}), PI_MORE: shifted(0.0, 9.0)}
-    drive = MadeUp({ACC: shifted(-2.0), PI: turning(-9.0, 3.0, later), **others})
-    found = choose(OPTIONS, drive, drive.budget, 0.001, quiet)
-    assert len(drive.seeds_of(ACC)) < len(drive.seeds_of(PEOPLE))  # for a while it was out
-    assert ACC in found.finalists
-    assert ACC not in found.set_aside
+    choose([IDM, PI], timed, budget, lines.append)
+    judge([PI], (0.1,), False, timed, budget, 0.001, lines.append)
+    assert lines[0] == "tuning seeds: 5; 1 of 2 options left; at most 4 min more"
+    assert lines[1].startswith("test seeds: 8; travel time known to ±")

@@ -203,12 +203,12 @@ def assess(
         typer.Option(
             "--driver",
             "-d",
-            help="Who drives the CAVs, as in drive; given several times, the best of them is chosen.",
-            show_default="those that fit roads with ends",
+            help="Controller of the CAVs, as in drive; given several times, the best of them is chosen.",
+            show_default="unjam:best, follower-stopper, pi",
         ),
     ] = None,
     shares: Annotated[
-        str, typer.Option(help="Shares of CAVs among the cars and the like; people alone are always driven.")
+        str, typer.Option(help="Penetration rates among the vehicles of --cav-classes.")
     ] = "0.02,0.05,0.1,0.2",
     episodes: Annotated[int, typer.Option("--episodes", "-n", min=1, help="Episodes in all, at most.")] = 400,
     minutes: Annotated[
@@ -217,7 +217,7 @@ def assess(
     precision: Annotated[
         float,
         typer.Option(
-            help="Half-width of the interval of travel time that is narrow enough, as a share of it."
+            help="Half-width of the confidence interval of travel time that is narrow enough, relative to it."
         ),
     ] = 0.02,
     settings: ScenarioSettingsOption = None,
@@ -226,11 +226,11 @@ def assess(
     json: JsonOption = False,
     changes: dict[str, Any],
 ) -> None:
-    """What would CAVs do on my road? Shares and drivers beside people alone, and a recommendation, or none.
+    """What would CAVs do on my road? Compare human drivers, ACC vehicles and controllers on equal seeds.
 
-    For each share a driver is chosen on some seeds and judged on fresh ones. It is recommended only where the
-    interval of travel time lies below zero, flow is not lower, a car could drive so, and people brake hard no
-    more often than alone.
+    For each penetration rate a controller is chosen on tuning seeds and tested on others. It is recommended
+    only if travel time is shown to be shorter than with human drivers and than with ACC vehicles, flow is not
+    lower, the CAVs are feasible, and human drivers do not brake hard more often.
 
     Examples:
 
@@ -256,7 +256,7 @@ def assess(
         print_json({**found.document, "folder": str(folder), "report": str(found.page)})
         return
     console.print(found.document["headline"], soft_wrap=True, markup=False)
-    for each in found.judged:
+    for each in (*found.judged, *found.acc):
         console.print(f"- {each.words}", soft_wrap=True, markup=False)
     for note in found.document["notes"]:
         aside.print(note, soft_wrap=True, markup=False)

@@ -47,6 +47,13 @@ HumansOption = Annotated[
         help="The people on the road: a file of `unjam fit-drivers`, unjam:ngsim or unjam:astazero.",
     ),
 ]
+CavClassesOption = Annotated[
+    str | None,
+    typer.Option(
+        help="Vehicle classes of which the share picks, on your own network: passenger,truck.",
+        show_default="passenger cars",
+    ),
+]
 BeginOption = Annotated[float | None, typer.Option(help="When your own network begins [s].")]
 EndOption = Annotated[float | None, typer.Option(help="When it ends [s].")]
 
@@ -111,6 +118,7 @@ def scenario_changes(
     cav_types: Annotated[
         str | None, typer.Option(help="Vehicle types that are CAVs, on your own network: car,truck.")
     ] = None,
+    cav_classes: CavClassesOption = None,
     begin: BeginOption = None,
     end: EndOption = None,
     humans: HumansOption = None,
@@ -127,16 +135,20 @@ def scenario_changes(
     }
     return {
         **{name: value for name, value in asked.items() if value is not None},
-        **people_changes(begin, end, humans),
+        **people_changes(cav_classes, begin, end, humans),
     }
 
 
 def people_changes(
-    begin: BeginOption = None, end: EndOption = None, humans: HumansOption = None
+    cav_classes: CavClassesOption = None,
+    begin: BeginOption = None,
+    end: EndOption = None,
+    humans: HumansOption = None,
 ) -> dict[str, Any]:
-    """Return the changes to a scenario that say when, and who the people are."""
+    """Return the changes to a network of the user's own: eligible vehicles, time, human drivers."""
     file = humans if humans is None or humans.startswith(SHIPPED) else str(Path(humans).absolute())
-    asked = {"begin": begin, "end": end, "population": file}
+    classes = cav_classes.split(",") if cav_classes else None
+    asked = {"cav_classes": classes, "begin": begin, "end": end, "population": file}
     return {name: value for name, value in asked.items() if value is not None}
 
 

@@ -1,12 +1,13 @@
-"""What CAVs change on a road, beside people alone on the same seeds, and whether they are recommended.
+"""What CAVs change on a road, compared with the human baseline and with ACC vehicles on the same seeds.
 
-The rule is one for all roads: travel time must be shown to fall; flow must be shown not to; a car must be
-able to drive so; and people must not brake hard more often than where they are alone.
+The rule is one for all roads. A controller is recommended only where travel time is shown to be shorter than
+with human drivers alone and than with ACC vehicles at the same penetration rate, flow is shown not to be
+lower, the CAVs are feasible, and human drivers do not brake hard more often.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import nan
+from math import ceil, isfinite, nan
 from typing import Any
 
 import numpy as np
@@ -31,7 +32,7 @@ LEAST_JUDGED = 10
 
 TIME, FLOW, FUEL = "travel_time", "throughput_veh_per_h", "fuel_ml_per_km"
 HARD = "people_beyond_4_5"
-NONE = "No CAVs are recommended on this road"
+NONE = "No controller is recommended on this road"
 
 
 @dataclass(frozen=True)
@@ -133,8 +134,8 @@ def harm_of(effect: Effect) -> str:
 
 def _harms(effect: Effect) -> tuple[tuple[bool, str], ...]:
     """Return whether travel time and flow are shown to be worse, each with the words for it."""
-    longer = f"travel time is longer than people's alone: {signed(effect.travel_time, 1)} s"
-    lower = f"flow is lower than people's alone: {signed(effect.flow)} veh/h"
+    longer = f"travel time is longer than that of the human baseline: {signed(effect.travel_time, 1)} s"
+    lower = f"flow is lower than that of the human baseline: {signed(effect.flow)} veh/h"
     return (effect.travel_time.low > 0, longer), (effect.flow.high < 0, lower)
 
 
@@ -143,57 +144,124 @@ def reasons_against(effect: Effect) -> list[str]:
     most = FLOW_LOST * effect.people_flow
     # Written so that a NaN, of too few seeds, is a reason against.
     checks = (
-        (effect.travel_time.count >= LEAST_JUDGED, f"{effect.travel_time.count} fresh seeds are too few"),
+        (effect.travel_time.count >= LEAST_JUDGED, f"{effect.travel_time.count} test seeds are too few"),
         (not effect.failed, f"{effect.failed} episodes failed"),
         *((not worse, words) for worse, words in _harms(effect)),
         (
             effect.travel_time.low > 0 or effect.travel_time.high < 0,
-            f"travel time is not shown to be shorter: {signed(effect.travel_time, 1)} s",
+            "travel time is not shown to be shorter than that of the human baseline: "
+            f"{signed(effect.travel_time, 1)} s",
         ),
         (
             effect.flow.high < 0 or effect.flow.low >= -most,
             f"flow may be lower by more than {100 * FLOW_LOST:g} %: {signed(effect.flow)} veh/h",
         ),
-        (effect.drivable == DRIVABLE, f"no car could drive so: {effect.drivable or 'no CAV drove'}"),
+        (effect.drivable == DRIVABLE, f"infeasible: {effect.drivable or 'no CAV drove'}"),
         (effect.collisions <= 0, f"{effect.collisions:.0f} more vehicles in contact than without CAVs"),
         (
             effect.hard_braking.mean <= 0,
-            "people brake beyond 4.5 m/s² more often than alone: "
-            f"{signed(effect.hard_braking)} times in a million moments, of which the mean's sign is asked",
+            "human drivers brake beyond 4.5 m/s² more often than in the human baseline: "
+            f"{signed(effect.hard_braking)} times in a million moments (only the sign of the mean counts)",
         ),
     )
     return [reason for fine, reason in checks if not fine]
 
 
+def seeds_for_verdict(difference: Estimate, narrow: float) -> float:
+    """Return with how many seeds an interval would exclude zero, or be narrower than ±`narrow`.
+
+    The mean is taken to stay, and the interval to narrow with the square root of the seeds; infinite where
+    there is no interval yet.
+    """
+    half = (difference.high - difference.low) / 2.0
+    enough = max(abs(difference.mean), narrow)
+    if not isfinite(half):
+        return float("inf")
+    return max(float(LEAST_JUDGED), ceil(difference.count * (half / enough) ** 2) if half else 0.0)
+
+
+@dataclass(frozen=True)
+class AccResult:
+    """What ACC vehicles without any controller do at a penetration rate, on test seeds."""
+
+    share: float
+    effect: Effect
+    of_properties: Estimate | None = None
+    """travel time compared with ACC vehicles that keep all properties of the vehicles which they replace [s];
+    None: these do"""
+    missing: float = 0.0
+    """test seeds that a verdict would need in addition"""
+
+    @property
+    def words(self) -> str:
+        """The finding, in a sentence or two."""
+        time = self.effect.travel_time
+        shown = "longer" if time.low > 0 else "shorter" if time.high < 0 else "not shown to differ"
+        words = (
+            f"ACC vehicles alone at a penetration rate of {percent(self.share)}: travel time is {shown} "
+            "compared with the human baseline. "
+            f"Differences: {self.effect.words}{_undecided(self.missing, time, 2)}."
+        )
+        if self.of_properties is None:
+            return words
+        other = f"{signed(self.of_properties, 1)} s of travel time"
+        return f"{words} Of it the properties that you have set for CAVs change {other}."
+
+
 @dataclass(frozen=True)
 class Judged:
-    """The driver that was chosen for a share of CAVs, on seeds that chose nothing."""
+    """The controller that was chosen for a penetration rate, on test seeds."""
 
     share: float
     driver: str
     effect: Effect
+    beyond_acc: Estimate
+    """travel time compared with ACC vehicles at the same penetration rate [s]"""
+    missing: float = 0.0
+    """test seeds that a verdict would need in addition"""
 
     @property
     def reasons(self) -> list[str]:
         """Why it is not recommended; none where it is."""
-        return reasons_against(self.effect)
+        beyond, reasons = self.beyond_acc, reasons_against(self.effect)
+        if not beyond.high < 0:
+            shown = "longer than" if beyond.low > 0 else "not shown to be shorter than"
+            difference = signed(beyond, 1)
+            reasons.append(
+                f"travel time is {shown} with ACC vehicles alone at this penetration rate: {difference} s"
+            )
+        return reasons
 
     @property
     def words(self) -> str:
-        """What is said of this share, in a sentence or two."""
-        who = f"{percent(self.share)} CAVs that drive as {self.driver}"
+        """What is said of this penetration rate, in a sentence or two."""
+        name = f"{self.driver} at a penetration rate of {percent(self.share)}"
         if self.reasons:
-            return f"{who}: not recommended, for {'; '.join(self.reasons)}."
+            unknown = _undecided(self.missing, self.beyond_acc, 3)
+            return f"{name}: not recommended: {'; '.join(self.reasons)}{unknown}."
         found = self.effect
         return (
-            f"{who}: recommended. Travel time {signed(found.travel_time, 1)} s "
+            f"{name}: recommended. Travel time {signed(found.travel_time, 1)} s "
             f"({100 * found.relative_time:+.1f} %), flow {signed(found.flow)} veh/h, fuel "
-            f"{signed(found.fuel, 1)} ml/km, on {found.travel_time.count} fresh seeds."
+            f"{signed(found.fuel, 1)} ml/km compared with the human baseline; travel time "
+            f"{signed(self.beyond_acc, 1)} s compared with ACC vehicles alone; "
+            f"{found.travel_time.count} test seeds."
         )
 
 
+def _undecided(missing: float, difference: Estimate, episodes: int) -> str:
+    """Return how wide an interval is, and what a verdict needs at so many `episodes` a seed."""
+    if not missing:
+        return ""
+    half = (difference.high - difference.low) / 2.0
+    if not isfinite(missing):
+        return f"; no verdict yet: {difference.count} test seeds are too few for an interval"
+    needed = f"a verdict needs about {missing:.0f} more test seeds ({episodes * missing:.0f} episodes)"
+    return f"; no verdict yet: the interval is ±{half:.1f} s, and {needed}"
+
+
 def recommended(judged: Sequence[Judged]) -> Judged | None:
-    """Return the share and driver that are recommended: who shortens travel time most among those allowed."""
+    """Return what is recommended: the shortest travel time among those that pass."""
     return min(
         (each for each in judged if not each.reasons),
         key=lambda each: each.effect.relative_time,
@@ -202,26 +270,37 @@ def recommended(judged: Sequence[Judged]) -> Judged | None:
 
 
 def shown_beside(judged: Sequence[Judged]) -> Judged | None:
-    """Return whose traffic pictures show beside people's: the recommended, else the quickest."""
+    """Return whose traffic pictures show with the human baseline's: the recommended, else the quickest."""
     quickest = min(judged, key=lambda each: each.effect.relative_time, default=None)
     return recommended(judged) or quickest
 
 
-def headline(judged: Sequence[Judged]) -> str:
-    """Return the answer in one sentence."""
+def headline(judged: Sequence[Judged], acc: Sequence[AccResult]) -> str:
+    """Return the answer: what is recommended, and what ACC vehicles alone would do."""
     best = recommended(judged)
-    if best is None:
-        if not judged:
-            return (
-                f"{NONE}: all that was tried did worse than people alone on the seeds that choose, or failed."
-            )
-        worse = sum(bool(harm_of(each.effect)) for each in judged)
-        harm = f" ({worse} of {len(judged)} slow traffic or lose flow)" if worse else ""
-        return f"{NONE}: none of the shares judged on fresh seeds passes the rule{harm}."
-    return (
-        f"{percent(best.share)} CAVs are recommended on this road, driving as {best.driver}: travel time "
-        f"{signed(best.effect.travel_time, 1)} s a vehicle ({100 * best.effect.relative_time:+.1f} %)."
-    )
+    if best is not None:
+        first = (
+            f"Recommended on this road: {best.driver} at a penetration rate of {percent(best.share)}. "
+            f"Travel time {signed(best.effect.travel_time, 1)} s a vehicle "
+            f"({100 * best.effect.relative_time:+.1f} %) compared with the human baseline, "
+            f"{signed(best.beyond_acc, 1)} s compared with ACC vehicles alone."
+        )
+    elif not judged:
+        first = f"{NONE}: none was tested, or all were set aside before the test."
+    elif any(each.missing for each in judged):
+        first = f"{NONE} so far: for some of them there is no verdict yet."
+    else:
+        first = f"{NONE}: none passes the rule."
+    gains = [each for each in acc if each.effect.travel_time.high < 0]
+    if gains:
+        most = min(gains, key=lambda each: each.effect.relative_time)
+        time, cut = signed(most.effect.travel_time, 1), 100 * most.effect.relative_time
+        second = f"shorten travel time: {time} s ({cut:+.1f} %) at {percent(most.share)}"
+    elif any(each.effect.travel_time.low > 0 for each in acc):
+        second = "lengthen travel time"
+    else:
+        second = "are not shown to shorten travel time"
+    return f"{first} ACC vehicles alone {second}."
 
 
 def percent(share: float) -> str:

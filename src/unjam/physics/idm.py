@@ -118,7 +118,9 @@ def idm_acceleration(
     return p.max_acceleration * (1.0 - free_road - interaction)
 
 
-def desired_speed_for(acceleration: Array, speed: Array, parameters: IDMParameters = PAPER_IDM) -> Array:
+def desired_speed_for(
+    acceleration: Array, speed: Array, parameters: IDMParameters | IDMRows = PAPER_IDM
+) -> Array:
     """Return the desired speed v0 with which a driver accelerates so where nobody is ahead [m/s].
 
     Closed form of Eq. 5 without its interaction; `acceleration` below the largest, `speed` in m/s, any shape.

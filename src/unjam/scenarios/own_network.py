@@ -1,7 +1,7 @@
 """The user's own road: any SUMO network with its traffic, some of whose vehicles become CAVs."""
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import field, replace
 from functools import cache
 from pathlib import Path
@@ -15,18 +15,23 @@ from unjam.drivers.roadside import Roadside
 from unjam.errors import InputError, wrong
 from unjam.parameters import STRICT, Count, NotNegative, Positive, build
 from unjam.scenarios.road import OwnRoad
-from unjam.scenarios.scenario import Scenario
+from unjam.scenarios.scenario import CruiseControl, Scenario
 from unjam.sumo_files import SumoFiles, read_sumo_files
 
 LONGEST = 3600.0
 """seconds of an episode where the configuration names no end"""
-OFF_THE_ROAD = ("rail", "rail_urban", "rail_electric", "rail_fast", "tram", "subway", "cable_car")
-OFF_THE_ROAD += ("ship", "aircraft", "drone", "pedestrian", "wheelchair", "container")
-"""SUMO's vehicle classes that no driver of cars drives"""
-CARS = ("passenger", "private", "hov", "taxi", "evehicle", "delivery", "truck", "trailer", "bus", "coach")
-"""SUMO's vehicle classes that a share picks from"""
 PASSENGER = "passenger"
 """the class of those that calibrated people drive: SUMO's default"""
+PASSENGER_CARS = (PASSENGER, "private", "hov", "taxi", "evehicle")
+"""SUMO's vehicle classes that are passenger cars"""
+OFF_THE_ROAD = ("rail", "rail_urban", "rail_electric", "rail_fast", "tram", "subway", "cable_car")
+OFF_THE_ROAD += ("ship", "aircraft", "drone", "pedestrian", "wheelchair", "container")
+"""SUMO's vehicle classes that are no road vehicles"""
+ROAD_CLASSES = (
+    *(*PASSENGER_CARS, "ignoring", "emergency", "authority", "army", "vip", "delivery", "truck", "trailer"),
+    *("bus", "coach", "motorcycle", "moped", "custom1", "custom2"),
+)
+"""SUMO's vehicle classes whose vehicles may become CAVs"""
 DRAWN = 100
 """calibrated people of an episode, drawn from the population"""
 WITH_OWN_ACC: dict[str, Any] = {"actuation": "cruise", "safety.active": False}
@@ -49,14 +54,19 @@ class OwnNetwork(Scenario):
     reward: ClassVar[str] = "travel-time"
     closed: ClassVar[bool] = False
     has_coordinate: ClassVar[bool] = False
+    has_vehicle_types: ClassVar[bool] = True
     tells: ClassVar[tuple[str, ...]] = ("allowed_speed", "lane_speeds", "cav_share")
 
     file: str = ""
     """the .sumocfg file"""
     cav_share: Annotated[float, Field(ge=0, le=1)] = 0.0
-    """share of the vehicles that become CAVs, cars and the like alone"""
+    """share of the vehicles of `cav_classes` that become CAVs"""
     cav_types: tuple[str, ...] = ()
-    """vehicle types all of whose vehicles become CAVs"""
+    """vehicle types all of whose vehicles become CAVs, whatever their class"""
+    cav_classes: tuple[str, ...] = PASSENGER_CARS
+    """SUMO's vehicle classes of which the share picks"""
+    cruise: CruiseControl = field(default_factory=lambda: CruiseControl(acceleration=None, deceleration=None))
+    """the CAV's own ACC: it has the limits of acceleration of its vehicle, unless it is given others"""
     cavs: Count | None = None
     """at most so many CAVs: the first of these that enter"""
     begin: NotNegative | None = None
@@ -74,19 +84,25 @@ class OwnNetwork(Scenario):
             files = read_sumo_files(Path(self.file))
         except InputError as error:
             raise ValueError(str(error)) from None
-        known = ", ".join(sorted(files.used_types))
+        known, classes = ", ".join(sorted(files.used_types)), ", ".join(self.cav_classes)
+        for name in self.cav_classes:
+            if name not in ROAD_CLASSES:
+                raise ValueError(f"cav_classes: {name!r} is not allowed; allowed: {', '.join(ROAD_CLASSES)}")
         for name in self.cav_types:
             if name not in files.used_types:
                 raise ValueError(f"cav_types: no vehicle has the type {name!r}; allowed: {known}")
-            if not is_on_the_road(files.types.get(name, {})):
+            if not is_on_the_road(files, name):
                 raise ValueError(f"cav_types: {name!r} is not allowed, for it is no type of road vehicles")
         if not self.cav_types:
             if self.cav_share == 0:
                 raise ValueError(
                     "cav_share: 0.0 is not allowed without cav_types; allowed: > 0, <= 1, as --cav-share 0.1"
                 )
-            if not any(is_car(files.types.get(name, {})) for name in files.used_types):
-                raise ValueError(f"cav_share: no vehicle is a car; its types are {known}; name cav_types")
+            if not self.eligible_types(files):
+                raise ValueError(
+                    f"cav_share: no vehicle has one of the classes {classes}; its types are "
+                    f"{_list_types(files, files.used_types)}; name cav_classes or cav_types"
+                )
         if self.emission_class != type(self).emission_class:
             raise ValueError(
                 "emission_class: it is not allowed on your own network, whose vehicle types say it"
@@ -114,7 +130,7 @@ class OwnNetwork(Scenario):
             limit_speed=float("nan"),
             cav_share=self.cav_share,
             cav_types=self.cav_types,
-            cars=frozenset(name for name, attributes in files.types.items() if is_car(attributes)),
+            eligible_types=self.eligible_types(files),
             cav_seed=cav_seed,
             cavs=self.cavs,
             roadside=self.roadside,
@@ -125,6 +141,25 @@ class OwnNetwork(Scenario):
         """How people drive."""
         files = "as the vehicle types of its files say"
         return f"in cars {super().people_in_words}; others {files}" if self.calibrated else files
+
+    def eligible_types(self, files: SumoFiles) -> frozenset[str]:
+        """Return the vehicle types in use of which the share picks."""
+        on_roads = (name for name in files.used_types if is_on_the_road(files, name))
+        return frozenset(name for name in on_roads if class_of(files, name) in self.cav_classes)
+
+    @property
+    def notes(self) -> list[str]:
+        """What differs from plain SUMO, and which vehicles stay human-driven because of their class."""
+        files = read_sumo_files(Path(self.file))
+        found = notes_on_files(files)
+        others = files.used_types - self.eligible_types(files) - set(self.cav_types)
+        if not self.cav_share or not others:
+            return found
+        return [
+            *found,
+            f"eligible to become CAVs: vehicles of the classes {', '.join(self.cav_classes)}; not those of "
+            f"the types {_list_types(files, others)} (see --cav-classes)",
+        ]
 
     def possible_cavs(self) -> tuple[str, ...]:
         """Return names for as many CAVs as there may be; what their vehicles are called SUMO alone knows.
@@ -139,7 +174,7 @@ class OwnNetwork(Scenario):
     def facts(self) -> list[tuple[str, str]]:
         """Return the road's own facts for `unjam scenarios`."""
         types = ", ".join(self.cav_types)
-        share = f"{100 * self.cav_share:g} % CAV" if self.cav_share else ""
+        share = f"{100 * self.cav_share:g} % CAV of {', '.join(self.cav_classes)}" if self.cav_share else ""
         return [
             ("road", self.file),
             ("vehicles", "as its files say (" + ", ".join(filter(None, (share, types))) + ")"),
@@ -156,6 +191,8 @@ def own_network(file: str, changes: dict[str, Any]) -> OwnNetwork:
     """
     files = read_sumo_files(Path(file).resolve())
     _log_once(*notes_on_files(files, MOST_LOGGED))
+    if isinstance(cruise := changes.get("cruise", {}), dict):
+        changes = {**changes, "cruise": {"acceleration": None, "deceleration": None, **cruise}}
     values = {"file": str(files.path), "simulation_step": files.step, **changes}
     made = build(OwnNetwork, values, Path(file).name)
     begin = files.begin if made.begin is None else made.begin
@@ -183,11 +220,6 @@ def notes_on_files(files: SumoFiles, most: int = MOST_NOTED) -> list[str]:
     return [f"{files.path.name}: {way}: {_shortened(names, most)}" for way, names in ways.items() if names]
 
 
-def notes_on_network(scenario: Scenario) -> list[str]:
-    """Return the notes on the files of a network of the user's own; of other scenarios none."""
-    return notes_on_files(read_sumo_files(Path(scenario.file))) if isinstance(scenario, OwnNetwork) else []
-
-
 def _shortened(names: Sequence[str], most: int) -> str:
     more = f" and {len(names) - most} more" if len(names) > most else ""
     return ", ".join(name[:60] for name in names[:most]) + more
@@ -201,16 +233,21 @@ def _log_once(*notes: str) -> None:
 
 def passenger_types(files: SumoFiles) -> list[str]:
     """Return the types of passenger cars that vehicles have; SUMO's default class is that one."""
-    classes = {name: files.types.get(name, {}).get("vClass", PASSENGER) for name in files.used_types}
-    on_roads = {name for name in classes if is_on_the_road(files.types.get(name, {}))}
-    return sorted(name for name, kind in classes.items() if kind == PASSENGER and name in on_roads)
+    on_roads = (name for name in files.used_types if is_on_the_road(files, name))
+    return sorted(name for name in on_roads if class_of(files, name) == PASSENGER)
 
 
-def is_car(attributes: dict[str, str]) -> bool:
-    """Return whether a share may pick vehicles of a type; SUMO's default class is a passenger car."""
-    return attributes.get("vClass", PASSENGER) in CARS and is_on_the_road(attributes)
+def class_of(files: SumoFiles, name: str) -> str:
+    """Return SUMO's vehicle class of a type; a type that names none is a passenger car."""
+    return files.types.get(name, {}).get("vClass", PASSENGER)
 
 
-def is_on_the_road(attributes: dict[str, str]) -> bool:
-    """Return whether vehicles of a type drive on roads: trains, ships, aircraft and pedestrians do not."""
-    return attributes.get("vClass") not in OFF_THE_ROAD and attributes.get("carFollowModel") != "Rail"
+def is_on_the_road(files: SumoFiles, name: str) -> bool:
+    """Return whether vehicles of a type are road vehicles: no trains, ships, aircraft or pedestrians."""
+    is_train = files.types.get(name, {}).get("carFollowModel") == "Rail"
+    return class_of(files, name) not in OFF_THE_ROAD and not is_train
+
+
+def _list_types(files: SumoFiles, names: Collection[str]) -> str:
+    """Return types with their classes, as far as a line has room for them."""
+    return _shortened([f"{name} ({class_of(files, name)})" for name in sorted(names)], MOST_LOGGED)

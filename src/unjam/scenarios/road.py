@@ -237,8 +237,8 @@ class OwnRoad(OpenRoad):
     """share of the vehicles that become CAVs"""
     cav_types: tuple[str, ...]
     """vehicle types all of whose vehicles become CAVs"""
-    cars: frozenset[str]
-    """vehicle types that the share may pick"""
+    eligible_types: frozenset[str]
+    """vehicle types whose vehicles the share may pick"""
     cav_seed: int
     """which vehicles the share picks"""
     cavs: int | None = None

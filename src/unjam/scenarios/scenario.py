@@ -14,7 +14,7 @@ from unjam.drivers.command import Limits
 from unjam.drivers.safety import Actuator, SafetyFilter
 from unjam.drivers.sensors import Sensors
 from unjam.parameters import STRICT, Count, CountOrNone, NotNegative, Positive
-from unjam.physics.arrays import Array, at_least, namespace
+from unjam.physics.arrays import Array, at_least, at_most, namespace
 from unjam.physics.idm import IDMParameters, IDMRows, desired_speed_for, idm_acceleration
 from unjam.physics.kinematics import next_speed
 from unjam.scenarios.population import Population, read_population
@@ -63,10 +63,10 @@ class CruiseControl:
 
     time_headway: Positive = 1.1
     """[s]"""
-    acceleration: Positive = 2.5
-    """[m/s2]"""
-    deceleration: Positive = 2.0
-    """comfortable [m/s2]"""
+    acceleration: Positive | None = 2.5
+    """[m/s2]; None, on your own network: that of the vehicle which the CAV replaces"""
+    deceleration: Positive | None = 2.0
+    """comfortable [m/s2]; None likewise"""
     gap: Positive = 2.0
     """to who stands ahead [m]"""
     keep_right: NotNegative | None = None
@@ -74,7 +74,14 @@ class CruiseControl:
     overtake: NotNegative | None = None
     """how eagerly it changes lanes to be faster, likewise"""
 
-    def set_speed(self, speed: Array, wanted: Array, highest: float, step: float) -> Array:
+    def set_speed(
+        self,
+        speed: Array,
+        wanted: Array,
+        highest: float,
+        step: float,
+        vehicle: tuple[Array, Array] | None = None,
+    ) -> Array:
         """Return the set speed with which it accelerates as wanted where nobody is near [m/s].
 
         Infinite where it may drive as it likes: as hard as it can, or as anybody may ask.
@@ -84,18 +91,21 @@ class CruiseControl:
             wanted: how fast it is to be after a step [m/s], shape (n,).
             highest: acceleration that anybody may ask for [m/s2].
             step: of the simulation [s].
+            vehicle: acceleration and comfortable deceleration of each vehicle [m/s2], shape (n,), which the
+                ACC has where it has none of its own.
         """
         xp, asked = namespace(speed), (wanted - speed) / step
-        held = asked < min(highest, self.acceleration) - 1e-6
-        acc = IDMParameters(max_acceleration=self.acceleration)
+        own_most, own_braking = vehicle or (0.0, 0.0)
+        most: Array = self.acceleration or own_most
+        braking: Array = self.deceleration or own_braking
+        held = asked < at_most(most, highest) - 1e-6
+        acc = IDMRows(0.0, self.time_headway, most, braking, IDMParameters().exponent, self.gap)
         faster = desired_speed_for(xp.where(held, asked, 0.0 * asked), speed, acc)
         rising = at_least(xp.maximum(wanted, faster), SLOWEST)
         # SUMO's IDM overshoots low set speeds within a step, brakes for it, and may stand for ever.
         parts = max(1, int(step / THINKING + 0.5))
-        reached, steady = speed, 2.0 * self.acceleration * step / parts
-        told = IDMRows(
-            rising, self.time_headway, self.acceleration, self.deceleration, acc.exponent, self.gap
-        )
+        reached, steady = speed, 2.0 * most * step / parts
+        told = acc._replace(desired_speed=rising)
         for _ in range(parts):
             reached = next_speed(reached, idm_acceleration(reached, reached, inf, told), step / parts)
         rising = xp.where(reached <= speed, at_least(rising, steady), rising)
@@ -127,6 +137,8 @@ class Scenario:
     """whether vehicles have a position along the road"""
     tells: ClassVar[tuple[str, ...]] = ()
     """fields of a `LocalState` that CAVs are told here and not everywhere"""
+    has_vehicle_types: ClassVar[bool] = False
+    """whether vehicles have types of the user's, whose properties a CAV keeps"""
     people_gap: ClassVar[float] = 0.0
     """gap that SUMO keeps for commanded people [m]"""
 
@@ -175,6 +187,13 @@ class Scenario:
     """SUMO's emission class of every vehicle, for fuel"""
 
     @model_validator(mode="after")
+    def _acc_has_limits(self) -> Self:
+        for name in ("acceleration", "deceleration"):
+            if not self.has_vehicle_types and getattr(self.cruise, name) is None:
+                raise ValueError(f"cruise.{name}: None is not allowed on {self.title}; allowed: > 0")
+        return self
+
+    @model_validator(mode="after")
     def _filter_allows_for_sensors(self) -> Self:
         for name in ("gap_error", "speed_error"):
             known, largest = getattr(self.safety, name), getattr(self.sensors, name)
@@ -183,6 +202,11 @@ class Scenario:
                     f"safety.{name}: {known:g} is not allowed; allowed: >= sensors.{name}, {largest:g}"
                 )
         return self
+
+    @property
+    def notes(self) -> list[str]:
+        """What a user must know of this road beside the results."""
+        return []
 
     @property
     def decision_step(self) -> float:

@@ -14,7 +14,7 @@ from typing import Any, Literal, NamedTuple
 from unjam import sandbox
 from unjam.children import child_environment, python_command
 from unjam.errors import InputError, did_you_mean, wrong
-from unjam.sumo_files.reader import stamp_of
+from unjam.sumo_files.reader import IN_PARAMETERS, TO_FILES, stamp_of
 
 PROGRAM = Path(__file__).with_name("program.py")
 LARGEST_MEMORY = 4 * 2**30
@@ -109,6 +109,8 @@ class SumoFiles(NamedTuple):
     """files that SUMO gets a harmless copy of, and what the copy is made from; it reads others themselves"""
     types: dict[str, dict[str, str]]
     """attributes of all vehicle types, by id"""
+    type_parameters: dict[str, dict[str, str]]
+    """nested `<param>` elements of the types: values by key, by the type's id"""
     used_types: frozenset[str]
     """types that vehicles have"""
 
@@ -191,6 +193,16 @@ def copy_harmless(path: Path, copy: Path, types: Path | None = None) -> None:
         InputError: it is broken, or too large.
     """
     _ask("copy", path, copy, *([types] if types else []))
+
+
+def is_harmless_attribute(name: str) -> bool:
+    """Return whether SUMO may read an attribute of a vehicle type: it names no file."""
+    return name not in TO_FILES and not name.endswith("File")
+
+
+def is_harmless_parameter(key: str) -> bool:
+    """Return whether SUMO may read a `<param>` of a vehicle type: it makes SUMO write no file."""
+    return not any(word in key.lower() for word in IN_PARAMETERS)
 
 
 def _ask(command: Literal["configuration", "lanes", "copy"], path: Path, *more: Path) -> Any:

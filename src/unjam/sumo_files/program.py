@@ -58,6 +58,11 @@ SYNONYMS = {
     for synonym in synonyms.split()
 }
 """other names of options, as SUMO has them"""
+LAWS = (
+    *("Krauss", "KraussOrig1", "KraussPS", "KraussX", "IDM", "IDMM", "EIDM", "SmartSK"),
+    *("Daniel1", "PWagner2009", "BKerner", "Wiedemann", "W99", "ACC", "CACC", "CC", "Rail"),
+)
+"""car-following models that older files name in an element of their own"""
 YES = ("true", "t", "yes", "on", "1", "x")
 """what SUMO takes for yes"""
 Lane = tuple[str, float, list[tuple[float, float]]]
@@ -110,6 +115,7 @@ def _configuration(path: Path) -> dict[str, Any]:
         "step": _seconds(path, options, "step-length", 1.0) or 1.0,
         "used_types": sorted(demand.used_types()),
         "types": demand.types,
+        "type_parameters": demand.type_parameters,
         "stamps": {
             str(file): stamps[file] for file in [path, *files, *sorted(stamps.keys() - {path, *files})]
         },
@@ -209,6 +215,10 @@ class _Demand:
         """when the first vehicle departs [s]; None where that cannot be told"""
         self._mixtures: dict[str, set[str]] = {}
         """types of each distribution; it may be used in another file than the one that defines it"""
+        self.type_parameters: dict[str, Attributes] = {}
+        """values of the parameters of each type, by key"""
+        self._type = ""
+        """the type that is being read; empty where none is"""
         self._mixture: set[str] = set()
         """types of the distribution that is being read"""
 
@@ -217,7 +227,9 @@ class _Demand:
         vehicles = {tag: partial(self._note_vehicle, depart) for tag, depart in DEMAND.items()}
         types = {"vType": self._note_type, "vTypeDistribution": self._note_mixture}
         persons = dict.fromkeys(("person", "personFlow"), self._note_person)
-        return {**vehicles, **types, **persons, "/vTypeDistribution": self._end_mixture}
+        laws = {f"carFollowing-{name}": self._note_law for name in LAWS}
+        ends = {"/vType": self._end_type, "/vTypeDistribution": self._end_mixture}
+        return {**vehicles, **types, **persons, **laws, "param": self._note_parameter, **ends}
 
     def _note_vehicle(self, depart: str, attributes: Attributes) -> None:
         self.wanted.add(attributes.get("type", DEFAULT_TYPE))
@@ -231,7 +243,18 @@ class _Demand:
         name = attributes.get("refId") or attributes.get("id", "")
         self._mixture.add(name)
         if "refId" not in attributes:
-            self.types[name] = attributes
+            self._type, self.types[name], self.type_parameters[name] = name, dict(attributes), {}
+
+    def _note_law(self, attributes: Attributes) -> None:
+        if self._type:  # older files have the attributes of the car-following law in an element of its own
+            self.types[self._type] |= attributes
+
+    def _note_parameter(self, attributes: Attributes) -> None:
+        if self._type:
+            self.type_parameters[self._type][attributes.get("key", "")] = attributes.get("value", "")
+
+    def _end_type(self, attributes: Attributes) -> None:
+        self._type = ""
 
     def _note_mixture(self, attributes: Attributes) -> None:
         self._mixture = set(attributes.get("vTypes", "").split())

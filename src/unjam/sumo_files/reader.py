@@ -29,6 +29,7 @@ TO_FILES = ("file", "output", "dest", "href")
 """attributes that name files, beside those that end in `File`"""
 IN_PARAMETERS = ("file", "output", "log", "ssm")
 """what is in the names of parameters of vehicles and signals that name files, or write one by themselves"""
+TYPES = "vType", "vTypeDistribution"
 CHECKED = {*ONLY_WRITERS, "include", "param", "vType", "vTypeDistribution"}
 """elements that are looked at whatever attributes they have"""
 PLAIN_ENCODINGS = (None, "utf-8", "us-ascii", "ascii", "iso-8859-1")
@@ -72,8 +73,8 @@ class Reader:
         self._write = out.write if out else None
         self._within = 0
         """open elements within one that was dropped, itself included"""
-        self._in_mixture = False
-        """whether a distribution of types is open"""
+        self._open_type = ""
+        """the outermost type or distribution of types that is open; empty where none is"""
         self._names: dict[str, str] = {}
         """other names by which elements are written"""
         self._plain: set[str] = set()
@@ -154,10 +155,10 @@ class Reader:
         if kept is None:
             self._drop_content()
             return
-        if tag == "vTypeDistribution":
-            self._in_mixture = True
+        if tag in TYPES:
+            self._open_type = self._open_type or tag
             self._parsers[-1].EndElementHandler = self._ended
-        elif tag == "vType":
+        if tag == "vType":
             kept |= self._types.get(kept.get("id", ""), {})
         self._write_start(tag, kept)
         if tag in DEFINED_ELSEWHERE and attributes.get("file"):
@@ -177,11 +178,12 @@ class Reader:
             self._within -= 1
         else:
             self._write_end(tag)
-            self._in_mixture &= tag != "vTypeDistribution"
+            if tag == self._open_type:
+                self._open_type = ""
             if (note := self._notes.get(f"/{tag}")) is not None:
                 note({})
         # Where nothing is written a call for each element would only take time.
-        if self._write is None and not self._within and not self._in_mixture:
+        if self._write is None and not self._within and not self._open_type:
             self._parsers[-1].EndElementHandler = None
 
     def _text(self, text: str) -> None:

@@ -1,6 +1,7 @@
-"""What would CAVs do on a road of the user's own? Several shares and drivers, beside people alone.
+"""What would CAVs do on the user's own road? Controllers at several penetration rates, and two baselines.
 
-Who drives is chosen on some seeds and judged on others; the page says what a rule makes of the numbers.
+The baselines are human drivers alone, and ACC vehicles without a controller. A controller is chosen for each
+penetration rate on tuning seeds and tested on others; a rule says whether it is recommended.
 """
 
 import json
@@ -14,32 +15,44 @@ from unjam.drivers.driver import Driver
 from unjam.errors import InputError, NoCavError, wrong
 from unjam.files import to_json, write_whole
 from unjam.manifest import manifest
-from unjam.measures.effect import Judged, headline, recommended, shown_beside
+from unjam.measures.effect import AccResult, Judged, headline, recommended, shown_beside
 from unjam.measures.statistics import estimate_of
 from unjam.reports.assessment import ASSESSMENT_FILE, ASSESSMENT_PAGE, write_assessment
 from unjam.scenarios import NAMED_BEFORE, make_scenario, scenario_recipe
-from unjam.scenarios.own_network import WITH_OWN_ACC, notes_on_network
+from unjam.scenarios.own_network import WITH_OWN_ACC, OwnNetwork
 from unjam.scenarios.scenario import Scenario
 from unjam.training.choice import (
-    PEOPLE,
+    ACC,
+    HUMAN,
+    UNCHANGED_ACC,
     Budget,
     Choice,
+    Findings,
     OnLine,
     Option,
     Rows,
     Seed,
     choose,
+    in_words,
     judge,
     least_episodes,
 )
-from unjam.training.evaluate import Evaluation, evaluate_each, notes_on_teleports, save_evaluation
+from unjam.training.evaluate import (
+    Evaluation,
+    evaluate_each,
+    notes_on_teleports,
+    raise_failure,
+    save_evaluation,
+)
 from unjam.training.folder import make_new_folder
-from unjam.training.seeds import choosing_seeds, held_out_seeds
+from unjam.training.seeds import held_out_seeds
 from unjam.worlds.episode import can_drive
 from unjam.worlds.workers import Workers
 
-DRIVERS_OF_OPEN_ROADS = (BEST, "cruise", "follower-stopper", "pi")
-"""who is tried where nobody is named: drivers that fit roads with ends"""
+DRIVERS_OF_OPEN_ROADS = (BEST, "follower-stopper", "pi")
+"""controllers that are tried where none is named: they fit roads with ends"""
+PROPERTIES = ("acceleration", "deceleration", "keep_right", "overtake")
+"""settings of the CAVs' ACC that replace a property of the vehicle"""
 FOR_PICTURES = 2
 """episodes of the budget that are kept for pictures"""
 NOBODY = 1e-12
@@ -47,7 +60,7 @@ NOBODY = 1e-12
 CHOOSING = "choosing"
 """folder within the results: the rows of the seeds that chose"""
 WHO_IS_A_CAV = "cav_share", "cav_types", "cavs"
-"""settings of a road that the shares stand for"""
+"""settings of a road that the penetration rates stand for"""
 METRICS_OF_PEOPLE = (
     "travel_time",
     "throughput_veh_per_h",
@@ -62,9 +75,10 @@ class Question:
     """What is asked of a road; everything in it has been checked."""
 
     file: str
-    road: Scenario
-    """with people alone"""
+    road: OwnNetwork
+    """with human drivers alone"""
     drivers: dict[str, Driver]
+    """the controllers"""
     shares: tuple[float, ...]
     episodes: int
     """at most, in all"""
@@ -75,14 +89,28 @@ class Question:
 
     @property
     def options(self) -> list[Option]:
-        """All shares with all drivers."""
+        """All penetration rates with all controllers."""
         return [Option(share, driver) for share in self.shares for driver in self.drivers]
 
+    @property
+    def sets_properties(self) -> bool:
+        """Whether the user replaces a property of the vehicles by another one for CAVs."""
+        return any(getattr(self.road.cruise, name) is not None for name in PROPERTIES)
+
     def setup(self, option: Option) -> tuple[Scenario, Driver]:
-        """Return the road with so many CAVs, and who drives them."""
-        if option == PEOPLE:
-            return self.road, make_driver(PEOPLE.driver, self.road.decision_step)
-        return replace(self.road, cav_share=option.share), self.drivers[option.driver]  # pyright: ignore[reportCallIssue]
+        """Return the road with so many CAVs, and their driver."""
+        if option == HUMAN:
+            return self.road, make_driver(HUMAN.driver, self.road.decision_step)
+        road = replace(self.road, cav_share=option.share)
+        if option.driver not in (ACC, UNCHANGED_ACC):
+            return road, self.drivers[option.driver]
+        cruise = road.cruise
+        if option.driver == UNCHANGED_ACC:
+            cruise = replace(cruise, **dict.fromkeys(PROPERTIES))
+        safety = replace(road.safety, active=False)
+        return replace(road, actuation="cruise", safety=safety, cruise=cruise), make_driver(
+            ACC, road.decision_step
+        )
 
 
 def question(
@@ -114,15 +142,18 @@ def question(
     if not 0 < precision < 1:
         raise wrong("precision", precision, "> 0, < 1")
     road = make_scenario(file, {**WITH_OWN_ACC, **(changes or {}), "cav_share": NOBODY})
-    made = {name: make_driver(name, road.decision_step) for name in drivers}
+    assert isinstance(road, OwnNetwork)
+    made = {name: make_driver(name, road.decision_step) for name in drivers if name != ACC}
     for name, driver in made.items():
         if driver.native or not can_drive(driver, road):
-            why = "people alone are driven anyway" if driver.native else "one that needs no closed road"
+            why = "the human baseline is driven anyway" if driver.native else "one that needs no closed road"
             raise wrong("driver", name, why)
-    least = least_episodes(len(asked), len(made)) + FOR_PICTURES
+    asked_for = Question(file, road, made, asked, episodes, minutes, precision)
+    least = least_episodes(len(asked), len(made), asked_for.sets_properties) + FOR_PICTURES
     if episodes < least:
-        raise wrong("episodes", episodes, f">= {least} for {len(asked)} shares and {len(made)} drivers")
-    return Question(file, road, made, asked, episodes, minutes, precision)
+        controllers = f"{len(asked)} penetration rates and {len(made)} controllers"
+        raise wrong("episodes", episodes, f">= {least} for {controllers}")
+    return asked_for
 
 
 @dataclass(frozen=True)
@@ -130,7 +161,9 @@ class Assessment:
     """The answer."""
 
     judged: list[Judged]
-    """the driver that was chosen for each share; none of a share where all were set aside"""
+    """the controller that was chosen for each penetration rate; none where all were set aside"""
+    acc: list[AccResult]
+    """what ACC vehicles alone do at each penetration rate"""
     document: dict[str, Any]
     """all of it but the rows, as `assessment.json` has it"""
     page: Path
@@ -153,7 +186,7 @@ def assess(
         InputError: the folder holds something, or no driver can drive this road.
     """
     make_new_folder(folder)
-    budget = Budget(asked.episodes - FOR_PICTURES, asked.minutes)
+    budget = Budget(asked.episodes - 1, asked.minutes, workers.count)
 
     def driven(options: Sequence[Option], seeds: Sequence[Seed], pictured: bool = False) -> Evaluation:
         setups = {option.label: asked.setup(option) for option in options}
@@ -169,50 +202,47 @@ def assess(
 
     def drive(options: Sequence[Option], seeds: Sequence[Seed]) -> dict[Option, Rows]:
         rows = driven(options, seeds).rows
-        people = rows.get(PEOPLE.label, [])
-        # Of a small share no vehicle is a CAV on some seeds: then it is people alone who drive.
+        humans = rows[HUMAN.label]
+        # On a seed with which a small share picks no vehicle, human drivers alone are driven.
         return {
             option: [
                 alone if row["error"] == NoCavError.__name__ else row
-                for row, alone in zip(rows[option.label], people, strict=True)
+                for row, alone in zip(rows[option.label], humans, strict=True)
             ]
             for option in options
         }
 
-    choice = choose(asked.options, drive, budget, asked.precision, on_line)
-    rows, judged, chose = {PEOPLE: choice.rows[PEOPLE]}, list[Judged](), budget.spent
-    if choice.finalists:
-        rows, judged = judge(choice.finalists, drive, budget, asked.precision, on_line)
-    beside = shown_beside(judged)
-    on_line("pictures of people alone" + ("" if beside is None else " and with CAVs, same seed"))
-    pictured = [PEOPLE] if beside is None else [PEOPLE, Option(beside.share, beside.driver)]
-    seeds = held_out_seeds(1) if judged else choosing_seeds(1)
-    shown = driven(pictured, seeds, pictured=True).shown
+    first = driven([HUMAN], held_out_seeds(1), pictured=True)
+    raise_failure(first.rows[HUMAN.label])
+    took, whole = in_words(budget.elapsed), in_words(budget.seconds_for(budget.episodes))
+    on_line(
+        f"an episode of the human baseline took {took}; all {asked.episodes} episodes on {workers.count} "
+        f"workers may take {whole}" + (f", but at most {asked.minutes:g} min" if asked.minutes else "")
+    )
+    choice = choose(asked.options, drive, budget, on_line)
+    chose = budget.spent - 1
+    tested = judge(
+        choice.finalists, asked.shares, asked.sets_properties, drive, budget, asked.precision, on_line
+    )
+    best = shown_beside(tested.judged)
+    option = Option(best.share, best.driver) if best else Option(asked.shares[-1], ACC)
+    shown = first.shown | driven([option], held_out_seeds(1), pictured=True).shown
 
     about = {"scenario": Path(asked.file).name, "reward": asked.road.reward, "manifest": manifest()}
     tried = {option.label: found for option, found in choice.rows.items()}
-    notes = notes_on_teleports(
-        {each.label: found for each, found in (rows if judged else choice.rows).items()}
-    )
-    notes += notes_on_network(asked.road)
-    document = {**about, **_document(asked, choice, rows, judged, chose, budget), "notes": notes}
+    rows = {option.label: found for option, found in tested.rows.items()}
+    notes = [*asked.road.notes, *notes_on_teleports(rows)]
+    document = {**about, **_document(asked, choice, tested, chose, budget), "notes": notes}
     save_evaluation(folder / CHOOSING, Evaluation(tried, {}), about)
-    save_evaluation(folder, Evaluation({each.label: found for each, found in rows.items()}, shown), about)
+    save_evaluation(folder, Evaluation(rows, shown), about)
     write_whole(folder / ASSESSMENT_FILE, to_json(document, indent=1))
     page = write_assessment(folder, folder / ASSESSMENT_PAGE)
-    return Assessment(judged, json.loads(to_json(document)), page)
+    return Assessment(tested.judged, tested.acc, json.loads(to_json(document)), page)
 
 
-def _document(
-    asked: Question,
-    choice: Choice,
-    rows: dict[Option, Rows],
-    judged: Sequence[Judged],
-    chose: int,
-    budget: Budget,
-) -> dict[str, Any]:
+def _document(asked: Question, choice: Choice, found: Findings, chose: int, budget: Budget) -> dict[str, Any]:
     """Return what is known in the end, but for the rows."""
-    best = recommended(judged)
+    best = recommended(found.judged)
     tried = [
         {
             **option._asdict(),
@@ -221,14 +251,15 @@ def _document(
             "effect": asdict(choice.effect(option)),
         }
         for option in asked.options
+        if choice.rows[option]
     ]
-    found = [{**asdict(each), "reasons": each.reasons, "words": each.words} for each in judged]
     return {
-        "headline": headline(judged),
+        "headline": headline(found.judged, found.acc),
         "recommended": best and {"share": best.share, "driver": best.driver},
-        "judged": found,
+        "judged": [{**asdict(each), "reasons": each.reasons, "words": each.words} for each in found.judged],
+        "acc": [{**asdict(each), "driver": ACC, "words": each.words} for each in found.acc],
         "tried": tried,
-        "people": {name: asdict(estimate_of(rows[PEOPLE], name)) for name in METRICS_OF_PEOPLE},
+        "people": {name: asdict(estimate_of(found.rows[HUMAN], name)) for name in METRICS_OF_PEOPLE},
         "road": {**scenario_recipe(asked.road), "file": asked.file},
         "people_drive": asked.road.people_in_words,
         "drivers": {name: driver.recipe().get("parameters", {}) for name, driver in asked.drivers.items()},
@@ -236,5 +267,5 @@ def _document(
         "precision": asked.precision,
         "budget": {"episodes": asked.episodes, "minutes": asked.minutes},
         "episodes": {"choosing": chose, "all": budget.spent},
-        "seeds": {"choosing": len(choice.rows[PEOPLE]), "judging": len(rows[PEOPLE]) if judged else 0},
+        "seeds": {"choosing": len(choice.rows[HUMAN]), "judging": len(found.rows[HUMAN])},
     }

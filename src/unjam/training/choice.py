@@ -1,26 +1,37 @@
-"""Who drives best at each share of CAVs: chosen on some seeds, judged on others, beside people alone.
+"""Which controller is best at each penetration rate, and is it better than ACC vehicles and human drivers?
 
-Some seeds choose a driver for each share: what is shown to harm, or to be slower than another at the same
-share, is set aside early. Those that are chosen are judged on fresh seeds, and a rule says what it means.
+Tuning seeds choose a controller for each penetration rate by successive halving. Fresh test seeds compare the
+human baseline, ACC vehicles without a controller, and the controllers that were chosen.
 """
 
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from math import isfinite
+from math import ceil, isfinite, log2
 from typing import Any, NamedTuple
 
 from unjam.measures.drivable import DRIVABLE
-from unjam.measures.effect import LEAST_JUDGED, Effect, Judged, effect_of, harm_of, percent
-from unjam.measures.statistics import CONFIDENCE, paired_difference, signed
+from unjam.measures.effect import (
+    LEAST_JUDGED,
+    AccResult,
+    Effect,
+    Judged,
+    effect_of,
+    harm_of,
+    percent,
+    seeds_for_verdict,
+)
+from unjam.measures.statistics import CONFIDENCE, Estimate, paired_difference
 from unjam.training.evaluate import raise_failure
 from unjam.training.seeds import choosing_seeds, held_out_seeds
 
-BATCH = 2
-"""seeds that are added at a time"""
-LEAST_CHOOSING = 6
-"""seeds before anything is set aside, or counts as known well enough"""
-PART_CHOOSING = 0.5
+MOST_CHOOSING = 10
+"""seeds of a round of successive halving, at most"""
+LEAST_HARMED = 6
+"""seeds before an option is set aside because it is shown to do harm"""
+LEAST_TESTED = 3
+"""test seeds without which there is no interval"""
+PART_CHOOSING = 0.4
 """of the budget, that choosing may spend"""
 
 Seed = tuple[int, ...]
@@ -29,135 +40,226 @@ OnLine = Callable[[str], None]
 
 
 class Option(NamedTuple):
-    """A share of CAVs and who drives them."""
+    """A penetration rate and a driver of the CAVs."""
 
     share: float
     driver: str
 
     @property
     def label(self) -> str:
-        """Its name in tables; people alone are `human`, as everywhere."""
+        """Its name in tables; the human baseline is `human`, as everywhere."""
         return f"{self.driver}, {percent(self.share)}" if self.share else self.driver
 
 
-PEOPLE = Option(0.0, "human")
+HUMAN = Option(0.0, "human")
+ACC = "cruise"
+"""driver of ACC vehicles without a controller"""
+UNCHANGED_ACC = "cruise with unchanged vehicles"
+"""the same, where the user has set properties of CAVs: with those of the vehicles which they replace"""
 Drive = Callable[[Sequence[Option], Sequence[Seed]], dict[Option, Rows]]
 """drives all options on all seeds, and measures"""
 
 
 class Budget:
-    """Counts episodes, and knows by how long those before took whether more fit into the time."""
+    """Counts episodes, and knows how many more fit into the time."""
 
     def __init__(
-        self, episodes: int, minutes: float | None = None, clock: Callable[[], float] = time.monotonic
+        self,
+        episodes: int,
+        minutes: float | None = None,
+        workers: int = 1,
+        clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        """Begin to count, and the clock to run."""
-        self.episodes, self.spent = episodes, 0
-        self._seconds, self._clock, self._started = minutes and 60.0 * minutes, clock, clock()
+        """Begin to count, and the clock to run; as many episodes at once as there are `workers`."""
+        self.episodes, self.minutes, self.spent = episodes, minutes, 0
+        self._workers, self._rounds, self._clock, self._started = workers, 0, clock, clock()
 
     def spend(self, count: int) -> None:
-        """Note that so many episodes were driven."""
+        """Note that so many episodes were driven together."""
         self.spent += count
+        self._rounds += ceil(count / self._workers)
 
-    def allows(self, count: int, part: float = 1.0) -> bool:
-        """Return whether so many episodes more fit into this part of the budget."""
-        wanted = self.spent + count
-        if wanted > part * self.episodes:
-            return False
-        if self._seconds is None or not self.spent:
-            return True
-        each = (self._clock() - self._started) / self.spent
-        return each * wanted <= part * self._seconds
+    @property
+    def elapsed(self) -> float:
+        """Time since the start [s]."""
+        return self._clock() - self._started
+
+    def seconds_for(self, episodes: float) -> float:
+        """Return how long so many episodes take, as those before did [s]."""
+        return self.elapsed / max(1, self._rounds) * ceil(episodes / self._workers)
+
+    def seeds(self, options: int, part: float = 1.0) -> int:
+        """Return on how many seeds so many options can be driven within this part of the budget."""
+        left = int(part * self.episodes + 1e-9) - self.spent
+        if self.minutes is not None and self._rounds:
+            rounds = (part * 60.0 * self.minutes - self.elapsed) / max(self.seconds_for(1), 1e-9)
+            left = min(left, int(rounds) * self._workers)
+        return max(0, left // options)
 
 
 @dataclass(frozen=True)
 class Choice:
-    """What the seeds that choose have shown."""
+    """What the tuning seeds have shown."""
 
     rows: dict[Option, Rows]
     set_aside: dict[Option, str]
-    """why, of what was not driven to the end"""
+    """why, of the options that are not tested"""
     finalists: list[Option]
-    """at most one for each share"""
+    """at most one for each penetration rate"""
 
     def effect(self, option: Option) -> Effect:
-        """Return what an option does beside people alone, on the seeds that it was driven on."""
-        return effect_of(self.rows[option], self.rows[PEOPLE])
+        """Return what an option changes compared with the human baseline on the seeds of both."""
+        return effect_of(self.rows[option], self.rows[HUMAN])
 
 
-def least_episodes(shares: int, drivers: int) -> int:
-    """Return the smallest budget with which something can be chosen and judged."""
-    choosing = LEAST_CHOOSING * (1 + shares * drivers)
-    return max(round(choosing / PART_CHOOSING), choosing + LEAST_JUDGED * (1 + shares))
+def least_episodes(shares: int, drivers: int, split: bool = False) -> int:
+    """Return the smallest budget with which every option is driven, and those chosen are tested."""
+    choosing = 1 + shares * drivers if drivers > 1 else 0
+    return choosing + LEAST_TESTED * (1 + shares * (1 + bool(drivers) + split))
 
 
-def choose(
-    options: Sequence[Option], drive: Drive, budget: Budget, precision: float, on_line: OnLine
-) -> Choice:
-    """Drive people and all options until a driver is known for each share, or half the budget is spent.
+def choose(options: Sequence[Option], drive: Drive, budget: Budget, on_line: OnLine) -> Choice:
+    """Choose a controller for each penetration rate by successive halving.
 
-    `precision` is the half-width of the interval of travel time that is narrow enough, as a share of
-    people's; `on_line` gets a line for each batch.
+    In each round the better half of each penetration rate goes on. `on_line` gets a line for each round.
 
     Raises:
-        UnjamError: people alone cannot be driven, or no option can.
+        UnjamError: the human baseline cannot be driven, or no option can.
     """
-    rows: dict[Option, Rows] = {option: [] for option in (PEOPLE, *options)}
+    rows: dict[Option, Rows] = {option: [] for option in (HUMAN, *options)}
     set_aside: dict[Option, str] = {}
-    slower_than: dict[Option, Option] = {}
-    while True:
-        left = [option for option in options if option not in set_aside]
-        _extend(rows, drive([PEOPLE, *left], choosing_seeds(BATCH, len(rows[PEOPLE]))))
-        found = Choice(rows, set_aside, [])
+    found, left = Choice(rows, set_aside, []), list(options)
+    most = max((sum(each.share == option.share for each in options) for option in options), default=0)
+    rounds = ceil(log2(most)) if most > 1 else 0
+    for number in range(rounds):
+        fit = budget.seeds(1 + len(left), PART_CHOOSING * (number + 1) / rounds)
+        count = max(min(MOST_CHOOSING, fit), int(number == 0))
+        if count:
+            _extend(rows, drive([HUMAN, *left], choosing_seeds(count, len(rows[HUMAN]))))
         set_aside |= _failed(rows, left)
-        if len(rows[PEOPLE]) >= LEAST_CHOOSING:
-            left = [option for option in left if option not in set_aside]
-            set_aside |= {option: harm for option in left if (harm := harm_of(found.effect(option)))}
-            for option in [each for each in slower_than if _is_better(each, slower_than[each], found)]:
-                del slower_than[option], set_aside[option]
-            slower = _slower(found, [option for option in left if option not in set_aside])
-            slower_than |= {option: rival for option, (rival, _) in slower.items()}
-            set_aside |= {option: words for option, (_, words) in slower.items()}
-        left = [option for option in options if option not in set_aside]  # with who has come back
-        widths = [found.effect(option).width for option in left]
-        said = f"choosing, {len(rows[PEOPLE])} seeds: {len(left)} of {len(options)} left"
-        on_line(f"{said}, {_wide(widths, precision)}")
-        decided = len({option.share for option in left}) == len(left)
-        known = len(rows[PEOPLE]) >= LEAST_CHOOSING and (decided or all(each <= precision for each in widths))
-        if not left or known or not budget.allows(BATCH * (1 + len(left)), PART_CHOOSING):
+        seeds = len(rows[HUMAN])
+        if seeds >= LEAST_HARMED:
+            set_aside |= {each: harm for each in left if (harm := harm_of(found.effect(each)))}
+        left = [option for option in left if option not in set_aside]
+        for share in dict.fromkeys(option.share for option in left):
+            ranked = sorted(
+                (each for each in left if each.share == share), key=lambda each: _order(found.effect(each))
+            )
+            for option in ranked[ceil(len(ranked) / 2) :]:
+                set_aside[option] = f"behind {ranked[0].driver} (tuning seeds: {seeds})"
+        left = [option for option in left if option not in set_aside]
+        on_line(f"tuning seeds: {seeds}; {len(left)} of {len(options)} options left{_time_left(budget)}")
+        if not left:
             break
-    if len(_failed(rows, options)) == len(options):
+    if options and len(_failed(rows, options)) == len(options):
         raise_failure([row for option in options for row in rows[option]])
-    shares = dict.fromkeys(option.share for option in left)
-    finalists = [
-        min((each for each in left if each.share == share), key=lambda each: _order(found.effect(each)))
-        for share in shares
-    ]
-    return Choice(rows, set_aside, finalists)
+    return Choice(rows, set_aside, left)
+
+
+@dataclass(frozen=True)
+class Findings:
+    """What the test seeds have shown."""
+
+    rows: dict[Option, Rows]
+    judged: list[Judged]
+    acc: list[AccResult]
 
 
 def judge(
-    finalists: Sequence[Option], drive: Drive, budget: Budget, precision: float, on_line: OnLine
-) -> tuple[dict[Option, Rows], list[Judged]]:
-    """Drive people and the finalists on fresh seeds until intervals are narrow, or the budget is spent.
+    finalists: Sequence[Option],
+    shares: Sequence[float],
+    split: bool,
+    drive: Drive,
+    budget: Budget,
+    precision: float,
+    on_line: OnLine,
+) -> Findings:
+    """Compare human baseline, ACC vehicles and the chosen controllers on test seeds.
 
-    It ends by how narrow the intervals are, never by where they lie. They are wider the more are judged: all
-    of them together hold with 95 % (Bonferroni).
+    An option is driven until its intervals are narrower than `precision`, a share of the travel time of the
+    human baseline, or until it can hardly be recommended any more within the budget. No option ends because
+    it does well, so that no interval is too narrow by a lucky moment. Intervals hold together for all
+    penetration rates with 95 % (Bonferroni). `split`: ACC vehicles that keep all properties of the vehicles
+    which they replace are driven, too.
     """
-    rows: dict[Option, Rows] = {option: [] for option in (PEOPLE, *finalists)}
-    confidence = 1.0 - (1.0 - CONFIDENCE) / max(1, len(finalists))
-    while True:
-        _extend(rows, drive([PEOPLE, *finalists], held_out_seeds(BATCH, len(rows[PEOPLE]))))
-        effects = [effect_of(rows[option], rows[PEOPLE], confidence) for option in finalists]
-        widths = [effect.width for effect in effects]
-        on_line(f"judging, {len(rows[PEOPLE])} fresh seeds: {_wide(widths, precision)}")
-        known = len(rows[PEOPLE]) >= LEAST_JUDGED and all(each <= precision for each in widths)
-        if known or not budget.allows(BATCH * len(rows)):
-            return rows, [Judged(*each, effect) for each, effect in zip(finalists, effects, strict=True)]
+    baselines = [Option(share, ACC) for share in shares]
+    unchanged = [Option(share, UNCHANGED_ACC) for share in shares if split]
+    rows: dict[Option, Rows] = {option: [] for option in (HUMAN, *baselines, *unchanged, *finalists)}
+    confidence = 1.0 - (1.0 - CONFIDENCE) / max(1, len(shares))
+    active, judged, acc = [*rows][1:], list[Judged](), list[AccResult]()
+    while active:
+        seeds = len(rows[HUMAN])
+        wanted = LEAST_JUDGED - seeds if seeds < LEAST_JUDGED else seeds // 2
+        count = max(min(wanted, budget.seeds(1 + len(active))), 0 if seeds else LEAST_TESTED)
+        if not count:
+            break
+        _extend(rows, drive([HUMAN, *active], held_out_seeds(count, seeds)))
+        judged = [_judged(option, rows, confidence, precision) for option in finalists]
+        acc = [_acc_result(option, rows, confidence, precision) for option in baselines]
+        affordable = len(rows[HUMAN]) + budget.seeds(1 + len(active))
+        open_ones = {
+            Option(each.share, each.driver) for each in judged if _is_open(each, affordable, precision)
+        }
+        open_shares = {option.share for option in open_ones} | {
+            each.share for each in acc if 0 < each.missing <= affordable - each.effect.travel_time.count
+        }
+        active = [
+            option
+            for option in active
+            if option in open_ones or (option not in finalists and option.share in open_shares)
+        ]
+        widths = [each.effect.width for each in (*judged, *acc)]
+        said = f"test seeds: {len(rows[HUMAN])}; {_wide(widths, precision)}, {len(active)} options left"
+        on_line(f"{said}{_time_left(budget) if active else ''}")
+    driven = [row for option in baselines for row in rows[option]]
+    if all(row["status"] == "failed" for row in driven):
+        raise_failure(driven)
+    return Findings(rows, judged, acc)
+
+
+def _judged(option: Option, rows: dict[Option, Rows], confidence: float, precision: float) -> Judged:
+    """Return what a controller does compared with human drivers and with ACC vehicles."""
+    effect = effect_of(rows[option], rows[HUMAN], confidence)
+    beyond = paired_difference(
+        rows[option], rows[Option(option.share, ACC)][: len(rows[option])], "travel_time", confidence
+    )
+    narrow = precision * effect.people_time
+    needed = max(seeds_for_verdict(each, narrow) for each in (beyond, effect.travel_time))
+    missing = 0.0 if _is_refused(effect, beyond) else max(0.0, needed - beyond.count)
+    return Judged(*option, effect, beyond, missing)
+
+
+def _is_refused(effect: Effect, beyond_acc: Estimate) -> bool:
+    """Return whether more test seeds can hardly lead to a recommendation."""
+    harms = bool(harm_of(effect)) or beyond_acc.low > 0
+    return bool(effect.failed) or harms or effect.drivable != DRIVABLE
+
+
+def _acc_result(option: Option, rows: dict[Option, Rows], confidence: float, precision: float) -> AccResult:
+    """Return what ACC vehicles do compared with human drivers."""
+    effect = effect_of(rows[option], rows[HUMAN], confidence)
+    unchanged = rows.get(Option(option.share, UNCHANGED_ACC))
+    of_properties = (
+        paired_difference(rows[option], unchanged, "travel_time", confidence) if unchanged else None
+    )
+    needed = seeds_for_verdict(effect.travel_time, precision * effect.people_time)
+    return AccResult(option.share, effect, of_properties, max(0.0, needed - effect.travel_time.count))
+
+
+def _is_open(found: Judged, affordable: int, precision: float) -> bool:
+    """Return whether more test seeds may still lead to a recommendation, or make it more precise."""
+    effect, beyond = found.effect, found.beyond_acc
+    if beyond.count < LEAST_JUDGED:
+        return not effect.failed
+    hopeless = beyond.mean >= 0 or _is_refused(effect, beyond)
+    unreachable = found.missing > affordable - beyond.count
+    half = (beyond.high - beyond.low) / 2.0
+    narrow = max(half / effect.people_time, effect.width) <= precision
+    return not (hopeless or unreachable or narrow)
 
 
 def _extend(rows: dict[Option, Rows], more: dict[Option, Rows]) -> None:
-    raise_failure(more[PEOPLE])
+    raise_failure(more[HUMAN])
     for option, found in more.items():
         rows[option] += found
 
@@ -171,36 +273,27 @@ def _failed(rows: dict[Option, Rows], options: Iterable[Option]) -> dict[Option,
     return {option: f"failed: {reason}" for option, reason in reasons.items() if reason is not None}
 
 
-def _slower(found: Choice, left: Sequence[Option]) -> dict[Option, tuple[Option, str]]:
-    """Return which options are shown to be slower than the best of their share, that one, and the words."""
-    slower = dict[Option, tuple[Option, str]]()
-    for option in left:
-        best = min(
-            (each for each in left if each.share == option.share),
-            key=lambda each: _order(found.effect(each)),
-        )
-        more = paired_difference(found.rows[option], found.rows[best], "travel_time")
-        if more.low > 0:
-            slower[option] = best, f"slower than {best.driver}: travel time {signed(more, 1)} s"
-    return slower
-
-
-def _is_better(option: Option, rival: Option, found: Choice) -> bool:
-    """Return whether who was quicker has turned out worse: it harms, failed, or no car could drive so."""
-    its, own = found.effect(rival), found.effect(option)
-    return bool(harm_of(its) or its.failed or _order(its)[:2] > _order(own)[:2])
-
-
 def _order(effect: Effect) -> tuple[bool, bool, float]:
-    """Return what options are sorted by: without contact, then drivable, then quick."""
+    """Return what options are sorted by: without contact, then feasible, then quick."""
     return effect.collisions > 0, effect.drivable != DRIVABLE, effect.relative_time
 
 
 def _wide(widths: Sequence[float], precision: float) -> str:
     """Return how wide the widest interval is, in words."""
-    if not widths:
-        return "all are set aside"
     wanted = f"(wanted: ±{100 * precision:g} %)"
     if not all(map(isfinite, widths)):
         return f"too few for an interval of travel time {wanted}"
-    return f"travel time known to ±{100 * max(widths):.1f} % of people's {wanted}"
+    return f"travel time known to ±{100 * max(widths):.1f} % of the human baseline's {wanted}"
+
+
+def _time_left(budget: Budget) -> str:
+    """Return how long the rest of the budget takes at most, in words."""
+    seconds = budget.seconds_for(budget.episodes - budget.spent)
+    if budget.minutes is not None:
+        seconds = min(seconds, max(0.0, 60.0 * budget.minutes - budget.elapsed))
+    return f"; at most {in_words(seconds)} more"
+
+
+def in_words(seconds: float) -> str:
+    """Return a duration for a line of progress."""
+    return f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.0f} min"

@@ -25,7 +25,6 @@ from unjam.measures.metrics import measure
 from unjam.measures.statistics import Estimate, paired_difference, summarise
 from unjam.reports.results import ABOUT_SHOWN, EVALUATION_FILE, packed, shown_of
 from unjam.scenarios import make_scenario, scenario_recipe
-from unjam.scenarios.own_network import notes_on_network
 from unjam.scenarios.scenario import Scenario
 from unjam.training.config import RunConfig
 from unjam.training.drive_result import DriveResult, Rows, frame_of_rows
@@ -317,7 +316,7 @@ def drive(
         found = evaluate(made, drivers, seeds, pool, reward, progress)
         report, notes = None, notes_on_controllers(scenario_recipe(made), drivers, found.shown)
         notes += [f"{name} {WANTS_ACC}" for name, one in drivers.items() if _lacks_acc(one, made)]
-        notes += [*notes_on_teleports(found.rows), *notes_on_network(made)]
+        notes += [*made.notes, *notes_on_teleports(found.rows)]
         ran = any(row["status"] != "failed" for rows in found.rows.values() for row in rows)
         if folder is not None and ran:
             about = {"scenario": Path(scenario).name, "reward": reward or made.reward, "manifest": manifest()}

@@ -10,6 +10,8 @@ import sumo
 
 from unjam.worlds.sumo.networks import sumo_program
 
+SPARSE = '<flow id="f" type="own" route="along" begin="0" end="50" period="4" departSpeed="max"/>'
+"""vehicles of the type `own`, for `network`"""
 GAME = Path(sumo.SUMO_HOME) / "tools" / "game"
 
 
@@ -61,3 +63,13 @@ def straight(
         f'<end value="{end}"/><step-length value="0.1"/></configuration>'
     )
     return path
+
+
+def network(folder: Path, demand: str, more: str = "", options: str = "") -> str:
+    """A straight road with vehicles on the route `along`, elements in an additional file, and options."""
+    file = straight(folder, "", length=800.0)
+    (folder / "demand.rou.xml").write_text(f'<routes><route id="along" edges="road"/>{demand}</routes>')
+    (folder / "more.add.xml").write_text(f"<additional>{more}</additional>")
+    text = file.read_text().replace("<end ", f'<additional-files value="more.add.xml"/>{options}<end ')
+    file.write_text(text)
+    return str(file)

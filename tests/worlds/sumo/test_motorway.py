@@ -184,7 +184,7 @@ def test_cavs_want_to_drive_as_fast_as_those_whom_they_replace(simulation: Simul
     for row, name in enumerate(traffic.cavs):
         factor = traffic.road.kinds[kinds[name]].speed_factor
         assert libsumo.vehicle.getSpeedFactor(name) == pytest.approx(factor)
-        assert libsumo.vehicle.getTypeID(name) == f"cav_of_{kinds[name]}"
+        assert simulation.type_of(name) == f"cav_of_{kinds[name]}"
         assert traffic.perceive().allowed_speed[row] == libsumo.vehicle.getAllowedSpeed(name)
 
 

@@ -1,6 +1,6 @@
 """What SUMO reads of an episode: the network, who drives how, and who enters."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -8,7 +8,8 @@ from typing import Any, NamedTuple
 from unjam.physics.idm import IDMParameters
 from unjam.scenarios.road import BuiltRoad, MotorwayRoad, OwnRoad, Road
 from unjam.scenarios.scenario import ACCELERATION, OBEDIENT, SMALLEST_CAV_GAP, VEHICLE_LENGTH, Scenario
-from unjam.worlds.sumo.networks import Attributes, document, element, network_file
+from unjam.sumo_files import is_harmless_attribute, is_harmless_parameter
+from unjam.worlds.sumo.networks import Attributes, element, network_file
 
 CAV_COLOUR = "215,38,61"
 """red, in SUMO's window"""
@@ -17,11 +18,8 @@ CAV_TYPES = CAV_PREFIX + "{}"
 """the type of a CAV whose own type is `{}`"""
 CALIBRATED_TYPES = "{}" + DRIVER_SUFFIX + "{}"
 """the type of a car whose own type is `{}`, driven by a calibrated person of that number"""
-KEPT = (
-    *("vClass", "length", "width", "height", "maxSpeed", "speedFactor", "guiShape", "emissionClass"),
-    *("laneChangeModel", "mass"),
-)
-"""attributes of a vehicle type that a CAV takes over, beside those of changing lanes: `lc...`"""
+FOLLOWING = {"carFollowModel", "tau", "minGap", "sigma", "delta", "stepping"}
+"""attributes of a vehicle type that are its car-following law's: a CAV keeps all others"""
 
 
 class Files(NamedTuple):
@@ -116,34 +114,44 @@ def _motorway_types(scenario: Scenario, road: MotorwayRoad) -> list[str]:
 
 
 def _own_types_xml(scenario: Scenario, road: OwnRoad) -> str:
-    """Return the XML of a CAV type beside each of the user's types: as large, but driven by commands.
+    """Return the XML of a CAV type for each type that may become one: alike but for the car-following law.
 
-    Where calibrated people drive, each car's type is there for each of them, as large and as fast as it was.
+    Each calibrated driver has such a type for each type of passenger cars. SUMO draws a new speed factor for
+    a vehicle that gets another type. From these types it draws none, and the vehicle gets its own back.
     """
-    calibrated = {
-        CALIBRATED_TYPES.format(name, number): {
-            **_kept(road.files.types[name], (*KEPT, "speedDev", "color")),
-            **_idm_layer(one),
-        }
-        for name in sorted(road.driven_types)
-        for number, one in enumerate(road.drivers)
+    layer = {"sigma": 0.0, "delta": IDMParameters().exponent, **_cav_layer(scenario)}
+    if scenario.actuation != "cruise":
+        layer["accel"] = None  # no command makes a vehicle accelerate harder than it can
+    layer = {key: value for key, value in layer.items() if value is not None}
+    files, lines, cavs = road.files, list[str](), road.eligible_types.union(road.cav_types)
+    for name, attributes in files.types.items():
+        drivers = enumerate(road.drivers if name in road.driven_types else ())
+        laws = {CALIBRATED_TYPES.format(name, number): _idm_layer(one) for number, one in drivers}
+        if name in cavs:
+            laws |= {CAV_TYPES.format(own): {**law, **layer} for own, law in {name: {}, **laws}.items()}
+        for variant, law in laws.items():
+            lines.append(_variant(variant, attributes, law, files.type_parameters.get(name, {})))
+    return "\n".join(["<additional>", *lines, "</additional>"])
+
+
+def _variant(name: str, attributes: Attributes, law: Attributes, parameters: dict[str, str]) -> str:
+    """Return the XML of a vehicle type like one of the user's that follows by another law."""
+    kept = {
+        key: value for key, value in attributes.items() if key not in FOLLOWING and is_harmless_attribute(key)
     }
-    types = [{**attributes, "id": name} for name, attributes in calibrated.items()]
-    for name, attributes in {**road.files.types, **calibrated}.items():
-        calm = {"id": CAV_TYPES.format(name), "sigma": 0.0, "speedDev": 0.0}
-        types.append({**_kept(attributes, KEPT), **calm, **_cav_layer(scenario)})
-    return document("additional", "vType", types)
+    opened = element("vType", **{**kept, "speedFactor": 1.0, "speedDev": 0.0, **law, "id": name})
+    nested = "".join(
+        element("param", key=key, value=value)
+        for key, value in parameters.items()
+        if is_harmless_parameter(key)
+    )
+    return f"{opened.removesuffix('/>')}>{nested}</vType>"
 
 
 def base_type(name: str) -> str:
     """Return the user's vehicle type from which the type of that name was made, for a CAV or a driver."""
     of_one_vehicle = name.partition("@")[0]  # as SUMO names a type of which one vehicle has a changed copy
     return of_one_vehicle.partition(DRIVER_SUFFIX)[0].removeprefix(CAV_PREFIX)
-
-
-def _kept(attributes: Attributes, names: Sequence[str]) -> Attributes:
-    """Return those attributes that have one of these names, or are about changing lanes."""
-    return {key: value for key, value in attributes.items() if key in names or key.startswith("lc")}
 
 
 def _vehicle_type(name: str, scenario: Scenario, **attributes: Any) -> str:
@@ -205,7 +213,7 @@ def _cav_layer(scenario: Scenario) -> Attributes:
         "color": CAV_COLOUR,
         "carFollowModel": "IDM",
         "tau": cruise.time_headway,
-        "accel": cruise.acceleration,
+        "accel": cruise.acceleration,  # None: as the vehicle has it
         "decel": cruise.deceleration,
         "minGap": cruise.gap,
     }

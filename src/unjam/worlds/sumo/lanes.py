@@ -66,6 +66,10 @@ class LaneTraffic(OpenTraffic[OpenKind]):
         """Return whom these CAVs follow now."""
         raise NotImplementedError
 
+    def _acc_limits(self, names: Sequence[str]) -> tuple[Floats, Floats] | None:
+        """Return acceleration and comfortable braking of the CAVs' vehicles [m/s2]; None: as the ACC says."""
+        return None
+
     def _is_free(self, name: str) -> bool:
         """Whether nobody may hold a CAV back where it is."""
         return False
@@ -102,7 +106,8 @@ class LaneTraffic(OpenTraffic[OpenKind]):
             super()._tell(speeds)
             return
         now = np.array(self._simulation.speeds(list(speeds)))
-        held = cruise.set_speed(now, np.array([*speeds.values()]), self.limits.highest, step)
+        limits = self._acc_limits(list(speeds))
+        held = cruise.set_speed(now, np.array([*speeds.values()]), self.limits.highest, step, limits)
         for name, cap in zip(speeds, held.tolist(), strict=True):
             if cap < inf and not self._is_free(name):
                 fastest = self._fastest.setdefault(name, self._simulation.fastest(name))

@@ -10,12 +10,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from unjam.drivers.command import Command
 from unjam.drivers.local_state import LARGEST_GAP, LocalState
 from unjam.drivers.roadside import Messages
 from unjam.drivers.safety import Ahead
 from unjam.scenarios.own_network import PASSENGER
 from unjam.scenarios.road import OwnRoad
 from unjam.worlds.record import Episode, Floats
+from unjam.worlds.sumo.control import VehicleLimits
 from unjam.worlds.sumo.files import CALIBRATED_TYPES, CAV_TYPES
 from unjam.worlds.sumo.lanes import Followed, LaneTraffic
 from unjam.worlds.sumo.networks import edge_lengths, lane_counts, network_lines
@@ -41,6 +43,8 @@ class OwnTraffic(LaneTraffic[OwnRoad]):
         """sum of the speeds that were allowed to vehicles [m/s], and of how many"""
         self._came, self._picked = 0, 0
         """vehicles that have entered, and CAVs among them"""
+        self._limits: dict[str, VehicleLimits] = {}
+        """of the vehicles that CAVs replace"""
         self._service = None
         if "lane_speeds" in self.asked:
             step = self.scenario.decision_step
@@ -72,7 +76,7 @@ class OwnTraffic(LaneTraffic[OwnRoad]):
         road, kind = self.road, self._simulation.type_of(name)
         if kind in road.cav_types:
             return True
-        if kind not in road.cars:
+        if kind not in road.eligible_types:
             return False
         return self._drawn(name) < road.cav_share * 2**64
 
@@ -101,6 +105,27 @@ class OwnTraffic(LaneTraffic[OwnRoad]):
     @property
     def _cav_type(self) -> str:
         return "{}" if self.scenario.actuation == "flow" else CAV_TYPES
+
+    def _vehicle_limits(self, names: Sequence[str]) -> tuple[Floats, Floats, Floats]:
+        """Return acceleration, comfortable and hardest braking of the vehicles that CAVs replace [m/s2]."""
+        for name in [name for name in names if name not in self._limits]:
+            kind = self._simulation.type_of(name)
+            own = self._simulation.type_limits(kind.removeprefix(CAV_TYPES.format("")))
+            self._limits[name] = own
+            if self.scenario.actuation in ("shielded", "raw"):
+                self._simulation.limit_braking(kind, min(own.braking, self.scenario.cav_brakes))
+        rows = np.array([self._limits[name] for name in names], np.float64).reshape(-1, 3)
+        return rows[:, 0], rows[:, 1], rows[:, 2]
+
+    def _acc_limits(self, names: Sequence[str]) -> tuple[Floats, Floats]:
+        return self._vehicle_limits(names)[:2]
+
+    def _told(self, command: Command | None) -> list[float]:
+        told = super()._told(command)
+        if self.scenario.actuation == "cruise":
+            return told
+        most, _, hardest = self._vehicle_limits(self.cavs)
+        return np.clip(told, -hardest, most).tolist()
 
     def _legal(self, speeds: dict[str, float]) -> dict[str, float]:
         if self.scenario.actuation == "cruise":  # SUMO keeps to it, and takes set speeds for allowed ones

@@ -15,20 +15,14 @@ from numpy.typing import NDArray
 
 from unjam.errors import EpisodeError, RefusedError, wrong
 from unjam.processes import PrivateFolder, printed_to
-from unjam.scenarios.scenario import Actuation
 from unjam.sumo_files import copy_harmless, stamp_of
+from unjam.worlds.sumo.control import VehicleControl
 from unjam.worlds.sumo.files import Files
 from unjam.worlds.sumo.library import Backend, Libsumo, Traci, function_of
 from unjam.worlds.sumo.networks import said_in, sumo_program
 from unjam.worlds.sumo.tripinfo import read_trips, trip_options
 from unjam.worlds.trips import Trips
 
-SPEED_MODES = {"shielded": 31, "raw": 30, "flow": 25, "cruise": 31}
-"""SUMO's speed mode bits for each way of actuation: bit 0 is the check for a safe speed."""
-WITHOUT_RIGHT_OF_WAY = 1
-"""the bit that stays where vehicles need not obey the right of way: who is surprised stops as it must"""
-LIMITS_OF_ACCELERATION = 2 | 4
-"""the bits by which vehicles keep to the acceleration and the braking of their type"""
 _exhaust = deque(maxlen=0).extend
 """runs through an iterator, in C: a loop would cost as much as the calls"""
 
@@ -54,7 +48,7 @@ class NetworkLane(NamedTuple):
     """lanes of the next edges"""
 
 
-class Simulation:
+class Simulation(VehicleControl):
     """One SUMO simulation, loaded anew for each episode.
 
     libsumo holds one simulation per process and silently replaces the first by a second. So this class
@@ -103,10 +97,6 @@ class Simulation:
         self._get_lane = call("vehicle", "getLaneID")
         self._get_fuel = call("vehicle", "getFuelConsumption")
         self._set_speed = call("vehicle", "setSpeed")
-        self.type_of: Callable[[str], str] = call("vehicle", "getTypeID")
-        """a vehicle's type"""
-        self.change_type: Callable[[str, str], object] = call("vehicle", "setType")
-        """gives a vehicle another type"""
         self.fastest: Callable[[str], float] = call("vehicle", "getMaxSpeed")
         """how fast a vehicle drives at most, whatever the road allows [m/s]"""
         self.set_fastest: Callable[[str, float], object] = call("vehicle", "setMaxSpeed")
@@ -269,25 +259,6 @@ class Simulation:
     def replace_speeds(self, ids: Iterable[str], speeds: Iterable[float]) -> None:
         """Give `ids` other current speeds [m/s], plain floats: how noise enters."""
         _exhaust(map(self._set_previous_speed, ids, speeds))
-
-    def command_people(self, ids: Iterable[str], right_of_way: bool, bounded: bool) -> None:
-        """Let SUMO keep `ids` safe and to the right of way and, if `bounded`, to limits of acceleration."""
-        mode = SPEED_MODES["flow"] if right_of_way else SPEED_MODES["flow"] & WITHOUT_RIGHT_OF_WAY
-        mode |= LIMITS_OF_ACCELERATION if bounded else 0
-        for name in ids:
-            self._sumo.vehicle.setSpeedMode(name, mode)
-
-    def take_control(
-        self, ids: Iterable[str], actuation: Actuation, right_of_way: bool = True, types: str = "cav"
-    ) -> None:
-        """Make `ids` CAVs: from now on they obey `command_speeds`.
-
-        Their type becomes `types`, in which `{}` stands for the type that they had.
-        """
-        mode = SPEED_MODES[actuation] if right_of_way else SPEED_MODES[actuation] & WITHOUT_RIGHT_OF_WAY
-        for name in ids:
-            self._sumo.vehicle.setType(name, types.format(self._sumo.vehicle.getTypeID(name)))
-            self._sumo.vehicle.setSpeedMode(name, mode)
 
     def end_with_trips(self, classes: dict[str, str], after: float) -> Trips:
         """End the episode, so that SUMO writes its last records, and return what `read_trips` finds."""

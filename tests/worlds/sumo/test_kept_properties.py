@@ -1,0 +1,212 @@
+"""Does a CAV keep everything of the vehicle that it replaces, except the car-following law?"""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.worlds.sumo.own_roads import SPARSE, network
+from unjam.controller import make_driver
+from unjam.drivers import Constant, Human
+from unjam.drivers.command import Command
+from unjam.drivers.driver import Driver
+from unjam.scenarios import make_scenario
+from unjam.scenarios.own_network import WITH_OWN_ACC
+from unjam.worlds.episode import run_episode
+from unjam.worlds.record import Episode
+from unjam.worlds.sumo import make_traffic
+from unjam.worlds.sumo.own import OwnTraffic
+from unjam.worlds.sumo.simulation import Simulation
+
+LAW = 'carFollowModel="IDM" tau="1.1" minGap="2"'
+"""the law of a CAV's own ACC, so that nothing at all may change"""
+ACCS = {**WITH_OWN_ACC, "cav_share": 1.0, "end": 60.0}
+
+
+def drive(simulation: Simulation, file: str, driver: Driver, **changes: Any) -> Episode:
+    scenario = make_scenario(file, {**ACCS, **changes})
+    return run_episode(scenario, driver, (3,), simulation=simulation)
+
+
+BUS_STOPS = (
+    '<busStop id="s1" lane="road_0" startPos="150" endPos="200"/>'
+    '<busStop id="s2" lane="road_0" startPos="400" endPos="450"/>'
+)
+PASSENGERS = (
+    '<vType id="own" vClass="bus" personCapacity="60" boardingDuration="0.2" {law}/>'
+    '<vehicle id="bus" type="own" depart="20" route="along" line="L">'
+    '<stop busStop="s1" duration="2"/><stop busStop="s2" duration="2"/></vehicle>'
+    '<personFlow id="p" begin="0" end="2" number="50"><walk from="road" busStop="s1" departPos="190"/>'
+    '<ride busStop="s2" lines="L"/></personFlow>'
+)
+
+
+@pytest.mark.parametrize(
+    ("demand", "more", "options"),
+    [
+        ('<vType id="own" {law}/>' + SPARSE, "", ""),
+        ('<vType id="own" {law} speedFactor="normc(0.9,0.2,0.5,1.5)"/>' + SPARSE, "", ""),
+        (
+            '<vType id="own" {law}/><vehicle id="v" type="own" route="along" depart="0" speedFactor="0.7"/>',
+            "",
+            "",
+        ),
+        (
+            '<vType id="own" vClass="truck" accel="0.5" decel="4" length="12" maxSpeed="18" {law}/>' + SPARSE,
+            "",
+            "",
+        ),
+        (
+            '<vType id="own" accel="2" emergencyDecel="5" jmTimegapMinor="3" impatience="0.5" {law}/>'
+            + SPARSE,
+            "",
+            "",
+        ),
+        (
+            '<vType id="own" actionStepLength="0.7" {law}/>' + SPARSE,
+            "",
+            '<step-method.ballistic value="true"/>',
+        ),
+        (
+            '<vType id="own" laneChangeModel="SL2015" latAlignment="arbitrary" minGapLat="0.1" width="0.8" '
+            'maxSpeedLat="2" lcPushy="1" {law}/><vType id="slow" vClass="bicycle" maxSpeed="4" width="0.6" '
+            'latAlignment="right"/>'
+            + SPARSE
+            + '<flow id="s" type="slow" route="along" begin="0" end="50" period="9"/>',
+            "",
+            '<lateral-resolution value="0.4"/>',
+        ),
+        (PASSENGERS, BUS_STOPS, ""),
+        (
+            '<vType id="own" {law}><carFollowing-IDM tau="1.1" minGap="2" accel="0.8"/></vType>' + SPARSE,
+            "",
+            "",
+        ),
+        (
+            '<vTypeDistribution id="mix"><vType id="own" accel="0.6" probability="0.5" {law}/>'
+            '<vType id="other" maxSpeed="12" probability="0.5" {law}/></vTypeDistribution>'
+            + SPARSE.replace('"own"', '"mix"'),
+            "",
+            "",
+        ),
+    ],
+    ids=[
+        "drawn",
+        "distribution",
+        "vehicle",
+        "truck",
+        "limits",
+        "action step",
+        "lateral",
+        "bus",
+        "nested",
+        "mix",
+    ],
+)
+def test_acc_vehicles_with_the_law_of_their_vehicles_change_nothing(
+    demand: str, more: str, options: str, tmp_path: Path, simulation: Simulation
+) -> None:
+    file = network(tmp_path, demand.replace("{law}", LAW), more, options)
+    changes = {"cav_classes": ["passenger", "truck", "bus"]}
+    human = drive(simulation, file, Human(), **changes)
+    acc = drive(simulation, file, make_driver("cruise", 0.1), **changes)
+    assert len(acc.cav_ids) >= 1
+    np.testing.assert_array_equal(acc.speeds, human.speeds)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {},
+        {"actuation": "shielded"},
+        {"actuation": "raw"},
+        {"actuation": "flow"},
+        {"population": "unjam:ngsim"},
+    ],
+    ids=["cruise", "shielded", "raw", "flow", "calibrated"],
+)
+def test_each_vehicle_keeps_its_speed_factor_and_others_draw_the_same(
+    changes: dict[str, Any], tmp_path: Path, simulation: Simulation
+) -> None:
+    own = '<vehicle id="it" type="own" route="along" depart="1" speedFactor="1.3"/>'
+    file = network(
+        tmp_path, '<vType id="own" speedDev="0.3"/>' + SPARSE.replace('period="4"', 'period="3"') + own
+    )
+
+    def factors(share: float) -> dict[str, float]:
+        scenario = make_scenario(file, {**ACCS, **changes, "cav_share": share, "cavs": 9})
+        traffic = make_traffic(scenario, (3,), simulation)
+        traffic.start(controlled=share == 1.0)
+        found: dict[str, float] = {}
+        while not traffic.ended:
+            traffic.advance(Command(np.zeros(len(traffic.cavs))))
+            names = [name for name in simulation.departed() if name not in found]
+            found |= zip(names, (factor for factor, _ in simulation.wishes(names)), strict=True)
+            last = [name for name in traffic.cavs if name in found]
+            found |= zip(last, (factor for factor, _ in simulation.wishes(last)), strict=True)
+        return found
+
+    human, cavs = factors(1e-12), factors(1.0)  # which may end early: a CAV without brakes
+    assert cavs == {name: human[name] for name in cavs}
+    assert cavs["it"] == 1.3
+    assert len(set(cavs.values())) == len(cavs) > 5
+
+
+TRUCK = '<vType id="own" vClass="truck" accel="0.5" emergencyDecel="3" decel="2.5" length="12"/>'
+ONE = '<vehicle id="v" type="own" route="along" depart="0" departSpeed="5"/>'
+CAR = '<vType id="own"/>'
+
+
+@pytest.mark.parametrize("actuation", ["shielded", "raw"])
+def test_commands_cannot_exceed_the_limits_of_the_vehicle(
+    actuation: str, tmp_path: Path, simulation: Simulation
+) -> None:
+    file = network(tmp_path, TRUCK + ONE)
+    asked = {"actuation": actuation, "cav_classes": ["truck"], "action_limit": 9.0, "horizon": 30}
+    for wanted, possible in ((1.0, 0.5), (0.3, 0.3), (-9.0, -3.0), (-1.0, -1.0)):
+        (trip,) = drive(simulation, file, Constant(wanted), **asked).trajectories
+        steps = np.diff(trip.states.speed)[:10]
+        np.testing.assert_allclose(steps, 0.1 * possible, atol=1e-9)
+        assert not (trip.shield > 1e-9).any()
+        np.testing.assert_allclose(trip.applied[:10], possible)
+
+
+@pytest.mark.parametrize(("vehicle", "most"), [(TRUCK, 0.5), (CAR, 2.6)])
+def test_a_set_speed_makes_a_vehicle_accelerate_as_asked_within_its_limits(
+    vehicle: str, most: float, tmp_path: Path, simulation: Simulation
+) -> None:
+    file = network(tmp_path, vehicle + ONE)
+    for wanted in (0.2, 0.4):
+        (trip,) = drive(
+            simulation, file, Constant(wanted), cav_classes=["passenger", "truck"], horizon=20
+        ).trajectories
+        np.testing.assert_allclose(np.diff(trip.states.speed)[1:], 0.1 * wanted, rtol=0.06)
+    free = drive(simulation, file, make_driver("cruise", 0.1), cav_classes=["passenger", "truck"], horizon=20)
+    assert np.diff(free.trajectories[0].states.speed).max() == pytest.approx(0.1 * most, rel=0.03)
+
+
+@pytest.mark.parametrize(("set_to", "found"), [({}, 0.5), ({"cruise.acceleration": 1.5}, 1.5)])
+def test_the_acc_has_another_acceleration_only_where_it_is_given_one(
+    set_to: dict[str, float], found: float, tmp_path: Path, simulation: Simulation
+) -> None:
+    file = network(tmp_path, TRUCK + ONE)
+    changes = {"cav_classes": ["truck"], "horizon": 20, **set_to}
+    episode = drive(simulation, file, make_driver("cruise", 0.1), **changes)
+    assert np.diff(episode.trajectories[0].states.speed).max() == pytest.approx(0.1 * found, rel=0.03)
+
+
+def test_brakes_are_those_of_the_filter_or_of_the_vehicle_if_these_are_weaker(
+    tmp_path: Path, simulation: Simulation
+) -> None:
+    other = '<vType id="car"/><vehicle id="w" type="car" route="along" depart="2"/>'
+    file = network(tmp_path, TRUCK + ONE + other)
+    changes = {"cav_share": 1.0, "cav_classes": ["truck", "passenger"], "horizon": 50}
+    traffic = make_traffic(make_scenario(file, changes), (0,), simulation)
+    assert isinstance(traffic, OwnTraffic)
+    traffic.start(controlled=True)
+    for _ in range(40):
+        traffic.advance(Command(np.zeros(len(traffic.cavs))))
+    limits = {kind: simulation.type_limits(f"cav_of_{kind}") for kind in ("own", "car")}
+    assert (limits["own"].acceleration, limits["own"].braking) == (0.5, 3.0)
+    assert (limits["car"].acceleration, limits["car"].braking) == (2.6, 6.0)
