@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from unjam.cli.options import DEFAULT_WORKERS, HumansOption, JsonOption, WorkersOption, scenario_changes
-from unjam.cli.output import aside, console, counting_steps, new_table, print_json, print_metrics
+from unjam.cli.output import aside, console, counting_steps, new_table, print_json, print_metrics, print_notes
 from unjam.errors import InputError, go_on_with, wrong
 from unjam.processes import go_on_limited, owned
 
@@ -69,7 +69,9 @@ def evaluate(
         print_json({"run": str(run), "scenario": config.scenario, "gain": gain, "drivers": drivers})
         return
     print_metrics(found.rows)
-    console.print(lead_of(read_results(target)), soft_wrap=True)
+    judged = read_results(target)
+    console.print(lead_of(judged), soft_wrap=True)
+    print_notes(judged.about["notes"])
     aside.print(f"report: {page}")
 
 

@@ -1,6 +1,7 @@
 """The user's own road: any SUMO network with its traffic, some of whose vehicles become CAVs."""
 
 import logging
+from collections.abc import Sequence
 from dataclasses import field, replace
 from functools import cache
 from pathlib import Path
@@ -114,6 +115,26 @@ class OwnNetwork(Scenario):
             roadside=self.roadside,
         )
 
+    def check_vehicles(self, entered: bool | None = None, warnings: Sequence[str] = ()) -> None:
+        """Raise `InputError` where no vehicle enters: by when the first departs, or as an episode has shown.
+
+        Args:
+            entered: whether a vehicle was on the road in a whole episode; None: none was driven yet.
+            warnings: what SUMO warned of in it.
+        """
+        files = read_sumo_files(Path(self.file))
+        begin = files.begin if self.begin is None else self.begin
+        end = begin + self.warmup * self.simulation_step + self.horizon * self.decision_step
+        first, none = files.first_departure, f"no vehicle entered before {_seconds(end)}"
+        # A loaded state brings vehicles of its own.
+        if entered or (entered is None and (first < end or "load-state" in files.options)):
+            return
+        if begin <= first < end:
+            raise InputError("; ".join([f"{none}, though the first departs at {_seconds(first)}", *warnings]))
+        late = files.end is not None and self.end is None and files.end <= first
+        more = f" --end {first + end - begin:g}" if late else ""
+        raise InputError(f"{none}; the first departs at {_seconds(first)}; use --begin {first:g}{more}")
+
     @property
     def people_in_words(self) -> str:
         """How people drive."""
@@ -153,14 +174,25 @@ def own_network(file: str, changes: dict[str, Any]) -> OwnNetwork:
         _tell_dropped(files.path.name, files.dropped)
     values = {"file": str(files.path), "simulation_step": files.step, **changes}
     made = build(OwnNetwork, values, Path(file).name)
-    if "horizon" in changes:
-        return made
+    if "horizon" not in changes:
+        made = replace(made, horizon=_decisions_until_end(files, made))
+    made.check_vehicles()
+    return made
+
+
+def _decisions_until_end(files: SumoFiles, made: OwnNetwork) -> int:
+    """Return how many decisions there are before the end of a configuration, or after an hour."""
     begin = files.begin if made.begin is None else made.begin
     end = made.end or (begin + LONGEST if files.end is None else files.end)
     driven = end - begin - made.warmup * made.simulation_step
     if driven <= 0:
         raise wrong("end", end, f"after begin, {begin:g} s" + (" and the warm-up" if made.warmup else ""))
-    return replace(made, horizon=max(1, int(driven / made.decision_step + 1e-9)))
+    return max(1, int(driven / made.decision_step + 1e-9))
+
+
+def _seconds(time: float) -> str:
+    """Return a time as messages state it."""
+    return f"{time:,.10g} s"
 
 
 @cache

@@ -26,6 +26,7 @@ PASSED = {
     *("begin", "end", "junction-taz", "weight-attribute", "step-method.ballistic", "extrapolate-departpos"),
     *("lateral-resolution", "route-steps", "no-internal-links", "ignore-junction-blocker"),
     *("ignore-route-errors", "ignore-accidents", "intermodal-collision.action", "collision.stoptime"),
+    *("collision.action", "collision.mingap-factor", "collision.check-junctions"),
     *("intermodal-collision.stoptime", "collision.check-junctions.mingap", "keep-after-arrival"),
     *("max-num-vehicles", "max-num-persons", "max-num-teleports", "scale", "scale-suffix"),
     *("sloppy-insert", "eager-insert", "emergency-insert", "insertion-checks"),
@@ -43,8 +44,8 @@ PASSED_GROUPS = (
 )
 """what the names of others of them begin with"""
 OTHERWISE = {
-    *("seed", "step-length", "collision.action", "collision.mingap-factor", "collision.check-junctions"),
-    *("no-step-log", "no-warnings", "duration-log.disable", "duration-log.statistics", "verbose", "start"),
+    *("seed", "step-length", "no-step-log", "no-warnings", "aggregate-warnings", "verbose", "start"),
+    *("duration-log.disable", "duration-log.statistics"),
     *("xml-validation", "xml-validation.net", "xml-validation.routes", "gui-settings-file", "quit-on-end"),
     *("delay", "precision", "step-log.period", "print-options", "human-readable-time", "registry-viewport"),
 }
@@ -66,6 +67,8 @@ class SumoFiles(NamedTuple):
     """[s]; None: when the last vehicle has arrived"""
     step: float
     """[s]"""
+    first_departure: float
+    """the first time at which a vehicle departs or a flow begins [s]; 0 where only SUMO knows it"""
     options: dict[str, str]
     """what else SUMO may be told of it, by name: harmless ways of simulating"""
     dropped: tuple[str, ...]

@@ -9,7 +9,7 @@ import sys
 import zlib
 from collections.abc import Callable, Iterator
 from contextlib import suppress
-from math import isfinite, nan
+from math import isfinite, isnan, nan
 from pathlib import Path
 from typing import IO, Any, NamedTuple
 from xml.etree import ElementTree
@@ -46,10 +46,8 @@ PLAIN_ENCODINGS = (None, "utf-8", "us-ascii", "ascii", "iso-8859-1")
 """in which SUMO's parser cannot see another element than the one here"""
 YES = ("true", "t", "yes", "on", "1", "x")
 """what SUMO takes for yes"""
-UNREADABLE = (
-    *(ElementTree.ParseError, expat.ExpatError, OSError, EOFError, zlib.error, LookupError, ValueError),
-)
-"""what reading can raise where a file is broken"""
+UNREADABLE = (SyntaxError, expat.ExpatError, OSError, EOFError, zlib.error, LookupError, ValueError)
+"""what reading can raise where a file is broken; ElementTree's errors are syntax errors"""
 
 Lane = tuple[str, float, list[tuple[float, float]]]
 """edge, length [m] and centre line [(x, y), m]"""
@@ -88,16 +86,15 @@ def _configuration(path: Path) -> dict[str, Any]:
     stamps = {str(file): _stamp(file) for file in files}
     filters = {file: _filtered(file) for file in (network, *additional, *routes)}
     _check_network(network, filters[network])
-    demand = _Demand({}, {}, set())
+    demand = _Demand({}, {}, {})
     for file in [*additional, *routes]:
         _read_demand(file, demand)
     if not demand.wanted:
         raise Broken(f"{path.name}: its route and additional files have no vehicle, trip or flow")
     used = set().union(*(demand.mixtures.get(name, {name}) for name in demand.wanted))
     demand.types.setdefault(DEFAULT_TYPE, {})
-    for name, kind in OTHER_DEFAULT_TYPES.items():
-        if name in used:
-            demand.types.setdefault(name, {"vClass": kind})
+    for name in used & OTHER_DEFAULT_TYPES.keys():
+        demand.types.setdefault(name, {"vClass": OTHER_DEFAULT_TYPES[name]})
     begin = _seconds(path, options, "begin", 0.0) or 0.0
     end = _seconds(path, options, "end", None)
     if end is not None and end <= begin:
@@ -112,6 +109,7 @@ def _configuration(path: Path) -> dict[str, Any]:
         "begin": begin,
         "end": end,
         "step": _seconds(path, options, "step-length", 1.0) or 1.0,
+        "first_departure": min(demand.wanted.values()),
         "types": demand.types,
         "used_types": sorted(used),
         "stamps": stamps,
@@ -145,16 +143,21 @@ def _seconds(path: Path, options: dict[str, str], name: str, otherwise: float | 
     text = options.get(name)
     if text is None or (name == "end" and text.strip() in ("-1", "-1.00")):
         return otherwise
+    value, positive = _time(text), name == "step-length"
+    if not isfinite(value) or value < 0 or (positive and not value):
+        allowed = "seconds > 0" if positive else "seconds, hours:minutes:seconds"
+        raise Broken(f"{path.name}: {name}: {text!r} is not allowed; allowed: {allowed}")
+    return value
+
+
+def _time(text: str) -> float:
+    """Return a time [s], of seconds or as 1:30:00; NaN where it is neither."""
     parts = text.split(":")
     try:
         value = sum(float(part) * unit for part, unit in zip(reversed(parts), UNITS, strict=False))
     except ValueError:
-        value = nan
-    positive = name == "step-length"
-    if not isfinite(value) or value < 0 or len(parts) not in (1, 3, 4) or (positive and not value):
-        allowed = "seconds > 0" if positive else "seconds, hours:minutes:seconds"
-        raise Broken(f"{path.name}: {name}: {text!r} is not allowed; allowed: {allowed}")
-    return value
+        return nan
+    return value if len(parts) in (1, 3, 4) else nan
 
 
 def _check_network(path: Path, found: "_Filter") -> None:
@@ -184,7 +187,7 @@ class _Filter:
         self.parser.XmlDeclHandler = self._declared
         self.parser.StartElementHandler = self._started
         self.parser.EndElementHandler = self._ended
-        self.parser.CharacterDataHandler = self._text
+        self.parser.CharacterDataHandler = lambda text: self._within or self._write(escape(text))
 
     def _declared(self, version: str, encoding: str | None, standalone: int) -> None:
         self.to_copy |= (encoding and encoding.lower()) not in PLAIN_ENCODINGS
@@ -205,10 +208,6 @@ class _Filter:
             self._within -= 1
         else:
             self._write(f"</{tag}>")
-
-    def _text(self, text: str) -> None:
-        if not self._within:
-            self._write(escape(text))
 
     def _harmless(self, tag: str, attributes: dict[str, str]) -> dict[str, str] | None:
         """Return which attributes of an element are harmless; None where the element is not."""
@@ -259,8 +258,8 @@ class _Demand(NamedTuple):
     types: dict[str, dict[str, str]]
     mixtures: dict[str, set[str]]
     """types of each distribution; it may be used in another file than the one that defines it"""
-    wanted: set[str]
-    """types and distributions that vehicles have"""
+    wanted: dict[str, float]
+    """types and distributions that vehicles have, with the first time at which one departs [s]"""
 
 
 def _read_demand(path: Path, demand: _Demand) -> None:
@@ -273,7 +272,9 @@ def _read_demand(path: Path, demand: _Demand) -> None:
             inside = [child.get("id", "") for child in element if child.tag == "vType"]
             demand.mixtures[name] = {*inside, *element.get("vTypes", "").split()}
         elif element.tag in DEMAND:
-            demand.wanted.add(element.get("type", DEFAULT_TYPE))
+            kind, time = element.get("type", DEFAULT_TYPE), element.get("depart", element.get("begin", "0"))
+            first = 0.0 if isnan(found := _time(time)) else found  # with a person: only SUMO knows when
+            demand.wanted[kind] = min(first, demand.wanted.get(kind, first))
 
 
 def _elements(path: Path) -> Iterator[ElementTree.Element]:

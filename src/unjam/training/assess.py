@@ -15,6 +15,7 @@ from unjam.errors import InputError, NoCavError, wrong
 from unjam.files import to_json, write_whole
 from unjam.manifest import manifest
 from unjam.measures.effect import Judged, headline, recommended, shown_beside
+from unjam.measures.notes import check_baseline, notes_of_rows
 from unjam.measures.statistics import estimate_of
 from unjam.reports.assessment import ASSESSMENT_FILE, ASSESSMENT_PAGE, write_assessment
 from unjam.scenarios import NAMED_BEFORE, make_scenario, scenario_recipe
@@ -32,7 +33,7 @@ from unjam.training.choice import (
     judge,
     least_episodes,
 )
-from unjam.training.evaluate import Evaluation, evaluate_each, notes_on_teleports, save_evaluation
+from unjam.training.evaluate import Evaluation, evaluate_each, save_evaluation
 from unjam.training.folder import make_new_folder
 from unjam.training.seeds import choosing_seeds, held_out_seeds
 from unjam.worlds.episode import can_drive
@@ -40,6 +41,8 @@ from unjam.worlds.workers import Workers
 
 DRIVERS_OF_OPEN_ROADS = (BEST, "cruise", "follower-stopper", "pi")
 """who is tried where nobody is named: drivers that fit roads with ends"""
+ENOUGH_BASELINE = 20
+"""episodes of the baseline for which early ends are counted before the last one: two of them are too many"""
 FOR_PICTURES = 2
 """episodes of the budget that are kept for pictures"""
 NOBODY = 1e-12
@@ -153,7 +156,7 @@ def assess(
         InputError: the folder holds something, or no driver can drive this road.
     """
     make_new_folder(folder)
-    budget = Budget(asked.episodes - FOR_PICTURES, asked.minutes)
+    budget, baseline = Budget(asked.episodes - FOR_PICTURES, asked.minutes), Rows()
 
     def driven(options: Sequence[Option], seeds: Sequence[Seed], pictured: bool = False) -> Evaluation:
         setups = {option.label: asked.setup(option) for option in options}
@@ -170,6 +173,8 @@ def assess(
     def drive(options: Sequence[Option], seeds: Sequence[Seed]) -> dict[Option, Rows]:
         rows = driven(options, seeds).rows
         people = rows.get(PEOPLE.label, [])
+        baseline.extend(people)
+        check_baseline(baseline, ENOUGH_BASELINE)
         # Of a small share no vehicle is a CAV on some seeds: then it is people alone who drive.
         return {
             option: [
@@ -183,6 +188,7 @@ def assess(
     rows, judged, chose = {PEOPLE: choice.rows[PEOPLE]}, list[Judged](), budget.spent
     if choice.finalists:
         rows, judged = judge(choice.finalists, drive, budget, asked.precision, on_line)
+    check_baseline(baseline)
     beside = shown_beside(judged)
     on_line("pictures of people alone" + ("" if beside is None else " and with CAVs, same seed"))
     pictured = [PEOPLE] if beside is None else [PEOPLE, Option(beside.share, beside.driver)]
@@ -191,9 +197,8 @@ def assess(
 
     about = {"scenario": Path(asked.file).name, "reward": asked.road.reward, "manifest": manifest()}
     tried = {option.label: found for option, found in choice.rows.items()}
-    notes = notes_on_teleports(
-        {each.label: found for each, found in (rows if judged else choice.rows).items()}
-    )
+    fresh = rows if judged else {}
+    notes = notes_of_rows({each.label: [*found, *fresh.get(each, ())] for each, found in choice.rows.items()})
     document = {**about, **_document(asked, choice, rows, judged, chose, budget), "notes": notes}
     save_evaluation(folder / CHOOSING, Evaluation(tried, {}), about)
     save_evaluation(folder, Evaluation({each.label: found for each, found in rows.items()}, shown), about)

@@ -11,6 +11,7 @@ from unjam.drivers.driver import Driver
 from unjam.drivers.from_file import DriverLike, as_driver
 from unjam.drivers.observation import feature
 from unjam.errors import InputError, NoCavError, wrong
+from unjam.scenarios.own_network import OwnNetwork
 from unjam.scenarios.scenario import Scenario
 from unjam.worlds.drive import drive
 from unjam.worlds.earned import earned
@@ -76,6 +77,9 @@ def run_episode(
             return run_episode(scenario, driver, seed, reward, explore, full, simulation, progress)
     traffic = make_traffic(scenario, seed, simulation, driver.plain_numbers, full, driver.asks)
     episode = drive(traffic, driver, explore, on_progress=progress)
+    episode = replace(episode, warnings=simulation.finish())
+    if isinstance(scenario, OwnNetwork):
+        scenario.check_vehicles(bool(episode.vehicle_ids), [each.example for each in episode.warnings])
     check_cavs_drove(episode, driver)
     return rewarded(episode, paid)
 

@@ -15,6 +15,11 @@ CAV_TYPES = "cav_of_{}"
 """the type of a CAV whose own type is `{}`"""
 CALIBRATED_TYPES = "{}_of_driver_{}"
 """the type of a car whose own type is `{}`, driven by a calibrated person of that number"""
+REAL_CONTACT = (
+    *("--collision.action", "warn", "--collision.mingap-factor", "0"),
+    *("--collision.check-junctions", "true"),
+)
+"""on built-in roads a collision is real contact, and each is reported; users' networks have own settings"""
 KEPT = (
     *("vClass", "length", "width", "height", "maxSpeed", "speedFactor", "guiShape", "emissionClass"),
     *("laneChangeModel", "mass"),
@@ -45,7 +50,7 @@ def files_of(scenario: Scenario, road: Road) -> Files:
     # Vehicles neither vanish from a jam nor give up waiting to enter.
     patience = ("--time-to-teleport", "-1", "--max-depart-delay", "-1")
     network = {"--net-file": (network_file(road.network),)}
-    return Files(patience, network, _traffic_xml(scenario, road), "--route-files")
+    return Files((*patience, *REAL_CONTACT), network, _traffic_xml(scenario, road), "--route-files")
 
 
 def _own_files(scenario: Scenario, road: OwnRoad) -> Files:

@@ -1,15 +1,36 @@
-"""How SUMO is reached: the only module that imports libsumo or traci."""
+"""How SUMO is reached: the only module that imports libsumo or traci; and records of what it answers."""
 
 import importlib
 from collections.abc import Callable
 from contextlib import suppress
 from types import ModuleType
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 from unjam.errors import MissingPartError
 
 Backend = Literal["libsumo", "traci", "gui"]
 """`libsumo`: in this process; `traci`: SUMO as a child process; `gui`: the same, with its window."""
+
+
+class Neighbours(NamedTuple):
+    """Who is ahead of a vehicle and behind it [m/s, m from bumper to bumper]; no name: nobody is ahead."""
+
+    leader: str
+    leader_speed: float
+    leader_gap: float
+    follower_speed: float
+    follower_gap: float
+
+
+class NetworkLane(NamedTuple):
+    """A lane of a network that is no junction's: its edge, its length [m], what it allows [m/s]."""
+
+    name: str
+    edge: str
+    length: float
+    speed: float
+    leads_to: tuple[str, ...]
+    """lanes of the next edges"""
 
 
 def close(sumo: Any) -> None:

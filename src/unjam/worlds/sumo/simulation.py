@@ -10,7 +10,7 @@ from functools import partial
 from itertools import count, starmap
 from pathlib import Path
 from tempfile import gettempdir
-from typing import Any, NamedTuple, Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,9 +20,11 @@ from unjam.processes import PrivateFolder, printed_to
 from unjam.sandbox import keep_disk
 from unjam.scenarios.scenario import Actuation
 from unjam.sumo_files import copy_harmless, stamp_of
+from unjam.worlds.record import SumoWarning
 from unjam.worlds.sumo.files import Files
-from unjam.worlds.sumo.library import Backend, close, function_of, library
+from unjam.worlds.sumo.library import Backend, Neighbours, NetworkLane, close, function_of, library
 from unjam.worlds.sumo.networks import said_in, sumo_program
+from unjam.worlds.sumo.warnings_log import LIMIT_OF_EXAMPLES, read_warnings
 
 SPEED_MODES = {"shielded": 31, "raw": 30, "flow": 25, "cruise": 31}
 """SUMO's speed mode bits for each way of actuation: bit 0 is the check for a safe speed."""
@@ -30,33 +32,14 @@ WITHOUT_RIGHT_OF_WAY = 1
 """the bit that stays where vehicles need not obey the right of way: who is surprised stops as it must"""
 LIMITS_OF_ACCELERATION = 2 | 4
 """the bits by which vehicles keep to the acceleration and the braking of their type"""
+CONTACT = 0.01
+"""overlap that is no rounding error [m]"""
 _exhaust = deque(maxlen=0).extend
 """runs through an iterator, in C: a loop would cost as much as the calls"""
 _open: "Simulation | None" = None
 """the one simulation that libsumo runs in this process"""
 _labels = count()
 """of connections over TraCI, of which a process may have many"""
-
-
-class Neighbours(NamedTuple):
-    """Who is ahead of a vehicle and behind it [m/s, m from bumper to bumper]; no name: nobody is ahead."""
-
-    leader: str
-    leader_speed: float
-    leader_gap: float
-    follower_speed: float
-    follower_gap: float
-
-
-class NetworkLane(NamedTuple):
-    """A lane of a network that is no junction's: its edge, its length [m], what it allows [m/s]."""
-
-    name: str
-    edge: str
-    length: float
-    speed: float
-    leads_to: tuple[str, ...]
-    """lanes of the next edges"""
 
 
 class Simulation:
@@ -197,11 +180,10 @@ class Simulation:
     def _options(self, step: float, seed: int) -> list[str]:
         return [
             *("--step-length", str(step), "--seed", str(seed)),
-            *("--no-step-log", "true", "--no-warnings", "true", "--duration-log.disable", "true"),
-            *("--error-log", str(self._error_log)),
-            # The only setting in which a collision is real contact and every one is reported.
-            *("--collision.action", "warn", "--collision.mingap-factor", "0"),
-            *("--collision.check-junctions", "true"),
+            *("--no-step-log", "true", "--duration-log.disable", "true"),
+            # Warnings go to the log alone, which keeps one example and the number of each kind.
+            *("--no-warnings", "true", "--error-log", str(self._error_log)),
+            *("--aggregate-warnings", LIMIT_OF_EXAMPLES),
         ]
 
     def speeds(self, ids: Sequence[str]) -> list[float]:
@@ -269,6 +251,18 @@ class Simulation:
             found += [self._get_speed(other) if there else speed, min(max(true_gap, 0.0), farthest)]
         return Neighbours(leader if found[1] < farthest else "", *found)
 
+    def is_in_contact(self, name: str, leader: str) -> bool:
+        """Return whether a vehicle overlaps with the one ahead of it on its lane, along it and across."""
+        vehicle = self._sumo.vehicle
+        gap = self._get_along(leader) - vehicle.getLength(leader) - self._get_along(name)
+        apart = vehicle.getLateralLanePosition(name) - vehicle.getLateralLanePosition(leader)
+        across = 2.0 * abs(apart) < vehicle.getWidth(name) + vehicle.getWidth(leader)
+        return self._get_lane(name) == self._get_lane(leader) and gap < -CONTACT and across
+
+    def teleport_count(self) -> int:
+        """Return how many teleports SUMO has counted since it started."""
+        return int(self._sumo.simulation.getParameter("", "stats.teleports.total"))
+
     def distances(self, ids: Sequence[str]) -> list[float]:
         """Return how far each of `ids` has driven since it entered [m]."""
         return list(map(self._get_distance, ids))
@@ -312,6 +306,11 @@ class Simulation:
         self._folder.cleanup()
         if _open is self:
             _open = None
+
+    def finish(self) -> tuple[SumoWarning, ...]:
+        """End the episode and return what SUMO warned of: its log is complete only once SUMO has ended."""
+        self._end()
+        return read_warnings(self._error_log)
 
     def _end(self) -> None:
         """End SUMO; one that is gone already is no error."""
