@@ -36,7 +36,7 @@ def notes_of_rows(rows_by_driver: Rows) -> list[str]:
 
 def early_ends(rows: Sequence[dict[str, Any]]) -> dict[str, int]:
     """Return how many episodes ended early, by reason."""
-    return dict(Counter(row["reason"] or row["status"] for row in rows if ended_early(row)))
+    return dict(Counter(row.get("reason") or row["status"] for row in rows if ended_early(row)))
 
 
 def early_end_notes(rows_by_driver: Rows) -> list[str]:

@@ -91,7 +91,7 @@ def digits_of(found: Estimate, digits: int) -> int:
 
 def ended_early(row: dict[str, Any]) -> bool:
     """Return whether an episode ran, but ended early, from its row of `measure`."""
-    return row["status"] not in ("completed", "failed")
+    return row.get("status", "completed") not in ("completed", "failed")
 
 
 def value_of(row: dict[str, Any], name: str) -> float:
