@@ -66,7 +66,8 @@ def evaluate(
         beyond, means = gain_of(config, found.rows), found.means()
         gain = asdict(beyond) if beyond else None
         drivers = [{"driver": one, "episodes": rows, "mean": means[one]} for one, rows in found.rows.items()]
-        print_json({"run": str(run), "scenario": config.scenario, "gain": gain, "drivers": drivers})
+        about = {"run": str(run), "scenario": config.scenario, "gain": gain}
+        print_json({**about, "drivers": drivers, "notes": read_results(target).about["notes"]})
         return
     print_metrics(found.rows)
     judged = read_results(target)
