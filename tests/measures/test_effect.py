@@ -99,7 +99,8 @@ def test_an_effect_knows_contacts_failures_and_the_verdict_on_the_cavs_alone() -
     rows[0] |= {"status": "collision", "collisions": 2.0}
     rows[2] |= {"status": "failed", "collisions": nan}
     found = effect_of(rows, rows_of([100.0] * 3))
-    assert (found.collisions, found.failed, found.travel_time.count) == (2.0, 1, 2)
+    assert (found.collisions, found.failed, found.ended_early) == (2.0, 1, 1)
+    assert (found.travel_time.count, found.travel_time.mean) == (1, -2.0), "of the complete episode"
     assert found.drivable == "2 vehicles in contact (1 of 3)"
     assert found.hard_braking.mean == 470.0
     assert effect_of(rows_of([99.0], people_beyond_4_5=500.0), rows_of([100.0])).drivable == "drivable"

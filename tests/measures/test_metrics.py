@@ -346,6 +346,8 @@ def test_a_row_has_the_episode_what_was_drawn_and_every_metric() -> None:
         "status",
         "reason",
         "error",
+        "warnings",
+        "vehicles",
         "steps",
         "length",
         "floor",

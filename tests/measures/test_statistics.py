@@ -343,3 +343,17 @@ def test_trimming_leaves_as_many_as_an_interval_needs() -> None:
     found = estimate([100.0, 107.0, 113.0, 120.0], trim=0.25)
     assert found == estimate([100.0, 107.0, 113.0, 120.0])
     assert estimate([100.0, 107.0, 113.0, 120.0, 200.0], trim=0.25).mean == pytest.approx(340.0 / 3)
+
+
+@pytest.mark.parametrize("status", ["collision", "teleports"])
+def test_episodes_that_ended_early_are_not_averaged_with_complete_ones(status: str) -> None:
+    complete = {**dict.fromkeys(METRICS, 10.0), "status": "completed"}
+    early = {**dict.fromkeys(METRICS, 2.0), "status": status, "seed": 2}
+    rows, others = [{**complete, "seed": 1}, early], [{**complete, "seed": seed} for seed in (1, 2)]
+    counts = {name: estimate_of(rows, name).count for name in METRICS}
+    assert counts["mean_speed"] == counts["travel_time"] == counts["fuel_ml_per_km"] == 1
+    assert estimate_of(rows, "mean_speed").mean == 10.0
+    assert counts["collisions"] == counts["cav_min_ttc"] == counts["people_max_braking"] == 2
+    assert counts["return"] == counts["return_eq16"] == (2 if status == "collision" else 1)
+    assert paired_difference(rows, others, "travel_time").count == 1
+    assert paired_by_training([rows], others, "mean_speed").shape == (1, 1)

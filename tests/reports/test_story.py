@@ -133,9 +133,16 @@ def test_a_plain_result_has_no_notes() -> None:
     assert notes_of(trained_on_pi([1.0, 2.0], [1.0, 2.0])) == []
 
 
-def test_collisions_are_noted() -> None:
+def test_early_ends_are_noted_once_of_every_driver() -> None:
     rows = [*rows_of([1.0] * 3), *rows_of([1.0], status="collision"), *failed_rows(1)]
-    assert notes_of(driven(pi=rows)) == ["pi ended in a collision in 1 of 4 episodes."]
+    note = "pi: 1 of 5 episodes ended early: collision; means are over complete episodes only"
+    assert notes_of(driven(pi=rows)) == [f"{note}."]
+    told = driven(pi=rows)
+    told.about["notes"] = [note]
+    assert notes_of(told) == [f"{note}."]
+    result = trained_on_pi([1.0], [1.0])
+    result.rows["pi"][0]["status"] = "collision"
+    assert [note[:26] for note in notes_of(result)] == ["pi: 1 of 1 episodes ended "]
 
 
 def test_close_driving_is_noted_with_the_reward_that_does_not_mind() -> None:
@@ -169,12 +176,12 @@ def test_traffic_beyond_the_limit_is_explained() -> None:
 
 def test_a_comparison_of_drivers_warns_about_each() -> None:
     found = driven(human=rows_of([1.0]), pi=rows_of([1.0], min_headway=0.3, status="collision"))
-    assert [note.split()[0] for note in notes_of(found)] == ["pi", "pi"]
+    assert [note.split()[0] for note in notes_of(found)] == ["pi:", "pi"]
 
 
 def test_notes_are_about_the_trained_controller_and_not_its_expert() -> None:
     result = trained_on_pi([1.0], [1.0])
-    result.rows["pi"][0]["status"] = "collision"
+    result.rows["pi"][0]["min_headway"] = 0.3
     assert notes_of(result) == []
 
 

@@ -289,7 +289,7 @@ def test_trains_ships_and_aircraft_never_become_cavs(attributes: str, tmp_path: 
 def test_demand_that_begins_after_the_end_is_refused(changes: dict[str, Any], tmp_path: Path) -> None:
     routes = '<routes><flow id="f" begin="7:00:00"/></routes>'
     path = configuration(tmp_path, '<end value="300"/>', routes=routes)
-    words = "no vehicle departs before the end, .* s; the first departs at 25,200 s; use --begin 25200 --end"
+    words = "no vehicle entered before .* s; the first departs at 25,200 s; use --begin 25200"
     with pytest.raises(InputError, match=words):
         make_scenario(str(path), {"cav_share": 0.5, **changes})
     assert make_scenario(str(path), {"cav_share": 0.5, "begin": 25200.0, "end": 25300.0}).horizon == 100

@@ -22,7 +22,15 @@ from unjam.cli.options import (
     together,
     with_options,
 )
-from unjam.cli.output import after_drive, aside, console, counting_steps, print_json, print_metrics
+from unjam.cli.output import (
+    after_drive,
+    aside,
+    console,
+    counting_steps,
+    print_json,
+    print_metrics,
+    print_notes,
+)
 from unjam.errors import InputError, MissingPartError
 from unjam.processes import has_display
 
@@ -106,8 +114,7 @@ def drive(
             seeds = f"{count} paired seed{'' if count == 1 else 's'}"
             words = f"{label} beside people alone, {seeds}: {effect.words}"
             console.print(words, soft_wrap=True)
-        for note in result.notes:
-            aside.print(f"note: {note}", markup=False, soft_wrap=True)
+        print_notes(result.notes)
         if result.report is not None:
             aside.print(f"report: {result.report}")
         after_drive(scenario, driver, changes, reward)
@@ -143,6 +150,7 @@ def watch(
     from unjam.controller.domain import notes_on_controllers
     from unjam.files import check_folder
     from unjam.measures.metrics import measure
+    from unjam.measures.notes import notes_of_rows
     from unjam.reports.film import check_format, write_video
     from unjam.scenarios import make_scenario, scenario_recipe
     from unjam.training.evaluate import raise_failure
@@ -153,8 +161,7 @@ def watch(
     (driver,) = drivers
     road = make_scenario(scenario, together(changes, assignments(settings)))
     driven = make_driver(driver, road.decision_step)
-    for note in notes_on_controllers(scenario_recipe(road), [driver], {}):
-        aside.print(f"note: {note}", markup=False, soft_wrap=True)
+    print_notes(notes_on_controllers(scenario_recipe(road), [driver], {}))
     if video is None:
         episode = watch_in_window(road, driven, (seed,), pace)
     else:
@@ -164,6 +171,7 @@ def watch(
         with Workers(1) as workers:
             episode = workers.run([EpisodeTask(road, driven, (seed,), full=True)])[0]
     row = measure(episode)
+    print_notes(notes_of_rows({driver: [row]}))
     if episode.ok and video is not None:
         aside.print("drawing")
         write_video(episode, video, driver, pace)

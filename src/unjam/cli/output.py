@@ -102,6 +102,12 @@ def print_metrics(rows_by_driver: dict[str, list[dict[str, Any]]]) -> None:
         console.print(of(block, separator), markup=True)
 
 
+def print_notes(notes: Sequence[str]) -> None:
+    """Print what a reader of the metrics should know, a line for each note."""
+    for note in notes:
+        aside.print(f"note: {note}", markup=False, soft_wrap=True)
+
+
 def _marked(cell: "Cell", separator: str) -> str:
     """Return a cell in rich's markup: its interval dim, verdicts in lines."""
     interval = escape(cell.interval).join(("[dim]", "[/dim]")) if cell.interval else ""

@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from unjam.cli.options import DEFAULT_WORKERS, HumansOption, JsonOption, WorkersOption, scenario_changes
-from unjam.cli.output import aside, console, counting_steps, new_table, print_json, print_metrics
+from unjam.cli.output import aside, console, counting_steps, new_table, print_json, print_metrics, print_notes
 from unjam.errors import InputError, go_on_with, wrong
 from unjam.processes import check_not_owned, go_on_limited, owned
 
@@ -67,10 +67,13 @@ def evaluate(
         beyond, means = gain_of(config, found.rows), found.means()
         gain = asdict(beyond) if beyond else None
         drivers = [{"driver": one, "episodes": rows, "mean": means[one]} for one, rows in found.rows.items()]
-        print_json({"run": str(run), "scenario": config.scenario, "gain": gain, "drivers": drivers})
+        about = {"run": str(run), "scenario": config.scenario, "gain": gain}
+        print_json({**about, "drivers": drivers, "notes": read_results(target).about["notes"]})
         return
     print_metrics(found.rows)
-    console.print(lead_of(read_results(target)), soft_wrap=True)
+    judged = read_results(target)
+    console.print(lead_of(judged), soft_wrap=True)
+    print_notes(judged.about["notes"])
     aside.print(f"report: {page}")
 
 

@@ -29,6 +29,7 @@ from unjam.cli.output import (
     console,
     print_json,
     print_metrics,
+    print_notes,
     resumable,
     say_next,
 )
@@ -100,6 +101,7 @@ def train(
         config = load_config(asked.file, asked.preset, changes)
         folder = new_folder(out, config.scenario)
     check_possible(config)
+    from unjam.measures.notes import notes_of_rows
     from unjam.reports.results import (  # and torch: seconds that nobody waits for a wrong word
         read_progress,
         read_results,
@@ -127,7 +129,8 @@ def train(
     def facts(of: Any) -> dict[str, Any]:
         files = {"folder": str(of.folder), "controller": str(of.controller), "report": str(result.report)}
         gain = asdict(of.gain) if of.gain else None
-        return {**files, "gain": gain, "drivers": Evaluation(of.rows, {}).means()}
+        means = Evaluation(of.rows, {}).means()
+        return {**files, "gain": gain, "drivers": means, "notes": notes_of_rows(of.rows)}
 
     if json:
         roads = {name: facts(road) for name, road in result.roads.items()}
@@ -139,6 +142,7 @@ def train(
         print_metrics(of.rows)
         judged = read_results(of.folder)
         console.print(lead_of(judged), soft_wrap=True)
+        print_notes(judged.about["notes"])
         aside.print(f"controller: {of.controller}")
         steps = max(config.steps, judged.progress[-1]["actual_steps"])
         over = ends_early(config, read_progress(result.folder))

@@ -1,6 +1,7 @@
 """The manifest of a `.unjam` file: its schema, and the description of a driver that is compared with it."""
 
 from dataclasses import field
+from math import nan
 from typing import Annotated, Any
 
 import numpy as np
@@ -108,9 +109,9 @@ def first_difference(
     elif type(said) is type(found) and said == found:
         return None
     else:
-        near = {type(said), type(found)} <= {int, float} and not (type(said) is type(found) is int)
-        near = near and abs(found - said) <= tolerance * max(1.0, abs(found))
-        return None if near else (name, said, found)
+        numbers = {type(said), type(found)} <= {int, float} and not (type(said) is type(found) is int)
+        one, other = (float(str(said)), float(str(found))) if numbers else (nan, nan)
+        return None if abs(other - one) <= tolerance * max(1.0, abs(other)) else (name, said, found)
     differences = (first_difference(one, other, tolerance, defaults, key) for key, one, other in pairs)
     return next((each for each in differences if each is not None), None)
 

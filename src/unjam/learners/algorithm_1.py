@@ -241,7 +241,7 @@ def afterwards(episode: Episode, trajectory: Trajectory, gamma: float, horizon: 
     imagined for a while: what would have been earned then nobody knows.
     """
     end = trajectory.during.stop
-    goes_on = episode.status == "completed" and not np.isnan(episode.speeds[-1]).all()
+    goes_on = episode.status != "collision" and not np.isnan(episode.speeds[-1]).all()
     if end >= episode.steps or trajectory.terminated or (goes_on and episode.steps < horizon):
         return None
     earned = np.add.reduceat(episode.reward[end:], np.arange(0, episode.steps - end, trajectory.hold))

@@ -192,13 +192,14 @@ def drivable_in_all(rows: Sequence[dict[str, Any]], people: Sequence[dict[str, A
     `people` are the episodes of the same road in which nobody is automated: what people do there is no
     driver's fault.
     """
-    alone = [row["people_beyond_4_5"] for row in people if row["status"] != "failed"]
+    alone = [row["people_beyond_4_5"] for row in people if row["status"] == "completed"]
     share = sum(alone) / len(alone) if alone else None
     verdicts = [drivable({**row, "people_beyond_4_5": 0.0}) for row in rows]
     wrong = [verdict for verdict in verdicts if verdict not in ("", DRIVABLE)]
     if wrong:
         return f"{wrong[0]} ({len(wrong)} of {len(verdicts)})"
-    judged = [row for row, verdict in zip(rows, verdicts, strict=True) if verdict]
+    pairs = zip(rows, verdicts, strict=True)
+    judged = [row for row, verdict in pairs if verdict and row["status"] == "completed"]
     if not judged:
         return ""
     mean = sum(row["people_beyond_4_5"] for row in judged) / len(judged)

@@ -17,12 +17,14 @@ from unjam.measures.statistics import (
     CONFIDENCE,
     Estimate,
     around_ratio,
+    ended_early,
     estimate,
     estimate_of,
     in_percent,
     paired,
     paired_difference,
     signed,
+    value_of,
 )
 
 FLOW_LOST = 0.01
@@ -61,6 +63,8 @@ class Effect:
     """share of people's delay beyond a free road that is saved; NaN where it is not known, or none"""
     speed: Estimate
     """mean speed of all vehicles [m/s]"""
+    ended_early: int = 0
+    """episodes that ran, but ended early, with or without CAVs: only complete ones are compared"""
 
     @property
     def words(self) -> str:
@@ -107,13 +111,17 @@ def effect_of(
         people_flow=estimate_of(people, FLOW).mean,
         delay_cut=_delay_cut(rows, people, confidence),
         speed=paired_difference(rows, people, "mean_speed", confidence),
+        ended_early=sum(map(ended_early, [*rows, *people])),
     )
 
 
 def _delay_cut(
     rows: Sequence[dict[str, Any]], people: Sequence[dict[str, Any]], confidence: float
 ) -> Estimate:
-    both = [(alone[TIME] - row[TIME], alone["delay"]) for row, alone in paired(rows, people)]
+    both = [
+        (value_of(alone, TIME) - value_of(row, TIME), value_of(alone, "delay"))
+        for row, alone in paired(rows, people)
+    ]
     saved, delays = np.array([each for each in both if np.isfinite(each).all()]).reshape(-1, 2).T
     if not len(delays) or delays.mean() <= 0:
         return Estimate(nan, nan, nan, 0)
@@ -146,6 +154,7 @@ def reasons_against(effect: Effect) -> list[str]:
     checks = (
         (effect.travel_time.count >= LEAST_JUDGED, f"{effect.travel_time.count} test seeds are too few"),
         (not effect.failed, f"{effect.failed} episodes failed"),
+        (not effect.ended_early, f"{effect.ended_early} episodes ended early"),
         *((not worse, words) for worse, words in _harms(effect)),
         (
             effect.travel_time.low > 0 or effect.travel_time.high < 0,

@@ -1,7 +1,7 @@
 """What is measured of an episode. Each metric is defined here, once, with its unit and source."""
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from math import inf, prod
 from typing import Any, Literal
 
@@ -180,7 +180,7 @@ def time_to_dissolve(episode: Episode) -> float:
 
 
 def collisions(episode: Episode) -> float:
-    """Vehicles that touched another; the episode ends there."""
+    """Vehicles that collided, on a user's network by its own settings; with a CAV it ends the episode."""
     return float(episode.collisions)
 
 
@@ -338,14 +338,12 @@ def measure(episode: Episode) -> dict[str, Any]:
     """
     row = {
         "seed": episode.seed[0] if len(episode.seed) == 1 else list(episode.seed),
-        "status": episode.status,
-        "reason": episode.reason,
-        "error": episode.error,
-        "steps": episode.steps,
+        **{name: getattr(episode, name) for name in ("status", "reason", "error", "steps", "teleports")},
+        "warnings": [asdict(each) for each in episode.warnings],
+        "vehicles": len(episode.vehicle_ids),
         **episode.drawn,
         "floor": episode.audit.floor,
         "lanes": episode.audit.lanes,
-        "teleports": episode.teleports,
         **{name: metric.function(episode) if episode.ok else np.nan for name, metric in METRICS.items()},
     }
     return {**row, "drivable": drivable(row)}

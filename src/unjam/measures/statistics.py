@@ -18,6 +18,13 @@ CONFIDENCE = 0.95
 LEAST = 3
 """values without which there is no interval: that of two is thirteen times as wide as they are apart"""
 
+DEFINED_AT_EARLY_END = {
+    *("collisions", "min_ttc", "min_headway", "cav_min_ttc", "max_drac", "max_jerk", "shield_max_braking"),
+    *("cav_max_braking", "cut_in_max_braking", "people_max_braking"),
+}
+"""metrics that also count where an episode ended early: how near a collision was, and how many there were"""
+RETURNS = {"return", "return_eq16"}
+"""metrics whose value at a collision the reward defines"""
 ENOUGH_TRAININGS = 10
 """without which nothing is said of a way to learn, only of these trainings"""
 
@@ -82,9 +89,23 @@ def digits_of(found: Estimate, digits: int) -> int:
     return digits + 2 if found.mean and not round(found.mean, digits) else digits
 
 
+def ended_early(row: dict[str, Any]) -> bool:
+    """Return whether an episode ran, but ended early, from its row of `measure`."""
+    return row.get("status", "completed") not in ("completed", "failed")
+
+
+def value_of(row: dict[str, Any], name: str) -> float:
+    """Return a metric of a row of `measure` for statistics: NaN where an early end makes it meaningless.
+
+    Early ends are not averaged with complete episodes: a metric of the first minutes is not one of an hour.
+    """
+    counts = not ended_early(row) or name in DEFINED_AT_EARLY_END
+    return row[name] if counts or (name in RETURNS and row["status"] == "collision") else nan
+
+
 def estimate_of(rows: Sequence[dict[str, Any]], name: str) -> Estimate:
     """Return the estimate of a metric over the rows of `measure`."""
-    return estimate([row[name] for row in rows], bounds=METRICS[name].bounds)
+    return estimate([value_of(row, name) for row in rows], bounds=METRICS[name].bounds)
 
 
 def summarise(rows: Sequence[dict[str, Any]]) -> dict[str, Estimate]:
@@ -107,7 +128,7 @@ def paired_difference(
     confidence: float = CONFIDENCE,
 ) -> Estimate:
     """Return the estimate of the difference, same seeds paired, of a metric between two sets of rows."""
-    differences = [row[name] - other[name] for row, other in paired(rows, others)]
+    differences = [value_of(row, name) - value_of(other, name) for row, other in paired(rows, others)]
     return estimate(differences, confidence=confidence)
 
 
@@ -171,7 +192,7 @@ def paired_by_training(
     runs: Sequence[Sequence[dict[str, Any]]], others: Sequence[dict[str, Any]], name: str
 ) -> Any:
     """Return the differences of a metric, shape (trainings, seeds), on the seeds that all have driven."""
-    tables = [{str(row["seed"]): row[name] for row in rows} for rows in (others, *runs)]
+    tables = [{str(row["seed"]): value_of(row, name) for row in rows} for rows in (others, *runs)]
     seeds = [seed for seed in tables[0] if all(np.isfinite(table.get(seed, nan)) for table in tables)]
     other, *found = ([table[seed] for seed in seeds] for table in tables)
     return np.array(found, np.float64).reshape(len(runs), len(seeds)) - np.array(other)

@@ -10,6 +10,7 @@ import pandas as pd
 from unjam.measures.drivable import DRIVABLE, verdicts
 from unjam.measures.effect import Effect, beside_people
 from unjam.measures.metrics import METRICS
+from unjam.measures.notes import early_end_notes
 from unjam.measures.statistics import estimate_of, paired, paired_difference, signed, verdict_on
 from unjam.measures.table import PEOPLE, baseline_of, cell_of
 from unjam.reports.results import Results, Shown
@@ -166,16 +167,14 @@ def _lead_of_drives(result: Results) -> str:
 def notes_of(result: Results) -> list[str]:
     """Return what a reader should know before trusting the main finding."""
     labels = [result.trained] if result.trained else list(result.rows)
-    foreign = [f"{note}." for note in result.about.get("notes", [])]
-    return [*foreign, *(note for label in labels for note in _notes_of(result, label))]
+    early = early_end_notes(result.rows)
+    said = [f"{note}." for note in dict.fromkeys([*result.about.get("notes", []), *early])]
+    return [*said, *(note for label in labels for note in _notes_of(result, label))]
 
 
 def _notes_of(result: Results, label: str) -> list[str]:
     rows = [row for row in result.rows[label] if row["status"] != "failed"]
     notes = []
-    crashes = sum(row["status"] == "collision" for row in rows)
-    if crashes:
-        notes.append(f"{label} ended in a collision in {crashes} of {len(rows)} episodes.")
     closest = min((row["min_headway"] for row in rows if np.isfinite(row["min_headway"])), default=np.inf)
     if closest < CLOSE_HEADWAY:
         released = result.about["reward"] == "released"

@@ -47,7 +47,8 @@ class OwnNetwork(Scenario):
 
     Roads with several lanes, signals, and routes that end are fine. A vehicle becomes a CAV at the first
     decision after it entered; SUMO still chooses its lane and obeys signals. Its neighbours are SUMO's.
-    Only a collision with a CAV ends an episode.
+    Collisions are what SUMO counts with the user's settings; one with a CAV ends an episode, as does SUMO's
+    `max-num-teleports`.
     """
 
     title: ClassVar[str] = "own-network"
@@ -136,6 +137,26 @@ class OwnNetwork(Scenario):
             roadside=self.roadside,
         )
 
+    def check_vehicles(self, entered: bool | None = None, warnings: Sequence[str] = ()) -> None:
+        """Raise `InputError` where no vehicle enters: by when the first departs, or as an episode has shown.
+
+        Args:
+            entered: whether a vehicle was on the road in a whole episode; None: none was driven yet.
+            warnings: what SUMO warned of in it.
+        """
+        files = read_sumo_files(Path(self.file))
+        begin = files.begin if self.begin is None else self.begin
+        end = begin + self.warmup * self.simulation_step + self.horizon * self.decision_step
+        first, none = files.first_departure, f"no vehicle entered before {_seconds(end)}"
+        if entered or (entered is None and (first is None or first < end)):
+            return
+        if first is None or begin <= first < end:
+            depart = "" if first is None else f", though the first departs at {_seconds(first)}"
+            raise InputError("; ".join([none + depart, *warnings]))
+        late = files.end is not None and self.end is None and files.end <= first
+        more = f" --end {first + end - begin:g}" if late else ""
+        raise InputError(f"{none}; the first departs at {_seconds(first)}; use --begin {first:g}{more}")
+
     @property
     def people_in_words(self) -> str:
         """How people drive."""
@@ -195,20 +216,25 @@ def own_network(file: str, changes: dict[str, Any]) -> OwnNetwork:
         changes = {**changes, "cruise": {"acceleration": None, "deceleration": None, **cruise}}
     values = {"file": str(files.path), "simulation_step": files.step, **changes}
     made = build(OwnNetwork, values, Path(file).name)
+    if "horizon" not in changes:
+        made = replace(made, horizon=_decisions_until_end(files, made))
+    made.check_vehicles()
+    return made
+
+
+def _decisions_until_end(files: SumoFiles, made: OwnNetwork) -> int:
+    """Return how many decisions there are before the end of a configuration, or after an hour."""
     begin = files.begin if made.begin is None else made.begin
-    warmup = made.warmup * made.simulation_step
     end = made.end or (begin + LONGEST if files.end is None else files.end)
-    if "horizon" in changes:
-        end = begin + warmup + made.horizon * made.decision_step
-    if files.first_departure is not None and (first := files.first_departure) >= end:
-        when = f"the first departs at {first:,g} s; use --begin {first:.0f} --end {first + LONGEST:.0f}"
-        raise InputError(f"{files.path.name}: no vehicle departs before the end, {end:,g} s; {when}")
-    if "horizon" in changes:
-        return made
-    driven = end - begin - warmup
+    driven = end - begin - made.warmup * made.simulation_step
     if driven <= 0:
         raise wrong("end", end, f"after begin, {begin:g} s" + (" and the warm-up" if made.warmup else ""))
-    return replace(made, horizon=max(1, int(driven / made.decision_step + 1e-9)))
+    return max(1, int(driven / made.decision_step + 1e-9))
+
+
+def _seconds(time: float) -> str:
+    """Return a time as messages state it."""
+    return f"{time:,.10g} s"
 
 
 def notes_on_files(files: SumoFiles, most: int = MOST_NOTED) -> list[str]:

@@ -28,6 +28,7 @@ PASSED = {
     *("begin", "end", "junction-taz", "weight-attribute", "step-method.ballistic", "extrapolate-departpos"),
     *("lateral-resolution", "route-steps", "no-internal-links", "ignore-junction-blocker"),
     *("ignore-route-errors", "ignore-accidents", "intermodal-collision.action", "collision.stoptime"),
+    *("collision.action", "collision.mingap-factor", "collision.check-junctions"),
     *("intermodal-collision.stoptime", "collision.check-junctions.mingap", "keep-after-arrival"),
     *("max-num-vehicles", "max-num-persons", "max-num-teleports", "scale", "scale-suffix"),
     *("sloppy-insert", "eager-insert", "emergency-insert", "insertion-checks"),
@@ -47,8 +48,8 @@ PASSED_GROUPS = (
 )
 """what the names of others of them begin with"""
 OTHERWISE = {
-    *("step-length", "collision.action", "collision.mingap-factor", "collision.check-junctions"),
-    *("no-step-log", "no-warnings", "duration-log.disable", "duration-log.statistics", "verbose", "start"),
+    *("step-length", "no-step-log", "no-warnings", "aggregate-warnings", "verbose", "start"),
+    *("duration-log.disable", "duration-log.statistics"),
     *("xml-validation", "xml-validation.net", "xml-validation.routes", "gui-settings-file", "quit-on-end"),
     *("delay", "precision", "step-log.period", "print-options", "human-readable-time", "registry-viewport"),
     *("aggregate-warnings", "language", "log.timestamps", "log.processid", "help", "version", "threads"),

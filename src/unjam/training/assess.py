@@ -16,6 +16,7 @@ from unjam.errors import InputError, NoCavError, wrong
 from unjam.files import to_json, write_whole
 from unjam.manifest import manifest
 from unjam.measures.effect import AccResult, Judged, headline, recommended, shown_beside
+from unjam.measures.notes import check_baseline, notes_of_rows
 from unjam.measures.statistics import estimate_of
 from unjam.reports.assessment import ASSESSMENT_FILE, ASSESSMENT_PAGE, write_assessment
 from unjam.scenarios import NAMED_BEFORE, make_scenario, scenario_recipe
@@ -37,13 +38,7 @@ from unjam.training.choice import (
     judge,
     least_episodes,
 )
-from unjam.training.evaluate import (
-    Evaluation,
-    evaluate_each,
-    notes_on_teleports,
-    raise_failure,
-    save_evaluation,
-)
+from unjam.training.evaluate import Evaluation, evaluate_each, raise_failure, save_evaluation
 from unjam.training.folder import make_new_folder
 from unjam.training.seeds import held_out_seeds
 from unjam.worlds.episode import can_drive
@@ -53,6 +48,8 @@ DRIVERS_OF_OPEN_ROADS = (BEST, "follower-stopper", "pi")
 """controllers that are tried where none is named: they fit roads with ends"""
 PROPERTIES = ("acceleration", "deceleration", "keep_right", "overtake")
 """settings of the CAVs' ACC that replace a property of the vehicle"""
+ENOUGH_BASELINE = 20
+"""episodes of the baseline for which early ends are counted before the last one: two of them are too many"""
 FOR_PICTURES = 2
 """episodes of the budget that are kept for pictures"""
 NOBODY = 1e-12
@@ -186,7 +183,7 @@ def assess(
         InputError: the folder holds something, or no driver can drive this road.
     """
     make_new_folder(folder)
-    budget = Budget(asked.episodes - 1, asked.minutes, workers.count)
+    budget, baseline = Budget(asked.episodes - 1, asked.minutes, workers.count), Rows()
 
     def driven(options: Sequence[Option], seeds: Sequence[Seed], pictured: bool = False) -> Evaluation:
         setups = {option.label: asked.setup(option) for option in options}
@@ -203,6 +200,8 @@ def assess(
     def drive(options: Sequence[Option], seeds: Sequence[Seed]) -> dict[Option, Rows]:
         rows = driven(options, seeds).rows
         humans = rows[HUMAN.label]
+        baseline.extend(humans)
+        check_baseline(baseline, ENOUGH_BASELINE)
         # On a seed with which a small share picks no vehicle, human drivers alone are driven.
         return {
             option: [
@@ -231,7 +230,11 @@ def assess(
     about = {"scenario": Path(asked.file).name, "reward": asked.road.reward, "manifest": manifest()}
     tried = {option.label: found for option, found in choice.rows.items()}
     rows = {option.label: found for option, found in tested.rows.items()}
-    notes = [*asked.road.notes, *notes_on_teleports(rows)]
+    check_baseline(baseline)
+    notes = [
+        *notes_of_rows({label: [*tried.get(label, ()), *found] for label, found in rows.items()}),
+        *asked.road.notes,
+    ]
     document = {**about, **_document(asked, choice, tested, chose, budget), "notes": notes}
     save_evaluation(folder / CHOOSING, Evaluation(tried, {}), about)
     save_evaluation(folder, Evaluation(rows, shown), about)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from unjam.measures.drivable import verdicts
 from unjam.measures.effect import Effect, beside_people
 from unjam.measures.metrics import METRICS
+from unjam.measures.notes import early_ends
 from unjam.measures.statistics import Estimate, paired_difference, summarise
 from unjam.measures.table import Rows, baseline_of, headings_of, table_of
 from unjam.reports.results import shown_of
@@ -29,7 +30,7 @@ def frame_of_rows(rows_by_driver: Rows) -> "pd.DataFrame":
             for label, rows in rows_by_driver.items()
             for row in rows
         ]
-    )
+    ).drop(columns="warnings", errors="ignore")
 
 
 @dataclass(frozen=True)
@@ -125,6 +126,7 @@ class DriveResult:
             "mean": {name: summary[name].mean for name in METRICS},
             "interval": {name: [summary[name].low, summary[name].high] for name in METRICS},
             "beside_people": _effect(effect) if effect else None,
+            "ended_early": early_ends(self.rows[driver]),
             "notes": self.notes,
             "folder": str(self.folder) if self.folder else None,
             "report": str(self.report) if self.report else None,

@@ -22,6 +22,7 @@ from unjam.errors import InputError, error_named, wrong
 from unjam.files import make_folder, to_json, write_whole
 from unjam.manifest import manifest
 from unjam.measures.metrics import measure
+from unjam.measures.notes import notes_of_rows
 from unjam.measures.statistics import Estimate, paired_difference, summarise
 from unjam.reports.results import ABOUT_SHOWN, EVALUATION_FILE, packed, shown_of
 from unjam.scenarios import make_scenario, scenario_recipe
@@ -37,7 +38,6 @@ from unjam.worlds.sumo.apart import simulation_for
 from unjam.worlds.workers import EpisodeTask, Workers
 
 WANTS_ACC = "holds back a car's own ACC, which none has: --set actuation=cruise --set safety.active=false"
-LIFTED = "vehicles that had stood for long and put them back further on: see its time-to-teleport"
 TRAINED = "trained"
 """label of the trained controller in tables and pictures"""
 Progress = Callable[[tuple[str, int], int], None]
@@ -223,6 +223,7 @@ def judge(
         "trained": TRAINED,
         "expert": config.make_expert().describe() if config.expert != "none" else "none",
         "controllers": _hashes({TRAINED: str(folder)}),
+        "notes": notes_of_rows(found.rows),
         "manifest": manifest(),
     }
     target = out or folder
@@ -238,12 +239,6 @@ def gain_of(config: RunConfig, rows: Rows) -> Estimate | None:
     if config.expert == "none":
         return None
     return paired_difference(rows[TRAINED], rows[config.make_expert().describe()], "return")
-
-
-def notes_on_teleports(rows: Rows) -> list[str]:
-    """Return by drivers how often SUMO moved somebody on who stood: no road does that."""
-    counts = {name: sum(row["teleports"] for row in found) for name, found in rows.items()}
-    return [f"{name}: SUMO lifted {count} {LIFTED}" for name, count in counts.items() if count]
 
 
 def _lacks_acc(driver: Driver, scenario: Scenario) -> bool:
@@ -316,7 +311,7 @@ def drive(
         found = evaluate(made, drivers, seeds, pool, reward, progress)
         report, notes = None, notes_on_controllers(scenario_recipe(made), drivers, found.shown)
         notes += [f"{name} {WANTS_ACC}" for name, one in drivers.items() if _lacks_acc(one, made)]
-        notes += [*made.notes, *notes_on_teleports(found.rows)]
+        notes = [*notes_of_rows(found.rows), *notes, *made.notes]
         ran = any(row["status"] != "failed" for rows in found.rows.values() for row in rows)
         if folder is not None and ran:
             about = {"scenario": Path(scenario).name, "reward": reward or made.reward, "manifest": manifest()}

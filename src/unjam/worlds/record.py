@@ -120,14 +120,25 @@ def trajectory(
 
 
 @dataclass(frozen=True)
+class SumoWarning:
+    """What SUMO warned of in an episode: one kind of message."""
+
+    kind: str
+    """the message with placeholders for names and numbers"""
+    example: str
+    """the first message of this kind"""
+    count: int
+
+
+@dataclass(frozen=True)
 class Episode:
     """What happened in one episode; T decisions, N vehicles. The warm-up is not part of it."""
 
     seed: tuple[int, ...]
     status: str
-    """`completed`, `collision`, or `failed`"""
+    """`completed`; `failed`; `collision`, or `teleports` beyond SUMO's max-num-teleports, ended it early"""
     reason: str = ""
-    """why it failed"""
+    """why it failed or ended early"""
     error: str = ""
     """name of the error that made it fail"""
     step: float = 0.1
@@ -150,7 +161,7 @@ class Episode:
     every: int = 1
     """where vehicles are is kept of every so many-th moment: not of all where many drive for long"""
     collisions: int = 0
-    """vehicles that were in contact with another"""
+    """vehicles that collided: on a built-in road by contact, on a user's network as its settings say"""
     speeds: Floats = field(default_factory=lambda: np.zeros((1, 0)))
     """[m/s], shape (T + 1, N); NaN where a vehicle is not on the road"""
     positions: Floats = field(default_factory=lambda: np.zeros((1, 0)))
@@ -167,7 +178,8 @@ class Episode:
     arrived: int = 0
     """vehicles that left at the end of their route"""
     teleports: int = 0
-    """times that SUMO lifted a vehicle that had stood for long off the road; until it is put back it waits"""
+    """times that SUMO took a vehicle that had stood for long or collided off the road; until it is put back
+    it waits"""
     peak: tuple[float, float] = (0.0, 0.0)
     """from when to when the most vehicles want to enter [s]; (0, 0) where there is no peak"""
     planned: float = float("nan")
@@ -195,6 +207,8 @@ class Episode:
     trips: Trips = field(default_factory=Trips)
     """of all vehicles, on a network of the user's own; empty elsewhere"""
     audit: Audit = field(default_factory=Audit)
+    warnings: tuple[SumoWarning, ...] = ()
+    """what SUMO warned of, the warm-up included; teleports, collisions and braking are counted elsewhere"""
 
     @property
     def reward(self) -> Floats:
@@ -215,7 +229,7 @@ class Episode:
 
     @property
     def ok(self) -> bool:
-        """Whether the episode ran to its end, be it a collision."""
+        """Whether the episode ran, also where it ended early."""
         return self.status != "failed"
 
 

@@ -40,29 +40,96 @@ def grid(folder: Path, kind: str = "traffic_light") -> Path:
     return path
 
 
+def built(folder: Path, nodes: str, edges: str, routes: str, configuration: str, *options: str) -> Path:
+    """A network of netconvert's with `options`, its routes and its configuration, all as inner XML."""
+    files = {"nodes.xml": f"<nodes>{nodes}</nodes>", "edges.xml": f"<edges>{edges}</edges>"}
+    files |= {"demand.rou.xml": f"<routes>{routes}</routes>"}
+    inputs = '<net-file value="road.net.xml"/><route-files value="demand.rou.xml"/>'
+    files |= {"my.sumocfg": f"<configuration>{inputs}{configuration}</configuration>"}
+    for name, content in files.items():
+        (folder / name).write_text(content)
+    command = [sumo_program("netconvert"), "-n", "nodes.xml", "-e", "edges.xml", "-o", "road.net.xml"]
+    subprocess.run([*command, *options], check=True, capture_output=True, cwd=folder)
+    return folder / "my.sumocfg"
+
+
 def straight(
-    folder: Path, vehicles: str, length: float = 1000.0, end: float = 60.0, speed: float = 20.0
+    folder: Path,
+    vehicles: str,
+    length: float = 1000.0,
+    end: float = 60.0,
+    speed: float = 20.0,
+    step: float = 0.1,
+    options: str = "",
 ) -> Path:
     """One road with one lane and a limit of 20 m/s or another, and vehicles on the route `along`."""
-    (folder / "nodes.xml").write_text(
-        f'<nodes><node id="a" x="0" y="0"/><node id="b" x="{length}" y="0"/></nodes>'
-    )
-    (folder / "edges.xml").write_text(
-        f'<edges><edge id="road" from="a" to="b" numLanes="1" speed="{speed}"/></edges>'
-    )
-    (folder / "demand.rou.xml").write_text(
-        f'<routes><vType id="car" carFollowModel="IDM" speedDev="0" minGap="1.5"/>'
+    made = built(
+        folder,
+        f'<node id="a" x="0" y="0"/><node id="b" x="{length}" y="0"/>',
+        f'<edge id="road" from="a" to="b" numLanes="1" speed="{speed}"/>',
+        f'<vType id="car" carFollowModel="IDM" speedDev="0" minGap="1.5"/>'
         f'<vType id="van" length="7" minGap="3" speedDev="0"/>'
-        f'<route id="along" edges="road"/>{vehicles}</routes>'
+        f'<route id="along" edges="road"/>{vehicles}',
+        f'<end value="{end}"/><step-length value="{step}"/>{options}',
     )
-    command = [sumo_program("netconvert"), "-n", "nodes.xml", "-e", "edges.xml", "-o", "road.net.xml"]
-    subprocess.run(command, check=True, capture_output=True, cwd=folder)
-    path = folder / "straight.sumocfg"
-    path.write_text(
-        '<configuration><net-file value="road.net.xml"/><route-files value="demand.rou.xml"/>'
-        f'<end value="{end}"/><step-length value="0.1"/></configuration>'
+    return made.rename(folder / "straight.sumocfg")
+
+
+def crossing(folder: Path, configuration: str = "") -> Path:
+    """A small signalled crossing of cars and long buses, which overlap on it in ten minutes."""
+    places = {"w": (-300, 0), "e": (300, 0), "s": (0, -300), "n": (0, 300)}
+    nodes = '<node id="m" x="0" y="0" type="traffic_light"/>' + "".join(
+        f'<node id="{name}" x="{x}" y="{y}"/>' for name, (x, y) in places.items()
     )
-    return path
+    edges = "".join(
+        f'<edge id="{begin}{end}" from="{begin}" to="{end}" numLanes="2" speed="13.9"/>'
+        for name in places
+        for begin, end in ((name, "m"), ("m", name))
+    )
+    flows = "".join(
+        f'<flow id="{kind}{begin}{end}" type="{kind}" from="{begin}m" to="m{end}" begin="0" end="900" '
+        f'vehsPerHour="{flow}"/>'
+        for begin in places
+        for end in places
+        for kind, flow in (("car", 150), ("bus", 15))
+        if begin != end
+    )
+    small = ("--default.junctions.radius", "2", "--junctions.small-radius", "1", "--no-turnarounds", "true")
+    routes = f'<vType id="car"/><vType id="bus" vClass="bus"/>{flows}'
+    return built(folder, nodes, edges, routes, f'<end value="900"/>{configuration}', *small)
+
+
+def two_way(folder: Path, configuration: str = "") -> Path:
+    """A road with left-hand traffic on which cars overtake slow tractors in the opposite lane."""
+    nodes = '<node id="a" x="0" y="0"/><node id="b" x="3000" y="0"/>'
+    edges = "".join(
+        f'<edge id="{there}" from="{there[0]}" to="{there[1]}" numLanes="1" speed="25">'
+        f'<neigh lane="{back}_0"/></edge>'
+        for there, back in (("ab", "ba"), ("ba", "ab"))
+    )
+    flow = '<flow id="{}" type="{}" route="{}" begin="1" end="600" vehsPerHour="{}" departSpeed="max"/>'
+    flows = [("t", "tractor", "r", 60), ("f", "car", "r", 300), ("g", "car", "q", 100)]
+    routes = (
+        '<vType id="car" lcOpposite="2"/><vType id="tractor" maxSpeed="8"/>'
+        '<route id="r" edges="ab"/><route id="q" edges="ba"/>' + "".join(flow.format(*one) for one in flows)
+    )
+    configuration = f'<end value="600"/><step-length value="0.5"/>{configuration}'
+    return built(folder, nodes, edges, routes, configuration, "--lefthand", "true")
+
+
+UNSORTED = (
+    '<flow id="a" type="car" route="along" begin="0" end="30" period="6"/>'
+    '<flow id="b" type="car" route="along" begin="30" end="60" period="6"/>'
+    '<flow id="c" type="car" route="along" begin="0" end="30" period="4"/>'
+)
+"""of which SUMO ignores the last flow"""
+LATE = '<flow id="z" type="car" route="along" begin="25200" end="25500" period="3"/>'
+STANDING = (
+    '<vehicle id="van" type="van" route="along" depart="0"><stop lane="road_0" endPos="300" duration="90"/>'
+    '</vehicle><flow id="f" type="car" route="along" begin="1" end="40" period="4"/>'
+)
+"""of which SUMO teleports those that stand behind the first"""
+TELEPORTS = '<time-to-teleport value="5"/>'
 
 
 def network(folder: Path, demand: str, more: str = "", options: str = "") -> str:

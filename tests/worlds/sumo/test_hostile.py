@@ -5,6 +5,7 @@ import json
 import os
 import re
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -175,7 +176,8 @@ def test_left_out_outputs_change_no_vehicle(tmp_path: Path, simulation: Simulati
             without = re.sub("<calibrator.*</calibrator>", "", WRITING, flags=re.DOTALL)
             (folder / "outputs.add.xml").write_text(without.replace("CANARY", str(tmp_path / "canary")))
         scenario = make_scenario(str(path), {"cav_share": 0.5, "horizon": 200})
-        episodes.append(run_episode(scenario, IDM(), (0,), simulation=simulation))
+        episode = run_episode(scenario, IDM(), (0,), simulation=simulation)
+        episodes.append(replace(episode, warnings=()))  # detectors warn of vehicles that miss them
     assert fingerprint(episodes[0]) == fingerprint(episodes[1])
     assert not (tmp_path / "canary").exists()
 
@@ -198,7 +200,8 @@ def test_folders_with_blanks_and_commas_drive_alike(tmp_path: Path, simulation: 
     for name in ("plain", "with a blank, a comma; and $HOME"):
         (tmp_path / name).mkdir()
         scenario = make_scenario(str(straight(tmp_path / name, COLUMN)), {"cav_share": 0.5, "horizon": 50})
-        episodes.append(run_episode(scenario, IDM(), (0,), simulation=simulation))
+        episode = run_episode(scenario, IDM(), (0,), simulation=simulation)
+        episodes.append(replace(episode, warnings=()))  # detectors warn of vehicles that miss them
     assert fingerprint(episodes[0]) == fingerprint(episodes[1])
 
 

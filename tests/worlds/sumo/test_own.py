@@ -338,16 +338,18 @@ def test_lanes_count_from_the_left_and_are_those_that_sumo_says(
     for _ in range(60):
         traffic.advance(Command(np.zeros(len(traffic.cavs))))
     here = {
-        name: (libsumo.vehicle.getRoadID(name), libsumo.vehicle.getLaneIndex(name))
+        name: libsumo.edge.getLaneNumber(libsumo.vehicle.getRoadID(name))
+        - 1
+        - libsumo.vehicle.getLaneIndex(name)
         for name in libsumo.vehicle.getIDList()
     }
     episode = traffic.record(Driven())
     column, seen = {name: number for number, name in enumerate(episode.vehicle_ids)}, set()
-    for name, (edge, index) in here.items():
+    for name, from_left in here.items():
         lane = episode.lanes[-1, column[name]]
         assert np.isnan(lane) == np.isnan(episode.positions[-1, column[name]]), "lanes of the route alone"
         if not np.isnan(lane):
-            assert lane == libsumo.edge.getLaneNumber(edge) - 1 - index
+            assert lane == from_left
             seen.add(episode.lane_names[int(lane)])
     assert "left lane" in seen
     assert len(seen) > 1

@@ -61,7 +61,7 @@ def assert_same(file: Path, simulation: Simulation, monkeypatch: pytest.MonkeyPa
     seeds, load = list[int](), simulation.load
     with monkeypatch.context() as patch:
         patch.setattr(simulation, "load", lambda *given: (seeds.append(given[2]), load(*given)))
-        road = make_scenario(str(file), {"cav_share": 0.3})
+        road = make_scenario(str(file), {"cav_share": 0.3, "cav_classes": ["passenger", "bus"]})
         episode = run_episode(road, Human(), (0,), simulation=simulation)
     expected = speeds_of_sumo(file, seeds[0])
     begin, compared = min(expected), 0
@@ -262,5 +262,7 @@ def test_an_episode_without_any_vehicle_is_no_result(
 ) -> None:
     files: Files = {"r.xml": f"<routes>{TYPE}{ROUTE}{FLOW.replace('90', '9')}</routes>"}
     path = write(tmp_path, network, files, '<route-files value="r.xml"/><begin value="20"/>')
-    with pytest.raises(InputError, match="no vehicle entered in 0 decisions: see when and where"):
+    with pytest.raises(
+        InputError, match="no vehicle entered before 60 s; the first departs at 0 s; use --begin 0"
+    ):
         run_episode(make_scenario(str(path), {"cav_share": 0.3}), Human(), (0,), simulation=simulation)

@@ -20,6 +20,11 @@ CALIBRATED_TYPES = "{}" + DRIVER_SUFFIX + "{}"
 """the type of a car whose own type is `{}`, driven by a calibrated person of that number"""
 FOLLOWING = {"carFollowModel", "tau", "minGap", "sigma", "delta", "stepping"}
 """attributes of a vehicle type that are its car-following law's: a CAV keeps all others"""
+REAL_CONTACT = (
+    *("--collision.action", "warn", "--collision.mingap-factor", "0"),
+    *("--collision.check-junctions", "true"),
+)
+"""on built-in roads a collision is real contact, and each is reported; users' networks have own settings"""
 
 
 class Files(NamedTuple):
@@ -47,7 +52,7 @@ def files_of(scenario: Scenario, road: Road) -> Files:
     # Vehicles neither vanish from a jam nor give up waiting to enter.
     patience = ("--time-to-teleport", "-1", "--max-depart-delay", "-1")
     network = {"--net-file": (network_file(road.network),)}
-    return Files(patience, network, _traffic_xml(scenario, road), "--route-files")
+    return Files((*patience, *REAL_CONTACT), network, _traffic_xml(scenario, road), "--route-files")
 
 
 def _own_files(scenario: Scenario, road: OwnRoad) -> Files:

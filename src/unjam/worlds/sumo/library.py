@@ -1,7 +1,8 @@
 """How SUMO is reached: the only module that imports libsumo or traci.
 
 Both libraries keep state of the whole process, in which the user may run a simulation of their own: it is
-never closed, stepped, or replaced, and the user's TraCI connection stays the active one.
+never closed, stepped, or replaced, and the user's TraCI connection stays the active one. The records of what
+SUMO answers are here, too.
 """
 
 import importlib
@@ -16,7 +17,7 @@ from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from types import ModuleType
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 from unjam.errors import LostError, MissingPartError, UnjamError
 from unjam.sandbox import keep_disk
@@ -183,6 +184,27 @@ class Traci:
 
     def close(self) -> None:
         """Do nothing more."""
+
+
+class Neighbours(NamedTuple):
+    """Who is ahead of a vehicle and behind it [m/s, m from bumper to bumper]; no name: nobody is ahead."""
+
+    leader: str
+    leader_speed: float
+    leader_gap: float
+    follower_speed: float
+    follower_gap: float
+
+
+class NetworkLane(NamedTuple):
+    """A lane of a network that is no junction's: its edge, its length [m], what it allows [m/s]."""
+
+    name: str
+    edge: str
+    length: float
+    speed: float
+    leads_to: tuple[str, ...]
+    """lanes of the next edges"""
 
 
 def close(sumo: Any) -> None:

@@ -28,6 +28,8 @@ from unjam.worlds.record import Floats
 
 LONG_AGO = 3600.0
 """seconds after which nobody makes a network any more"""
+TOTAL = "total messages of type:"
+"""in the lines at the end of a log that count its messages"""
 Attributes = dict[str, Any]
 """of an XML element"""
 _whole: dict[Path, tuple[int, int]] = {}
@@ -70,7 +72,7 @@ def sumo_words(lines: Iterable[str]) -> str:
 def said_in(log: Path) -> str:
     """Return SUMO's own words about its last error: they are in its log, behind warnings."""
     try:
-        lines = log.read_text(errors="replace").splitlines()
+        lines = [line for line in log.read_text(errors="replace").splitlines() if TOTAL not in line]
     except OSError:
         return ""
     return sumo_words(dropwhile(lambda line: not line.lstrip().startswith("Error"), lines))

@@ -85,6 +85,10 @@ class OpenTraffic(Traffic[OpenKind]):
         """Command CAVs to have these speeds after the next step [m/s]."""
         self._simulation.command_speeds(speeds.keys(), speeds.values())
 
+    def _colliding(self) -> Sequence[str]:
+        """Return the vehicles that collided in the last step."""
+        return self._simulation.colliding()
+
     def _ends_with(self, colliding: Sequence[str]) -> bool:
         """Whether a collision of these vehicles ends the episode."""
         return True
@@ -154,7 +158,7 @@ class OpenTraffic(Traffic[OpenKind]):
             # Who has reached what the road allows is not overridden.
             for name, most in zip(slower, self._simulation.allowed_speeds(slower), strict=True):
                 shield[name] = max(shield[name], (min(commanded[name], most) - moved[name]) / step)
-            if self.crashed:
+            if self.crashed or self.stopped:
                 break
         self.decisions += 1
         self._look()
@@ -188,9 +192,12 @@ class OpenTraffic(Traffic[OpenKind]):
         self._simulation.step()
         self._follow()
         self._watch()
-        colliding = self._simulation.colliding()
+        colliding = self._colliding()
         if colliding:
             self._touched.update(colliding)
+            removed = set(colliding).intersection(self._simulation.arrived())
+            removed -= set(self._simulation.lifted())  # one that is teleported to its end has arrived
+            self._arrived, self._teleports = self._arrived - len(removed), self._teleports + len(removed)
             self.crashed = self.crashed or self._ends_with(colliding)
 
     def _follow(self) -> None:

@@ -20,9 +20,9 @@ from unjam.worlds.record import Episode, Floats
 from unjam.worlds.sumo.control import VehicleLimits
 from unjam.worlds.sumo.files import CALIBRATED_TYPES, CAV_TYPES
 from unjam.worlds.sumo.lanes import Followed, LaneTraffic
+from unjam.worlds.sumo.library import Neighbours
 from unjam.worlds.sumo.networks import edge_lengths, lane_counts, network_lines
 from unjam.worlds.sumo.sections import RoadAhead
-from unjam.worlds.sumo.simulation import Neighbours
 from unjam.worlds.world import Driven, OnProgress
 
 FILTER_SEES = 400.0
@@ -89,7 +89,11 @@ class OwnTraffic(LaneTraffic[OwnRoad]):
         """Keep up with who is on the road, and let calibrated people drive the cars that have entered."""
         self._near: dict[str, Neighbours] = {}
         self._places: dict[str, tuple[str, float]] = {}
+        before = self._teleports
         super()._follow()
+        most = int(self.road.files.options.get("max-num-teleports", -1))
+        if self._teleports > before and 0 <= most < self._simulation.teleport_count():
+            self.stopped = f"more than {most} teleports (max-num-teleports)"
         road, simulation = self.road, self._simulation
         for name in simulation.departed() if road.drivers else ():
             kind = simulation.type_of(name)
@@ -154,8 +158,20 @@ class OwnTraffic(LaneTraffic[OwnRoad]):
             self._near[name] = self._simulation.neighbours(name, LARGEST_GAP)
         return self._near[name]
 
+    def _colliding(self) -> Sequence[str]:
+        """Return what SUMO counts as collided under the user's settings, and CAVs that touch their leader.
+
+        With `collision.action` none, SUMO itself counts nothing.
+        """
+        found = dict.fromkeys(super()._colliding())
+        for name, (leader, _, gap, *_) in self._near.items() if self._controlled else ():
+            if leader and gap <= 0.0 and self._simulation.is_in_contact(name, leader):
+                found |= {name: None, leader: None}
+        return list(found)
+
     def _ends_with(self, colliding: Sequence[str]) -> bool:
-        return any(name in self.cavs for name in colliding)
+        """Whether a CAV is among them; in human-only traffic, the baseline, nothing ends early for that."""
+        return self._controlled and any(name in self.cavs for name in colliding)
 
     def _pictured_now(self, names: Sequence[str]) -> dict[str, Any]:
         unknown = np.full(len(names), np.nan)

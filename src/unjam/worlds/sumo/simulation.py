@@ -8,7 +8,7 @@ from itertools import starmap
 from pathlib import Path
 from tempfile import gettempdir
 from threading import Lock
-from typing import Any, NamedTuple, Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,36 +16,19 @@ from numpy.typing import NDArray
 from unjam.errors import EpisodeError, RefusedError, wrong
 from unjam.processes import PrivateFolder, printed_to
 from unjam.sumo_files import copy_harmless, stamp_of
+from unjam.worlds.record import SumoWarning
 from unjam.worlds.sumo.control import VehicleControl
 from unjam.worlds.sumo.files import Files
-from unjam.worlds.sumo.library import Backend, Libsumo, Traci, function_of
+from unjam.worlds.sumo.library import Backend, Libsumo, Neighbours, NetworkLane, Traci, function_of
 from unjam.worlds.sumo.networks import said_in, sumo_program
 from unjam.worlds.sumo.tripinfo import read_trips, trip_options
+from unjam.worlds.sumo.warnings_log import LIMIT_OF_EXAMPLES, read_warnings
 from unjam.worlds.trips import Trips
 
+CONTACT = 0.01
+"""overlap that is no rounding error [m]"""
 _exhaust = deque(maxlen=0).extend
 """runs through an iterator, in C: a loop would cost as much as the calls"""
-
-
-class Neighbours(NamedTuple):
-    """Who is ahead of a vehicle and behind it [m/s, m from bumper to bumper]; no name: nobody is ahead."""
-
-    leader: str
-    leader_speed: float
-    leader_gap: float
-    follower_speed: float
-    follower_gap: float
-
-
-class NetworkLane(NamedTuple):
-    """A lane of a network that is no junction's: its edge, its length [m], what it allows [m/s]."""
-
-    name: str
-    edge: str
-    length: float
-    speed: float
-    leads_to: tuple[str, ...]
-    """lanes of the next edges"""
 
 
 class Simulation(VehicleControl):
@@ -150,7 +133,8 @@ class Simulation(VehicleControl):
                 else:
                     program = sumo_program("sumo-gui" if self.backend == "gui" else "sumo")
                     self._library.start([program, *options, *self._gui_options], self._error_log)
-                    self._bind()
+                    if self.backend != "libsumo":  # over TraCI each start makes another connection
+                        self._bind()
                 self.step()  # the first step inserts the vehicles and moves none
         except Exception as error:
             self._library.end()  # only then is SUMO's message in its log, and can the next episode start
@@ -172,11 +156,10 @@ class Simulation(VehicleControl):
     def _options(self, step: float, seed: int) -> list[str]:
         return [
             *("--step-length", str(step), "--seed", str(seed)),
-            *("--no-step-log", "true", "--no-warnings", "true", "--duration-log.disable", "true"),
-            *("--error-log", str(self._error_log)),
-            # The only setting in which a collision is real contact and every one is reported.
-            *("--collision.action", "warn", "--collision.mingap-factor", "0"),
-            *("--collision.check-junctions", "true"),
+            *("--no-step-log", "true", "--duration-log.disable", "true"),
+            # Warnings go to the log alone, which keeps one example and the number of each kind.
+            *("--no-warnings", "true", "--error-log", str(self._error_log)),
+            *("--aggregate-warnings", LIMIT_OF_EXAMPLES),
         ]
 
     def speeds(self, ids: Sequence[str]) -> list[float]:
@@ -244,6 +227,18 @@ class Simulation(VehicleControl):
             found += [self._get_speed(other) if there else speed, min(max(true_gap, 0.0), farthest)]
         return Neighbours(leader if found[1] < farthest else "", *found)
 
+    def is_in_contact(self, name: str, leader: str) -> bool:
+        """Return whether a vehicle overlaps with the one ahead of it on its lane, along it and across."""
+        vehicle = self._sumo.vehicle
+        gap = self._get_along(leader) - vehicle.getLength(leader) - self._get_along(name)
+        apart = vehicle.getLateralLanePosition(name) - vehicle.getLateralLanePosition(leader)
+        across = 2.0 * abs(apart) < vehicle.getWidth(name) + vehicle.getWidth(leader)
+        return self._get_lane(name) == self._get_lane(leader) and gap < -CONTACT and across
+
+    def teleport_count(self) -> int:
+        """Return how many teleports SUMO has counted since it started."""
+        return int(self._sumo.simulation.getParameter("", "stats.teleports.total"))
+
     def distances(self, ids: Sequence[str]) -> list[float]:
         """Return how far each of `ids` has driven since it entered [m]."""
         return list(map(self._get_distance, ids))
@@ -275,6 +270,11 @@ class Simulation(VehicleControl):
         self._library.end()
         self._library.close()
         self._folder.cleanup()
+
+    def finish(self) -> tuple[SumoWarning, ...]:
+        """End the episode and return what SUMO warned of: its log is complete only once SUMO has ended."""
+        self._library.end()
+        return read_warnings(self._error_log)
 
     def __enter__(self) -> Self:
         return self

@@ -78,6 +78,8 @@ class Traffic(World[Episode], Generic[RoadKind]):
         self.crashed = False
         self.over = False
         """whether nobody is on the road any more, nor will be"""
+        self.stopped = ""
+        """why SUMO's own rules end the episode early; empty: they do not"""
         self.decisions = 0
         """made since the log began"""
         self.entered = 0
@@ -101,8 +103,9 @@ class Traffic(World[Episode], Generic[RoadKind]):
         """Let people drive alone; raise `EpisodeError` where they collide."""
         for step in range(self.scenario.warmup):
             simulate()
-            if self.crashed:
-                raise EpisodeError(f"collision in step {step} of the all-human warm-up")
+            if self.crashed or self.stopped:
+                why = self.stopped or "collision"
+                raise EpisodeError(f"{why} in step {step} of the all-human warm-up")
             if on_progress is not None and step % WARMUP_PROGRESS_STEPS == 0:
                 on_progress(0)
 
@@ -123,8 +126,8 @@ class Traffic(World[Episode], Generic[RoadKind]):
 
     @property
     def ended(self) -> bool:
-        """Whether there was a collision, nobody will be on the road any more, or the horizon is reached."""
-        return self.crashed or self.over or self.decisions >= self.scenario.horizon
+        """Whether the horizon is reached, the road stays empty, or something ended the episode early."""
+        return self.crashed or self.over or bool(self.stopped) or self.decisions >= self.scenario.horizon
 
     def perceive(self) -> LocalState:
         """Return what the CAVs perceive now: arrays of shape (CAVs,), or plain numbers of a single one."""
@@ -181,7 +184,8 @@ class Traffic(World[Episode], Generic[RoadKind]):
         self._simulation.check()
         return {
             "seed": self.seed,
-            "status": "collision" if self.crashed else "completed",
+            "status": "collision" if self.crashed else "teleports" if self.stopped else "completed",
+            "reason": "" if self.crashed else self.stopped,
             "step": self.scenario.decision_step,
             "warmup": self.scenario.warmup,
             "drawn": self.road.drawn,

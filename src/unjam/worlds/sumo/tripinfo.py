@@ -10,6 +10,8 @@ from unjam.worlds.trips import Trips
 
 NOT_ARRIVED = -1.0
 """what SUMO writes for the time of an arrival that has not happened"""
+TIMES = "departDelay", "duration", "timeLoss", "arrival"
+"""attributes of a trip that are read [s]"""
 CHUNK = 1 << 20
 """bytes that are read at once"""
 
@@ -26,18 +28,18 @@ def read_trips(path: Path, classes: dict[str, str], after: float) -> Trips:
     `classes` has the vehicle class of each vehicle type. Trips that ended before the time `after` [s], during
     a warm-up, are left out.
     """
-    found: list[tuple[str, str, float, float, float, float]] = []
+    ids, kinds, times = list[str](), list[str](), list[list[float]]()
 
     def start(tag: str, attributes: dict[str, str]) -> None:
-        if tag == "tripinfo" and not NOT_ARRIVED < (arrival := float(attributes["arrival"])) <= after:
-            times = (float(attributes[name]) for name in ("departDelay", "duration", "timeLoss"))
-            found.append((attributes["id"], classes[base_type(attributes["vType"])], *times, arrival))
+        if tag == "tripinfo" and not NOT_ARRIVED < float(attributes["arrival"]) <= after:
+            ids.append(attributes["id"])
+            kinds.append(classes[base_type(attributes["vType"])])
+            times.append([float(attributes[name]) for name in TIMES])
 
     parser = expat.ParserCreate()
     parser.StartElementHandler = start
     with path.open("rb") as file:
         while chunk := file.read(CHUNK):
             parser.Parse(chunk)
-    ids, classes, *columns = zip(*found, strict=True) if found else ((),) * 6
-    depart_delay, duration, time_loss, arrival = (np.array(column, np.float64) for column in columns)
-    return Trips(ids, classes, depart_delay, duration, time_loss, arrival != NOT_ARRIVED)
+    depart_delay, duration, time_loss, arrival = np.array(times, np.float64).reshape(-1, len(TIMES)).T
+    return Trips(tuple(ids), tuple(kinds), depart_delay, duration, time_loss, arrival != NOT_ARRIVED)

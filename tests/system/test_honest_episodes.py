@@ -1,0 +1,103 @@
+"""Does the command line say what is missing from episodes on a user's own network?"""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import unjam as package
+from tests.system.conftest import Run
+from tests.worlds.sumo.own_roads import LATE, STANDING, TELEPORTS, UNSORTED, crossing, straight
+from unjam.errors import InputError
+
+IGNORED = "demand is missing, SUMO warns: Route file should be sorted by departure time, ignoring 'c'!"
+NONE_ENTERED = "no vehicle entered before 60 s; the first departs at 25,200 s; use --begin 25200"
+STOPPED = "2 of 2 episodes ended early: more than 0 teleports (max-num-teleports)"
+
+
+def document(run: Run, *words: object) -> dict[str, Any]:
+    ran = run(*words, "--json", pictures=False)
+    assert ran.returncode == 0, ran.stderr
+    return json.loads(ran.stdout)
+
+
+def test_ignored_demand_is_told_in_terminal_json_and_report(unjam: Run, tmp_path: Path) -> None:
+    straight(tmp_path, UNSORTED, end=90.0, step=0.5)
+    drive = ("drive", "straight.sumocfg", "--cav-share", 0.5, "-d", "human", "-n", 2)
+    often = "(2 warnings of this kind in 2 of 2 episodes)"
+    ran = unjam(*drive, "--out", "out", pictures=False)
+    assert f"note: {IGNORED} {often}" in ran.stderr
+    assert IGNORED.replace("'", "&#39;") in (tmp_path / "out" / "report.html").read_text()
+    found = document(unjam, *drive, "--no-report")
+    assert found["notes"] == [f"{IGNORED} {often}"]
+    assert [row["vehicles"] for row in found["episodes"]] == [10, 10]
+    assert found["ended_early"] == {}
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("drive", "straight.sumocfg", "--cav-share", "0.1"),
+        ("drive", "straight.sumocfg", "--cav-share", "0.1", "-d", "human", "--set", "horizon=120"),
+        ("assess", "straight.sumocfg"),
+        ("train", "straight.sumocfg", "--set", "road.cav_share=0.5", "--steps", "100"),
+    ],
+)
+def test_traffic_without_vehicles_is_one_clear_line(
+    words: tuple[str, ...], unjam: Run, tmp_path: Path
+) -> None:
+    straight(tmp_path, LATE, step=0.5)
+    ran = unjam(*words)
+    assert (ran.returncode, ran.stdout) == (2, "")
+    assert ran.stderr.strip() == f"unjam: {NONE_ENTERED} --end 25260"
+    assert not list(tmp_path.glob("runs/*"))
+
+
+def test_the_advice_for_traffic_without_vehicles_helps_and_python_gets_it_too(tmp_path: Path) -> None:
+    file, how = str(straight(tmp_path, LATE, step=0.5)), {"cav_share": 0.5}
+    with pytest.raises(InputError, match=NONE_ENTERED):
+        package.drive(file, "human", 1, road=how, workers=1)
+    rows = package.drive(file, "human", 1, road={**how, "begin": 25200, "end": 25260}, workers=1).rows
+    assert rows["human"][0]["vehicles"] >= 20
+
+
+def test_vehicles_that_sumo_does_not_insert_are_one_clear_line(unjam: Run, tmp_path: Path) -> None:
+    vehicle = '<vehicle id="v" type="car" route="along" depart="5"/>'
+    straight(tmp_path, vehicle, end=20.0, options='<max-num-vehicles value="0"/>')
+    ran = unjam("drive", "straight.sumocfg", "--cav-share", 0.5, "-d", "human", "-n", 1, "--no-report")
+    assert ran.returncode == 2
+    assert "unjam: no vehicle entered before 20 s, though the first departs at 5 s" in ran.stderr
+
+
+@pytest.mark.long
+def test_overlaps_at_junctions_that_plain_sumo_ignores_end_no_baseline(unjam: Run, tmp_path: Path) -> None:
+    crossing(tmp_path)
+    found = [
+        document(unjam, "drive", "my.sumocfg", "--cav-share", share, "-d", "human", "-n", 1, "--no-report")
+        for share in (0.01, 0.5)
+    ]
+    (few,), (half,) = (each["episodes"] for each in found)
+    assert (few["status"], few["collisions"], few["steps"]) == ("completed", 0.0, 900)
+    assert found[0]["ended_early"] == {}
+    traffic = ("vehicles", "mean_speed", "travel_time", "throughput_veh_per_h", "fuel_ml_per_km")
+    assert [few[name] for name in traffic] == [half[name] for name in traffic]
+
+
+def test_a_limit_of_teleports_ends_episodes_and_assess_refuses_such_a_baseline(
+    unjam: Run, tmp_path: Path
+) -> None:
+    options = TELEPORTS + '<max-num-teleports value="0"/>'
+    straight(tmp_path, STANDING, end=120.0, step=0.5, options=options)
+    drive = ("drive", "straight.sumocfg", "--cav-share", 0.5, "-d", "human", "-n", 2)
+    ran = unjam(*drive, "--out", "out", pictures=False)
+    assert f"note: human: {STOPPED}; means are over complete episodes only" in ran.stderr
+    assert STOPPED in (tmp_path / "out" / "report.html").read_text()
+    found = document(unjam, *drive, "--no-report")
+    assert found["ended_early"] == {"more than 0 teleports (max-num-teleports)": 2}
+    assert found["mean"]["travel_time"] is None
+    assert {row["status"] for row in found["episodes"]} == {"teleports"}
+    refused = unjam("assess", "straight.sumocfg", "-d", "acc", "--shares", "0.5", "-n", 40, "--out", "answer")
+    assert refused.returncode == 2
+    assert f"unjam: human: {STOPPED}; allowed: 5 %" in refused.stderr
+    assert not (tmp_path / "answer").exists()

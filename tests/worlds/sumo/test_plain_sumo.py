@@ -1,0 +1,140 @@
+"""The human baseline on a network of the user's own is the traffic of plain SUMO, trip by trip."""
+
+import os
+import subprocess
+import sys
+from collections import defaultdict
+from pathlib import Path
+
+import numpy as np
+import pytest
+import sumo
+from hypothesis import HealthCheck, Phase, given, settings
+from hypothesis import strategies as st
+
+from tests.worlds.sumo.own_roads import game, straight
+from unjam.drivers import Human
+from unjam.measures.metrics import measure
+from unjam.scenarios import make_scenario
+from unjam.worlds.episode import run_episode
+from unjam.worlds.record import Episode
+from unjam.worlds.sumo.networks import sumo_program
+from unjam.worlds.sumo.simulation import Simulation
+from unjam.worlds.sumo.tripinfo import read_trips, trip_options
+from unjam.worlds.trips import Trips
+
+TYPES = """<vType id="car" sigma="0.6"/><vType id="truck" vClass="truck" accel="0.8" maxSpeed="22"/>
+<vType id="bus" vClass="bus" personCapacity="40"/>
+<vTypeDistribution id="mix" vTypes="car truck bus" probabilities="0.8 0.15 0.05"/>"""
+CLASSES = defaultdict(lambda: "passenger", truck="truck", bus="bus")
+END = 150
+
+
+def random_network(folder: Path, seed: int, lanes: int, junctions: str, period: float, step: float) -> Path:
+    """Return the configuration of a random network with random trips of cars, trucks and buses."""
+    network, trips, path = folder / "net.net.xml", folder / "trips.rou.xml", folder / "random.sumocfg"
+    generate = [sumo_program("netgenerate"), "--rand", "--rand.iterations", "12", "--seed", str(seed)]
+    generate += ["--default.lanenumber", str(lanes), "--default-junction-type", junctions, "-o", str(network)]
+    draw = [sys.executable, str(Path(sumo.SUMO_HOME) / "tools" / "randomTrips.py"), "-n", str(network)]
+    draw += ["-o", str(trips), "-e", str(END), "-p", str(period), "--seed", str(seed)]
+    draw += ["--trip-attributes", 'type="mix" departLane="best" departSpeed="max"']
+    for command in (generate, draw):
+        environment = {**os.environ, "SUMO_HOME": str(sumo.SUMO_HOME)}
+        subprocess.run(command, check=True, capture_output=True, cwd=folder, env=environment)
+    (folder / "types.add.xml").write_text(f"<additional>{TYPES}</additional>")
+    path.write_text(
+        f'<configuration><net-file value="{network.name}"/><additional-files value="types.add.xml"/>'
+        f'<route-files value="{trips.name}"/><end value="{END}"/><step-length value="{step}"/>'
+        "</configuration>"
+    )
+    return path
+
+
+def trips_of_plain_sumo(path: Path, seed: int, end: float) -> Trips:
+    """Return the trips of `sumo -c` itself; it ends a step later, as unjam's first step only inserts."""
+    out = path.with_name("plain.xml")
+    step = make_scenario(str(path), {"cav_share": 0.2}).simulation_step
+    command = [sumo_program("sumo"), "-c", str(path), "--seed", str(seed), "--end", str(end + step)]
+    subprocess.run([*command, *trip_options(out)], check=True, capture_output=True, cwd=path.parent)
+    return read_trips(out, CLASSES, 0.0)
+
+
+def human_baseline(path: Path, simulation: Simulation, **changes: float) -> tuple[Episode, int]:
+    """Return the human baseline, and the seed that SUMO had."""
+    scenario = make_scenario(str(path), {"cav_share": 0.2, **changes})
+    seeds = []
+    original = simulation.load
+
+    def load(files: object, step: float, seed: int) -> None:
+        seeds.append(seed)
+        original(files, step, seed)  # pyright: ignore[reportArgumentType]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(simulation, "load", load)
+        episode = run_episode(scenario, Human(), 5, simulation=simulation)
+    return episode, seeds[0]
+
+
+def check_same_trips(found: Trips, plain: Trips) -> None:
+    """Assert that two sets of trips are equal to the last digit, whatever their order."""
+    assert sorted(found.vehicle_ids) == sorted(plain.vehicle_ids)
+    of_plain = {name: number for number, name in enumerate(plain.vehicle_ids)}
+    order = [of_plain[name] for name in found.vehicle_ids]
+    for name in ("depart_delay", "duration", "time_loss", "arrived"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(plain, name)[order], name)
+
+
+@pytest.mark.long
+@settings(
+    max_examples=6,
+    deadline=None,
+    phases=(Phase.explicit, Phase.reuse, Phase.generate),  # a smaller network is no clearer
+    suppress_health_check=[HealthCheck.function_scoped_fixture],
+)
+@given(
+    seed=st.integers(0, 10**6),
+    lanes=st.integers(1, 3),
+    junctions=st.sampled_from(("priority", "traffic_light", "right_before_left")),
+    period=st.floats(0.4, 3.0),
+    step=st.sampled_from((0.1, 0.5, 1.0)),
+)
+def test_the_human_baseline_has_the_trips_of_plain_sumo(
+    seed: int,
+    lanes: int,
+    junctions: str,
+    period: float,
+    step: float,
+    tmp_path_factory: pytest.TempPathFactory,
+    simulation: Simulation,
+) -> None:
+    path = random_network(tmp_path_factory.mktemp("random"), seed, lanes, junctions, round(period, 2), step)
+    episode, sumo_seed = human_baseline(path, simulation)
+    plain = trips_of_plain_sumo(path, sumo_seed, END)
+    assert len(plain.vehicle_ids) > 20
+    check_same_trips(episode.trips, plain)
+
+
+def test_the_human_baseline_of_a_motorway_has_the_trips_of_plain_sumo(
+    tmp_path: Path, simulation: Simulation
+) -> None:
+    path = game(tmp_path, "ramp")
+    episode, sumo_seed = human_baseline(path, simulation, end=60.0)
+    check_same_trips(episode.trips, trips_of_plain_sumo(path, sumo_seed, 60.0))
+
+
+def test_delay_and_travel_time_by_vehicle_class_are_those_of_the_trips(
+    tmp_path: Path, simulation: Simulation
+) -> None:
+    vehicles = '<vType id="lorry" vClass="truck" maxSpeed="8" speedDev="0"/>'
+    vehicles += '<vehicle id="slow" type="lorry" route="along" depart="0" departSpeed="max"/>'
+    vehicles += '<vehicle id="fast" type="car" route="along" depart="4" departSpeed="max"/>'
+    path = straight(tmp_path, vehicles, length=400.0, end=120.0)
+    episode, _ = human_baseline(path, simulation)
+    row = measure(episode)
+    free = 400.0 / 20.0
+    assert row["travel_time_trucks"] == pytest.approx(400.0 / 8.0, abs=1.5)
+    assert row["travel_time_cars"] > 1.8 * free  # it cannot overtake
+    assert np.isnan(row["travel_time_buses"])
+    assert row["travel_time"] == pytest.approx((row["travel_time_trucks"] + row["travel_time_cars"]) / 2)
+    lost = row["travel_time_cars"] - free
+    assert row["delay"] == pytest.approx(lost / 2.0, abs=1.5)
