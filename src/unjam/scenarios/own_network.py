@@ -45,7 +45,7 @@ class OwnNetwork(Scenario):
     reward: ClassVar[str] = "travel-time"
     closed: ClassVar[bool] = False
     has_coordinate: ClassVar[bool] = False
-    tells: ClassVar[tuple[str, ...]] = ("allowed_speed", "lane_speeds", "cav_share")
+    tells: ClassVar[tuple[str, ...]] = ("allowed_speed", "lane_speeds", "cav_share", "congestion")
 
     file: str = ""
     """the .sumocfg file"""

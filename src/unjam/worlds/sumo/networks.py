@@ -103,7 +103,7 @@ def network_file(network: RoadNetwork) -> Path:
                 if time.time() - left.stat().st_mtime > LONG_AGO:
                     shutil.rmtree(left, ignore_errors=True)
         with tempfile.TemporaryDirectory(dir=target.parent) as folder:
-            made = _netconvert(files, options, Path(folder))
+            made = netconvert(files, options, Path(folder))
             with made.open("ab") as file:
                 file.write(seal(made.read_bytes()))
                 file.flush()
@@ -179,7 +179,12 @@ def element(tag: str, /, **attributes: Any) -> str:
     return f"<{tag} {' '.join(pairs)}/>"
 
 
-def _netconvert(files: dict[tuple[str, str], str], options: list[str], folder: Path) -> Path:
+def netconvert(files: dict[tuple[str, str], str], options: list[str], folder: Path) -> Path:
+    """Return the network that netconvert makes in a folder of files by (option, name), and further options.
+
+    Raises:
+        EpisodeError: netconvert refuses them; with its own words.
+    """
     made = folder / "road.net.xml"
     for (_, name), content in files.items():
         (folder / name).write_text(content)

@@ -30,6 +30,8 @@ WITHOUT_RIGHT_OF_WAY = 1
 """the bit that stays where vehicles need not obey the right of way: who is surprised stops as it must"""
 LIMITS_OF_ACCELERATION = 2 | 4
 """the bits by which vehicles keep to the acceleration and the braking of their type"""
+FREE_LINKS = "MZ-"
+"""states of connections that no vehicle waits at: with the right of way, a zipper merge, a dead end"""
 _exhaust = deque(maxlen=0).extend
 """runs through an iterator, in C: a loop would cost as much as the calls"""
 _open: "Simulation | None" = None
@@ -57,6 +59,8 @@ class NetworkLane(NamedTuple):
     speed: float
     leads_to: tuple[str, ...]
     """lanes of the next edges"""
+    has_stop_line: bool = False
+    """whether vehicles may have to wait at its end: at a signal, a stop sign, or to give way"""
 
 
 class Simulation:
@@ -232,9 +236,11 @@ class Simulation:
         """Return all lanes of the network but those of junctions."""
         lane = self._sumo.lane
         names = [name for name in lane.getIDList() if not name.startswith(":")]
-        links = [tuple(link[0] for link in lane.getLinks(name)) for name in names]
+        links = [lane.getLinks(name) for name in names]
+        leads_to = (tuple(link[0] for link in each) for each in links)
+        stops = (any(link[5] not in FREE_LINKS for link in each) for each in links)
         facts = map(lane.getEdgeID, names), map(lane.getLength, names), map(lane.getMaxSpeed, names)
-        return list(map(NetworkLane, names, *facts, links))
+        return list(map(NetworkLane, names, *facts, leads_to, stops))
 
     def lane_places(self, ids: Sequence[str]) -> list[tuple[str, float]]:
         """Return in which lane each of `ids` is, and how far along it [m]."""
