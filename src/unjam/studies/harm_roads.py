@@ -3,7 +3,7 @@
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from itertools import product
+from itertools import accumulate, product
 from pathlib import Path
 from typing import NamedTuple
 
@@ -79,20 +79,23 @@ class HarmRoad:
     """its parameters; their desired speed is a limit in addition to that of the road"""
     speed_spread: float = 0.1
     """standard deviation of the factor by which drivers exceed the limit"""
+    entry_speed: str = "avg"
+    """speed at which vehicles enter, in SUMO's words or [m/s]"""
 
     @property
     def has_signals(self) -> bool:
         """Whether there is a signal."""
         return any(stretch.signal for stretch in self.stretches)
 
-    def free_speed(self, place: float) -> float:
-        """Return how fast cars drive alone at a place along the road [m/s]."""
-        end = 0.0
-        for stretch in self.stretches:
-            end += stretch.length
-            if place < end:
-                break
-        return min(stretch.speed, self.humans.desired_speed)  # the last stretch goes on behind the end
+    def free_speed(self, begin: float, end: float) -> float:
+        """Return how fast cars drive alone on the slowest stretch between two places along the road [m/s]."""
+        ends = accumulate(stretch.length for stretch in self.stretches)
+        limits = [
+            stretch.speed
+            for stretch, last in zip(self.stretches, ends, strict=True)
+            if last > begin and last - stretch.length < end
+        ]
+        return min(*limits, self.humans.desired_speed)
 
     @property
     def capacity(self) -> float:
@@ -113,8 +116,12 @@ def _road(
     return HarmRoad(stretches, demand if isinstance(demand, tuple) else (demand,), **changes)  # pyright: ignore[reportArgumentType]
 
 
+OVERLOAD = (1.1, 1.1, 1.1, 0.5)
+"""demand that no bottleneck carries, and less in the end"""
 HARM_ROADS: dict[str, HarmRoad] = {
-    "limit far above the flow": _road(1.0, Stretch(4000, 3, 40), model="IDM", humans=CALM, speed_spread=0.0),
+    "limit far above the flow": _road(
+        1.0, Stretch(5000, 3, 40), model="IDM", humans=CALM, speed_spread=0.0, entry_speed="24"
+    ),
     "the same, demand that rises": _road((0.4, 0.95), Stretch(4000, 3, 40), model="IDM", humans=CALM),
     "a calm two-lane road": _road(0.3, Stretch(4000, 2, 25)),
     "one lane, calm": _road(0.5, Stretch(4000, 1, 28)),
@@ -132,10 +139,10 @@ HARM_ROADS: dict[str, HarmRoad] = {
         0.7, Stretch(2500, 3, 36), Stretch(300, 4, 36, ramp_flow=0.15), Stretch(1200, 3, 36)
     ),
     "on-ramp, overloaded": _road(
-        (0.6, 1.05, 0.6), Stretch(3000, 2, 33), Stretch(300, 3, 33, ramp_flow=0.2), Stretch(1200, 2, 33)
+        OVERLOAD, Stretch(3000, 2, 33), Stretch(300, 3, 33, ramp_flow=0.25), Stretch(1200, 2, 33)
     ),
     "lane drop with reserve": _road(0.7, Stretch(2500, 4, 33), Stretch(1500, 3, 33)),
-    "lane drop, overloaded": _road((0.6, 1.1, 0.6), Stretch(3000, 3, 33), Stretch(1000, 2, 33)),
+    "lane drop, overloaded": _road(OVERLOAD, Stretch(3000, 3, 33), Stretch(1000, 2, 33)),
     "arterial with signals": _road(
         0.35, *(Stretch(700, 2, 25, signal=True) for _ in range(4)), Stretch(700, 2, 25)
     ),
@@ -179,7 +186,7 @@ def write_road(road: HarmRoad, folder: Path) -> Path:
         flow = road.demand[part] * road.capacity * share * shares[kind]
         if flow:
             about = {"id": f"{name}.{part}.{kind}", "type": kind, "route": name, "begin": begin, "end": end}
-            enters = {"departLane": "best", "departSpeed": "avg"}
+            enters = {"departLane": "best", "departSpeed": road.entry_speed}
             flows.append((begin, element("flow", **about, vehsPerHour=round(flow, 1), **enters)))
     inputs = {
         ("--node-files", "road.nod.xml"): _document("nodes", nodes),
