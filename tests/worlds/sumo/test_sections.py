@@ -17,9 +17,10 @@ from unjam.scenarios import make_scenario
 from unjam.studies.harm_roads import HARM_ROADS, write_road
 from unjam.worlds.episode import run_episode
 from unjam.worlds.sumo import make_traffic
+from unjam.worlds.sumo.networks import NetworkLane
 from unjam.worlds.sumo.own import OwnTraffic
 from unjam.worlds.sumo.sections import NOWHERE, LaneSections
-from unjam.worlds.sumo.simulation import NetworkLane, Simulation
+from unjam.worlds.sumo.simulation import Simulation
 
 LANES = [
     NetworkLane("a_0", "a", 250.0, 20.0, ("b_0", "ramp_0")),

@@ -31,6 +31,21 @@ Attributes = dict[str, Any]
 """of an XML element"""
 _whole: dict[Path, tuple[int, int]] = {}
 """networks in the cache that this process has found whole, with their stamps"""
+FREE_LINKS = "MZ-"
+"""states of connections that no vehicle waits at: with the right of way, a zipper merge, a dead end"""
+
+
+class NetworkLane(NamedTuple):
+    """A lane of a network that is no junction's: its edge, its length [m], what it allows [m/s]."""
+
+    name: str
+    edge: str
+    length: float
+    speed: float
+    leads_to: tuple[str, ...]
+    """lanes of the next edges"""
+    has_stop_line: bool = False
+    """whether vehicles may have to wait at its end: at a signal, a stop sign, or to give way"""
 
 
 @cache

@@ -10,7 +10,8 @@ import numpy as np
 from unjam.drivers.local_state import SECTION, SECTIONS_AHEAD
 from unjam.drivers.roadside import CongestionMonitor, Messages
 from unjam.physics.arrays import Floats
-from unjam.worlds.sumo.simulation import NetworkLane, Simulation
+from unjam.worlds.sumo.networks import NetworkLane
+from unjam.worlds.sumo.simulation import Simulation
 
 NOWHERE = -1
 """the section behind the end of a route"""

@@ -22,7 +22,7 @@ from unjam.scenarios.scenario import Actuation
 from unjam.sumo_files import copy_harmless, stamp_of
 from unjam.worlds.sumo.files import Files
 from unjam.worlds.sumo.library import Backend, close, function_of, library
-from unjam.worlds.sumo.networks import said_in, sumo_program
+from unjam.worlds.sumo.networks import FREE_LINKS, NetworkLane, said_in, sumo_program
 
 SPEED_MODES = {"shielded": 31, "raw": 30, "flow": 25, "cruise": 31}
 """SUMO's speed mode bits for each way of actuation: bit 0 is the check for a safe speed."""
@@ -30,8 +30,6 @@ WITHOUT_RIGHT_OF_WAY = 1
 """the bit that stays where vehicles need not obey the right of way: who is surprised stops as it must"""
 LIMITS_OF_ACCELERATION = 2 | 4
 """the bits by which vehicles keep to the acceleration and the braking of their type"""
-FREE_LINKS = "MZ-"
-"""states of connections that no vehicle waits at: with the right of way, a zipper merge, a dead end"""
 _exhaust = deque(maxlen=0).extend
 """runs through an iterator, in C: a loop would cost as much as the calls"""
 _open: "Simulation | None" = None
@@ -48,19 +46,6 @@ class Neighbours(NamedTuple):
     leader_gap: float
     follower_speed: float
     follower_gap: float
-
-
-class NetworkLane(NamedTuple):
-    """A lane of a network that is no junction's: its edge, its length [m], what it allows [m/s]."""
-
-    name: str
-    edge: str
-    length: float
-    speed: float
-    leads_to: tuple[str, ...]
-    """lanes of the next edges"""
-    has_stop_line: bool = False
-    """whether vehicles may have to wait at its end: at a signal, a stop sign, or to give way"""
 
 
 class Simulation:
