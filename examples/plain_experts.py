@@ -153,8 +153,7 @@ def cruise(p: Any, s: State, m: Any) -> float:
 def jam_ahead(p: Any, s: State, m: Any) -> float:
     told = (s.road_speeds if p.all_lanes else s.lane_speeds)[p.first : p.last + 1]
     ahead = sum(told) / len(told) if told else math.inf
-    jammed = ahead < getattr(p, "jam", 0.75) * s.allowed_speed
-    if not told or not (jammed if math.isnan(s.to_merge) else s.to_merge > 0.0):
+    if not told or not s.to_merge > 0.0:  # NaN without a map: it would need a report of congestion
         return cruise(p, s, m)
     wanted = ahead + p.margin + p.margin_by_share * s.cav_share
     cap = min(max(wanted, p.lowest), s.allowed_speed)

@@ -154,8 +154,8 @@ def _write(studies: StudyFolder, seeds: int, folder: Path, workers: int) -> None
 
 def _is_open(found: Mapping[str, Any], rate: float) -> bool:
     """Return whether more seeds are needed, and allowed."""
-    judged = _judgment(found, rate)
-    return judged.verdict == UNDECIDED and judged.time.count < MOST_SEEDS
+    driven = len(found["rows"].get(_label(ACC, rate), ()))
+    return driven < MOST_SEEDS and _judgment(found, rate).verdict == UNDECIDED
 
 
 def _drive_batch(
