@@ -117,7 +117,7 @@ def test_few_slow_vehicles_are_no_congestion() -> None:
 
 
 def test_each_section_is_judged_by_itself_and_an_empty_one_is_free() -> None:
-    monitor = CongestionMonitor(3, 1.0)
+    monitor, found = CongestionMonitor(3, 1.0), np.zeros(3, bool)
     for step in range(900):
         counts = np.array([2.0, 2.0 if step < 600 else 9.0, 0.0])
         found = monitor.update(counts, counts * [25.0, 25.0 if step < 600 else 4.0, 0.0])

@@ -164,7 +164,7 @@ def write_road(road: HarmRoad, folder: Path) -> Path:
         if before:
             more = stretch.lanes - before.lanes
             pairs = [(lane, lane + more) for lane in range(before.lanes) if lane + more >= 0]
-            links += [_link(main[number - 1], main[number], *pair) for pair in pairs]
+            links += [_link(main[number - 1], main[number], lane, other) for lane, other in pairs]
         if signal:
             nodes += [_node(f"south{number}", x, y - 300.0), _node(f"north{number}", x, y + 300.0)]
             crossing = [f"in{number}", f"out{number}"]

@@ -114,8 +114,9 @@ class RoadAhead:
         counts, totals = sections.measure(places, speeds)
         means = np.where(counts > 0, totals / counts.clip(1), sections.allowed)
         across = sections.cross_sections
-        congested = self._monitor.update(*(np.bincount(across, each) for each in (counts, totals)))
-        self._messages.send(np.stack([means, congested[across] & sections.monitored]))
+        density, flow = (np.bincount(across, each).astype(np.float64) for each in (counts, totals))
+        congested = self._monitor.update(density, flow)[across] & sections.monitored
+        self._messages.send(np.stack([means, congested.astype(np.float64)]))
 
     def told(self, names: Sequence[str], places: Sequence[tuple[str, float]]) -> dict[str, Floats]:
         """Return what these CAVs are told, by field of a `LocalState`."""
