@@ -8,6 +8,7 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from itertools import product
+from math import nan
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
@@ -137,7 +138,7 @@ def _has_breakdown(found: Mapping[str, Any]) -> bool:
 def _write(studies: StudyFolder, seeds: int, folder: Path, workers: int) -> None:
     """Drive what is missing; what is there stays, unless the controller or the road is another one now."""
     path = folder / RESULTS
-    results: dict[str, Any] = json.loads(path.read_text()) if path.is_file() else {}
+    results = _read_results(path)
     with TemporaryDirectory() as place, Workers(workers) as pool:
         for number, (name, road) in enumerate(HARM_ROADS.items()):
             about = {"controller": file_of(CONTROLLER), "road": json.loads(to_json(asdict(road)))}
@@ -150,6 +151,14 @@ def _write(studies: StudyFolder, seeds: int, folder: Path, workers: int) -> None
                 for label, rows in _drive_batch(file, road, found, rates, pool).items():
                     found["rows"].setdefault(label, []).extend(rows)
                 write_whole(path, to_json(results, indent=1))
+
+
+def _read_results(path: Path) -> dict[str, Any]:
+    """Return what is known of each road; numbers that are null in the file are NaN."""
+    results: dict[str, Any] = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+    for row in (row for found in results.values() for rows in found["rows"].values() for row in rows):
+        row |= {name: nan for name, value in row.items() if value is None}
+    return results
 
 
 def _is_open(found: Mapping[str, Any], rate: float) -> bool:
@@ -187,9 +196,8 @@ def _drive_batch(
 
 def harm_table(folder: Path) -> pd.DataFrame:
     """Return the comparison with the ACC alone and the verdict, for each road and penetration rate."""
-    results = json.loads((folder / RESULTS).read_text(encoding="utf-8"))
     table: Table = []
-    for (name, found), rate in product(results.items(), PENETRATION_RATES):
+    for (name, found), rate in product(_read_results(folder / RESULTS).items(), PENETRATION_RATES):
         road, rows = HARM_ROADS[name], found["rows"]
         acc, own = (rows[_label(driver, rate)] for driver in (ACC, CONTROLLER))
         judged, slow = _judgment(found, rate), [row["breakdown"] for row in rows[PEOPLE]]

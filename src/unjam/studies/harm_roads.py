@@ -170,7 +170,7 @@ def write_road(road: HarmRoad, folder: Path) -> Path:
             crossing = [f"in{number}", f"out{number}"]
             edges.append(_edge(crossing[0], f"south{number}", f"n{number}", SIDE_ROAD))
             edges.append(_edge(crossing[1], f"n{number}", f"north{number}", SIDE_ROAD))
-            links.append(_link(*crossing, 0, 0))
+            links.append(_link(crossing[0], crossing[1], 0, 0))
             routes[f"crossing{number}"] = (crossing, CROSSING_SHARE)
         if stretch.ramp_flow:
             nodes.append(_node(f"ramp{number}", x - 400.0, y - 80.0))
