@@ -28,6 +28,7 @@ class State(NamedTuple):
     beside_gaps: Sequence[float] = ()
     beside_speeds: Sequence[float] = ()
     cav_share: float = 0.0
+    congestion: Sequence[float] = ()
 
 
 def clip(value: float, low: float, high: float) -> float:
@@ -154,6 +155,7 @@ def jam_ahead(p: Any, s: State, m: Any) -> float:
     told = (s.road_speeds if p.all_lanes else s.lane_speeds)[p.first : p.last + 1]
     ahead = sum(told) / len(told) if told else math.inf
     jammed = ahead < getattr(p, "jam", 0.75) * s.allowed_speed
+    jammed = jammed and max(s.congestion[p.first : p.last + 1], default=0.0) >= 0.5
     if not told or not (jammed if math.isnan(s.to_merge) else s.to_merge > 0.0):
         return cruise(p, s, m)
     wanted = ahead + p.margin + p.margin_by_share * s.cav_share

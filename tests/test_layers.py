@@ -224,6 +224,9 @@ BUFFER = "into memory, or to the standard output"
 UNSAFE_BUT = {
     "worlds/sumo/simulation.py: traffic.write_text(files.traffic)": PRIVATE,
     "worlds/sumo/networks.py: (folder / name).write_text(content)": PRIVATE,
+    "studies/do_no_harm.py: files.mkdir()": PRIVATE,
+    "studies/harm_roads.py: (folder / 'road.rou.xml').write_text(_document('routes', traffic))": PRIVATE,
+    "studies/harm_roads.py: path.write_text(_document('configuration', lines))": PRIVATE,
     "sumo_files/program.py: open(copy, 'w', encoding='utf-8')": PRIVATE,
     "reports/film.py: imageio_ffmpeg.write_frames(str(film), (SIZE, SIZE), fps=rate, "
     "ffmpeg_log_level='error')": PRIVATE,

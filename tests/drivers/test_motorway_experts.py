@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
 from tests.conftest import random_network
 from unjam.drivers.local_state import EVERYWHERE, SECTIONS_AHEAD, LocalState, like_ones
@@ -51,10 +52,34 @@ def test_it_never_asks_for_more_than_is_allowed() -> None:
     assert answer(AT_ONCE, 27.9, 40.0) == pytest.approx(0.1)
 
 
-def test_where_no_map_says_where_ramps_join_it_holds_back_for_jams_alone() -> None:
-    jammed, dense = (state(20.0, ahead)._replace(to_merge=None) for ahead in (20.9, 21.1))  # of 28 m/s
-    assert AT_ONCE.act(jammed, {})[0].tolist() == pytest.approx([0.9])
-    assert AT_ONCE.act(dense, {})[0].tolist() == [FREELY]
+def without_map(ahead: float, *congested: int, report: float = 1.0) -> LocalState:
+    """As `state`, on a road of which nobody knows where ramps join, and the sections that are congested."""
+    congestion = np.zeros((1, SECTIONS_AHEAD))
+    congestion[0, list(congested)] = report
+    return state(20.0, ahead)._replace(to_merge=None, congestion=congestion)
+
+
+def test_where_no_map_says_where_ramps_join_it_slows_down_for_reported_congestion_alone() -> None:
+    jam, dense = 20.9, 21.1  # below and above three quarters of 28 m/s
+    assert AT_ONCE.act(without_map(jam, 4), {})[0].tolist() == pytest.approx([0.9])
+    assert AT_ONCE.act(without_map(jam), {})[0].tolist() == [FREELY]
+    assert AT_ONCE.act(without_map(jam, 5), {})[0].tolist() == [FREELY]
+    assert AT_ONCE.act(without_map(dense, 4), {})[0].tolist() == [FREELY]
+    assert AT_ONCE.act(without_map(jam, 4, report=0.4), {})[0].tolist() == [FREELY]
+    assert AT_ONCE.act(without_map(jam, 4)._replace(congestion=None), {})[0].tolist() == [FREELY]
+
+
+def test_where_a_map_says_where_ramps_join_no_report_of_congestion_changes_anything() -> None:
+    mapped = state(20.0, 19.0)
+    reported = mapped._replace(congestion=np.ones((1, SECTIONS_AHEAD)))
+    assert AT_ONCE.act(reported, {})[0].tolist() == AT_ONCE.act(mapped, {})[0].tolist()
+
+
+def test_arrays_and_tensors_of_a_road_without_a_map_have_the_same_answers() -> None:
+    rows = [without_map(ahead, *congested) for ahead in (15.0, 25.0) for congested in ((), (0,), (4, 6))]
+    both = rows[0].each(lambda *values: np.concatenate(values), *rows[1:])
+    tensors = both.each(torch.as_tensor)
+    assert JamAhead().act(tensors, {})[0].tolist() == JamAhead().act(both, {})[0].tolist()
 
 
 def test_behind_the_merge_and_without_a_message_it_holds_nobody_back() -> None:

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from unjam.drivers.local_state import SECTIONS_AHEAD
-from unjam.drivers.roadside import MainRoad, Messages, Roadside
+from unjam.drivers.roadside import CongestionMonitor, MainRoad, Messages, Roadside
+from unjam.physics.idm import IDMParameters, equilibrium_gap
 
 ALLOWED = 30.0
 RAMP, RIGHT, LEFT = 0, 1, 2
@@ -68,3 +69,56 @@ def test_a_lost_message_leaves_the_one_before() -> None:
     assert came[0]
     assert came.mean() == pytest.approx(0.5, abs=0.08)
     assert (np.diff(heard) >= 0).all()
+
+
+HUMANS = IDMParameters(desired_speed=40.0, time_headway=1.5)
+FREE, FULL, JAM = 30.0, 23.0, 5.0
+"""speeds: of calm traffic, near capacity, and in a jam [m/s]"""
+
+
+def observe(monitor: CongestionMonitor, speed: float, seconds: int, density: float | None = None) -> bool:
+    """Whether a section is congested after so long in equilibrium, or at a density [veh/m]."""
+    density = 1.0 / (5.0 + equilibrium_gap(speed, HUMANS)) if density is None else density
+    counts = np.array([100.0 * density])
+    return [bool(monitor.update(counts, counts * speed)[0]) for _ in range(seconds)][-1]
+
+
+def test_flow_that_rises_with_density_is_free_however_slow_it_is() -> None:
+    monitor = CongestionMonitor(1, 1.0)
+    for speed in np.arange(38.0, FULL, -0.5):
+        assert not observe(monitor, float(speed), 60)
+    assert 0.6 * HUMANS.desired_speed > FULL
+    assert not observe(monitor, FREE, 300)
+    assert not observe(monitor, FULL, 300)
+
+
+@pytest.mark.parametrize("before", [FREE, FULL])
+def test_denser_and_much_slower_than_at_the_highest_flow_is_congestion_until_it_has_gone(
+    before: float,
+) -> None:
+    monitor = CongestionMonitor(1, 1.0)
+    assert not observe(monitor, before, 600)
+    assert observe(monitor, JAM, 120)
+    assert observe(monitor, JAM, 3600)
+    assert not observe(monitor, before, 600)
+
+
+def test_what_begins_as_a_jam_is_known_as_one_once_more_flow_was_seen() -> None:
+    monitor = CongestionMonitor(1, 1.0)
+    assert not observe(monitor, JAM, 1800)
+    assert not observe(monitor, FULL, 600)
+    assert observe(monitor, JAM, 300)
+
+
+def test_few_slow_vehicles_are_no_congestion() -> None:
+    monitor = CongestionMonitor(1, 1.0)
+    observe(monitor, FREE, 600)
+    assert not observe(monitor, JAM, 600, density=0.01)
+
+
+def test_each_section_is_judged_by_itself_and_an_empty_one_is_free() -> None:
+    monitor, found = CongestionMonitor(3, 1.0), np.zeros(3, bool)
+    for step in range(900):
+        counts = np.array([2.0, 2.0 if step < 600 else 9.0, 0.0])
+        found = monitor.update(counts, counts * [25.0, 25.0 if step < 600 else 4.0, 0.0])
+    assert found.tolist() == [False, True, False]

@@ -110,7 +110,7 @@ def test_the_plain_reader_compares_itself_with_the_recorded_sample(tmp_path: Pat
     assert compared(path).returncode != 0
 
 
-def test_where_no_map_tells_of_ramps_the_plain_reader_holds_back_for_jams_alone(tmp_path: Path) -> None:
+def test_without_a_map_the_plain_reader_holds_back_for_reported_congestion_alone(tmp_path: Path) -> None:
     states = perceived(700)._replace(to_merge=None)
     driver = named_driver("jam-ahead", 1.0)
     path = shipped(driver, tmp_path / "it.unjam", states, limit=1.5)

@@ -90,6 +90,7 @@ def random_state(generator: np.random.Generator, rows: int, told: bool = False) 
         beside_gaps=beside,
         beside_speeds=generator.uniform(0.0, 30.0, beside.shape),
         cav_share=generator.uniform(0.0, 0.3, rows),
+        congestion=(generator.random((rows, SECTIONS_AHEAD)) < 0.3).astype(float),
     )
 
 

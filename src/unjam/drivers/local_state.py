@@ -50,6 +50,9 @@ class LocalState(NamedTuple):
     """their speeds [m/s]; its own where nobody is"""
     cav_share: Array = None
     """how many of all that have entered so far are CAVs, as a roadside service counts"""
+    congestion: Array = None
+    """whether the sections of `lane_speeds` are congested, as a service reports: (n, SECTIONS_AHEAD);
+    1 or 0, between these where messages are smoothed"""
 
     def each(self, function: Callable[..., Any], *others: "LocalState") -> "LocalState":
         """Return `function` of each quantity, and of the same quantity of the other states."""
@@ -80,7 +83,7 @@ SECTIONS_AHEAD = 11
 SPEED_SCALE = 10.0
 """what speeds are divided by before a network sees them [m/s]"""
 
-_UNITS = ("m/s", "m/s", "m", "m/s", "m", "m", "m", "m", "m/s", "m", "m/s", "m/s", "m", "m/s", "")
+_UNITS = ("m/s", "m/s", "m", "m/s", "m", "m", "m", "m", "m/s", "m", "m/s", "m/s", "m", "m/s", "", "")
 STATE_UNITS = dict(zip(LocalState._fields, _UNITS, strict=True))
 """units of a `LocalState`, in its order"""
 
@@ -91,6 +94,7 @@ BESIDE = ("ahead on the left", "behind on the left", "ahead on the right", "behi
 COLUMNS = {
     "lane_speeds": SECTIONS_AHEAD,
     "road_speeds": SECTIONS_AHEAD,
+    "congestion": SECTIONS_AHEAD,
     "beside_gaps": len(BESIDE),
     "beside_speeds": len(BESIDE),
 }

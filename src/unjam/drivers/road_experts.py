@@ -29,6 +29,8 @@ OVERRUN = 50.0
 """[m] beyond `last_position`, where it waits no longer"""
 FREELY = 100.0
 """acceleration that no ACC has: nothing holds it back [m/s2]"""
+REPORTED = 0.5
+"""from which on a smoothed report says that a section is congested"""
 
 Section = Annotated[int, Field(ge=0, lt=SECTIONS_AHEAD)]
 
@@ -236,6 +238,10 @@ class JamAhead(Formula):
     So it arrives at the tail of a jam hardly faster than the jam moves, keeps room for those who merge, and
     the jam ahead gets less than it lets go. Elsewhere, and where no message says how fast the road ahead is,
     its own ACC drives. It gives way to nobody on purpose: those behind pass where there are lanes.
+
+    Where no map says where ramps join, it slows down only for sections that the roadside service reports as
+    congested: dense free flow may be far slower than a road allows. Without such a report it never does.
+    `congestion` is not in `told`: graphs and manifests describe the road with a map, which does not use it.
     """
 
     name: ClassVar[str] = "jam-ahead"
@@ -260,8 +266,7 @@ class JamAhead(Formula):
     time_constant: Positive = 3.0
     """time over which the cap is reached [s]"""
     jam: Positive = 0.75
-    """share of what is allowed below which the road ahead is jammed, where no map says where ramps join: the
-    cap is for jams alone there"""
+    """share of what is allowed that the mean ahead must be below, too, where no map says where ramps join"""
 
     @model_validator(mode="after")
     def _in_order(self) -> "JamAhead":
@@ -281,8 +286,12 @@ class JamAhead(Formula):
         wanted = ahead + self.margin + self.margin_by_share * share
         cap = xp.minimum(at_least(wanted, self.lowest), state.allowed_speed)
         towards = at_least((cap - state.speed) / self.time_constant, -self.slowing)
-        holds = ahead < self.jam * state.allowed_speed if state.to_merge is None else state.to_merge > 0.0
-        return xp.where(holds, towards, free), memory
+        if state.to_merge is not None:
+            return xp.where(state.to_merge > 0.0, towards, free), memory
+        if state.congestion is None:
+            return free, memory
+        congested = (state.congestion[..., self.first : self.last + 1] >= REPORTED).any(-1)
+        return xp.where(congested & (ahead < self.jam * state.allowed_speed), towards, free), memory
 
 
 @dataclass(frozen=True, config=STRICT)

@@ -48,6 +48,44 @@ class Messages:
             self.arrived = self._late[0]
 
 
+AVERAGING = 60.0
+"""time constant of the mean flow and density of a section [s]; a wave passes 100 m in half a minute"""
+JAM_ENTRY, JAM_EXIT = 0.8, 0.9
+"""shares of the speed at highest flow: below the first a section becomes congested, up to the second it
+remains so"""
+
+
+class CongestionMonitor:
+    """Tells congestion from free flow in each section, by the highest flow that the section has carried.
+
+    While traffic flows freely, flow rises with density, also where all drive far below the speed limit. A
+    section is congested once it is denser and much slower than it was at its highest flow. Where an episode
+    begins in a jam, the jam has the highest flow, and nothing is congested before more flow is seen.
+    """
+
+    def __init__(self, sections: int, step: float) -> None:
+        """Begin with empty sections; `step` is the time between two measurements [s]."""
+        self._new = 1.0 - exp(-step / AVERAGING)
+        self._density, self._flow, self._critical_density, self._highest_flow = np.zeros((4, sections))
+        self._congested = np.zeros(sections, bool)
+
+    def update(self, counts: Floats, speed_sums: Floats) -> NDArray[np.bool_]:
+        """Return which sections are congested, after one more measurement of their vehicles.
+
+        Densities are in vehicles of a section, and flows their speeds' sums [m/s]: only ratios matter.
+        """
+        self._density += self._new * (counts - self._density)
+        self._flow += self._new * (speed_sums - self._flow)
+        higher = self._flow > self._highest_flow
+        self._highest_flow = np.where(higher, self._flow, self._highest_flow)
+        self._critical_density = np.where(higher, self._density, self._critical_density)
+        share = np.where(self._congested, JAM_EXIT, JAM_ENTRY)
+        # speed < share * speed at highest flow, without a division by empty sections
+        slower = self._flow * self._critical_density < share * self._highest_flow * self._density
+        self._congested = slower & (self._density > self._critical_density)
+        return self._congested
+
+
 class MainRoad:
     """The sections of a main road and of its ramps by way, and which of them lie ahead."""
 

@@ -56,7 +56,7 @@ class OwnNetwork(Scenario):
     closed: ClassVar[bool] = False
     has_coordinate: ClassVar[bool] = False
     has_vehicle_types: ClassVar[bool] = True
-    tells: ClassVar[tuple[str, ...]] = ("allowed_speed", "lane_speeds", "cav_share")
+    tells: ClassVar[tuple[str, ...]] = ("allowed_speed", "lane_speeds", "cav_share", "congestion")
 
     file: str = ""
     """the .sumocfg file"""

@@ -2,6 +2,7 @@
 
 from unjam.studies.adaptation import ADAPTATION
 from unjam.studies.comparison import FIGURE_5, comparison_of
+from unjam.studies.do_no_harm import DO_NO_HARM
 from unjam.studies.drivable import (
     DRIVABLE_EIGHT,
     DRIVABLE_JAMMED,
@@ -65,6 +66,7 @@ STUDIES: dict[str, Study] = {
     "on-ramp-trained": ramp_trained({"ramp-long": "residual on the one tuned longer"}),
     "on-ramp-in-turn": ramp_trained({"ramp-in-turn": "residual on unjam:on-ramp-tuned, learned in turn"}),
     "envelope": ENVELOPE,
+    "do-no-harm": DO_NO_HARM,
     "everywhere": EVERYWHERE_STUDY,
     "adaptation": ADAPTATION,
     "rings": trained_together(

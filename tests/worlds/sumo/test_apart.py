@@ -46,7 +46,7 @@ def test_an_episode_is_the_same_wherever_sumo_runs(road: Scenario, simulation: S
 def test_all_that_is_asked_of_a_simulation_is_answered_alike(road: Scenario, simulation: Simulation) -> None:
     asked = [(name, of) for name, of in vars(Simulation).items() if not name.startswith("_") and callable(of)]
     told = {"load", "step", "close", "command_speeds", "replace_speeds", "command_people"}
-    told |= {"take_control", "change_type", "end_with_trips", "is_in_contact"}
+    told |= {"take_control", "change_type", "end_with_trips", "is_in_contact", "teleport_count", "finish"}
     answers = []
     with SimulationApart() as apart:
         for each in (simulation, apart):

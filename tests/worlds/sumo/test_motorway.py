@@ -271,5 +271,6 @@ def test_a_cav_that_is_held_back_still_brakes_as_hard_as_its_own_acc_must(simula
     road = OnRamp(cav_share=0.3, horizon=800)
     episode = run_episode(road, AdaptiveACC(time_step=1.0), (2,), simulation=simulation)
     assert (episode.status, episode.collisions) == ("completed", 0)
+    assert road.cruise.deceleration is not None
     assert episode.audit.cavs.hardest > road.cruise.deceleration + 0.1
     assert episode.audit.cavs.beyond[1] == 0

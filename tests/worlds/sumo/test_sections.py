@@ -8,17 +8,19 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.worlds.sumo.own_roads import straight
+from tests.worlds.sumo.own_roads import grid, straight
 from unjam.drivers.command import Command
 from unjam.drivers.local_state import SECTIONS_AHEAD, LocalState
 from unjam.drivers.road_experts import Cruise, JamAhead
 from unjam.drivers.roadside import Roadside
 from unjam.scenarios import make_scenario
+from unjam.studies.harm_roads import HARM_ROADS, write_road
 from unjam.worlds.episode import run_episode
 from unjam.worlds.sumo import make_traffic
+from unjam.worlds.sumo.networks import NetworkLane
 from unjam.worlds.sumo.own import OwnTraffic
 from unjam.worlds.sumo.sections import NOWHERE, LaneSections
-from unjam.worlds.sumo.simulation import NetworkLane, Simulation
+from unjam.worlds.sumo.simulation import Simulation
 
 LANES = [
     NetworkLane("a_0", "a", 250.0, 20.0, ("b_0", "ramp_0")),
@@ -48,10 +50,14 @@ def numbered(sections: LaneSections) -> dict[int, str]:
     return {number: lane.name for number, lane in enumerate(cells)} | {NOWHERE: ""}
 
 
-def test_the_mean_of_each_section_is_of_those_in_it_and_junctions_are_none(sections: LaneSections) -> None:
+def test_vehicles_are_counted_in_the_sections_of_their_lanes_and_not_in_junctions(
+    sections: LaneSections,
+) -> None:
     places = [("a_0", 0.0), ("a_0", 99.0), ("a_0", 100.0), ("b_1", 330.0), (":node_0", 3.0), ("", 0.0)]
-    means = sections.means(places, np.array([4.0, 6.0, 9.0, 2.0, 1.0, 1.0]))
-    assert means.tolist() == [5.0, 9.0, 20.0, *[20.0] * 3, *[25.0] * 4, *[25.0] * 3, 2.0, 10.0]
+    counts, speed_sums = sections.measure(places, np.array([4.0, 6.0, 9.0, 2.0, 1.0, 1.0]))
+    assert counts.tolist() == [2.0, 1.0, *[0.0] * 11, 1.0, 0.0]
+    assert speed_sums.tolist() == [10.0, 9.0, *[0.0] * 11, 2.0, 0.0]
+    assert sections.allowed.tolist() == [*[20.0] * 6, *[25.0] * 8, 10.0]
 
 
 def test_the_sections_ahead_follow_the_lanes_that_lead_along_the_route(sections: LaneSections) -> None:
@@ -60,6 +66,46 @@ def test_the_sections_ahead_follow_the_lanes_that_lead_along_the_route(sections:
     assert [names[each] for each in ahead] == ["a_1"] * 2 + ["b_1"] * 4 + [""] * (SECTIONS_AHEAD - 6)
     assert len(set(ahead)) == 7
     assert [names[each] for each in sections.ahead("a_0", 240.0, ("a", "ramp"))][:3] == ["a_0", "ramp_0", ""]
+
+
+def test_the_lanes_of_an_edge_share_their_cross_sections(sections: LaneSections) -> None:
+    assert sections.cross_sections.tolist() == [0, 1, 2, 0, 1, 2, 3, 4, 5, 6, 3, 4, 5, 6, 7]
+
+
+def monitored(length: float, *, stop_line: bool) -> list[bool]:
+    """Of two lanes of 600 m and of a `length`, one after the other: which sections are monitored."""
+    lanes = [
+        NetworkLane("a_0", "a", 600.0, 20.0, ("b_0",)),
+        NetworkLane("b_0", "b", length, 20.0, (), stop_line),
+    ]
+    simulation: Any = SimpleNamespace(lanes=lambda: lanes)
+    return LaneSections(simulation).monitored.tolist()
+
+
+def test_before_a_stop_line_no_congestion_is_reported_as_far_as_its_queue_may_reach() -> None:
+    assert monitored(600.0, stop_line=False) == [True] * 12
+    assert monitored(600.0, stop_line=True) == [True] * 2 + [False] * 10
+    assert monitored(1200.0, stop_line=True) == [True] * 8 + [False] * 10
+
+
+def test_of_a_section_too_short_for_a_mean_no_congestion_is_reported() -> None:
+    assert monitored(649.0, stop_line=False) == [True] * 12 + [False]
+    assert monitored(651.0, stop_line=False) == [True] * 13
+
+
+@pytest.mark.parametrize("kind", ["traffic_light", "priority", "right_before_left"])
+def test_queues_at_signals_and_at_right_of_way_are_no_congestion(
+    kind: str, tmp_path: Path, simulation: Simulation
+) -> None:
+    scenario = make_scenario(str(grid(tmp_path, kind)), {"cav_share": 0.3})
+    make_traffic(scenario, (1,), simulation)
+    assert not LaneSections(simulation).monitored.any()
+
+
+def test_a_motorway_is_monitored_where_ramps_join_and_leave(tmp_path: Path, simulation: Simulation) -> None:
+    file = write_road(HARM_ROADS["on-ramp with reserve"], tmp_path)
+    make_traffic(make_scenario(str(file), {"cav_share": 0.1}), (1,), simulation)
+    assert LaneSections(simulation).monitored.mean() > 0.95, "all but pieces of a few meters"
 
 
 def test_who_must_change_lanes_is_told_of_the_lane_beside(sections: LaneSections) -> None:
@@ -109,15 +155,36 @@ def test_a_function_of_ones_own_is_told_too(jammed: Any, simulation: Simulation)
     assert episode.trajectories[0].states.speed[-1] < 8.0
 
 
-def test_a_cav_slows_down_for_a_jam_that_it_cannot_see(jammed: Any, simulation: Simulation) -> None:
+QUEUE = (
+    '<flow id="before" type="car" route="along" begin="0" end="200" period="3" departSpeed="15"/>'
+    '<vehicle id="broken" type="car" route="along" depart="201" departSpeed="15">'
+    '<stop lane="road_0" endPos="1900" duration="200"/></vehicle>'
+    '<flow id="behind" type="car" route="along" begin="204" end="320" period="4" departSpeed="15"/>'
+    '<vehicle id="cav" type="van" route="along" depart="400" departSpeed="15"/>'
+)
+"""free flow, then a vehicle that stands and a queue behind it, and a CAV that arrives"""
+
+
+@pytest.mark.long
+def test_a_cav_slows_down_for_congestion_that_it_cannot_see(tmp_path: Path, simulation: Simulation) -> None:
+    changes = {"cav_types": ("van",), "horizon": 5000, "actuation": "cruise", "safety.active": False}
+    scenario = make_scenario(str(straight(tmp_path, QUEUE, 2500.0, 500.0)), changes)
     careful, free = (
-        run_episode(jammed, driver, (1,), simulation=simulation)
+        run_episode(scenario, driver, (1,), simulation=simulation).trajectories[0].states
         for driver in (JamAhead(first=4, last=4, margin=0.0, margin_by_share=0.0), Cruise())
     )
-    seen = careful.trajectories[0].states
-    assert seen.leader_gap.min() == 100.0
-    assert seen.speed[-1] == pytest.approx(6.0, abs=0.5)
-    assert free.trajectories[0].states.speed[-1] > 12.0
+    slowest, of_acc = (states.speed[10:][states.leader_gap[10:] == 100.0].min() for states in (careful, free))
+    assert careful.congestion.max() == 1.0
+    assert slowest < 10.0
+    assert of_acc > 14.0
+
+
+def test_an_episode_that_begins_in_a_jam_holds_no_cav_back(jammed: Any, simulation: Simulation) -> None:
+    first, second = (
+        run_episode(jammed, driver, (1,), simulation=simulation).trajectories[0].states
+        for driver in (JamAhead(first=4, last=4, margin=0.0, margin_by_share=0.0), Cruise())
+    )
+    assert first.speed.tolist() == second.speed.tolist()
 
 
 def test_a_message_of_ones_own_road_is_late_as_asked(jammed: Any, simulation: Simulation) -> None:

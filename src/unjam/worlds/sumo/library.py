@@ -196,17 +196,6 @@ class Neighbours(NamedTuple):
     follower_gap: float
 
 
-class NetworkLane(NamedTuple):
-    """A lane of a network that is no junction's: its edge, its length [m], what it allows [m/s]."""
-
-    name: str
-    edge: str
-    length: float
-    speed: float
-    leads_to: tuple[str, ...]
-    """lanes of the next edges"""
-
-
 def close(sumo: Any) -> None:
     """End a simulation; one that is gone already is no error."""
     with suppress(Exception):

@@ -34,6 +34,21 @@ Attributes = dict[str, Any]
 """of an XML element"""
 _whole: dict[Path, tuple[int, int]] = {}
 """networks in the cache that this process has found whole, with their stamps"""
+FREE_LINKS = "MZ-"
+"""states of connections that no vehicle waits at: with the right of way, a zipper merge, a dead end"""
+
+
+class NetworkLane(NamedTuple):
+    """A lane of a network that is no junction's: its edge, its length [m], what it allows [m/s]."""
+
+    name: str
+    edge: str
+    length: float
+    speed: float
+    leads_to: tuple[str, ...]
+    """lanes of the next edges"""
+    has_stop_line: bool = False
+    """whether vehicles may have to wait at its end: at a signal, a stop sign, or to give way"""
 
 
 @cache
@@ -106,7 +121,7 @@ def network_file(network: RoadNetwork) -> Path:
                 remove(left)
     try:
         with PrivateFolder() as folder:
-            made = _netconvert(files, options, Path(folder)).read_bytes()
+            made = netconvert(files, options, Path(folder)).read_bytes()
     except OSError as error:
         raise (disk_error(error, "a temporary file") if error.errno in DISK_ERRNOS else error) from None
     write_whole(target, made + seal(made))  # whole or not at all, also with several workers at it
@@ -176,7 +191,12 @@ def element(tag: str, /, **attributes: Any) -> str:
     return f"<{tag} {' '.join(pairs)}/>"
 
 
-def _netconvert(files: dict[tuple[str, str], str], options: list[str], folder: Path) -> Path:
+def netconvert(files: dict[tuple[str, str], str], options: list[str], folder: Path) -> Path:
+    """Return the network that netconvert makes in a folder of files by (option, name), and further options.
+
+    Raises:
+        EpisodeError: netconvert refuses them; with its own words.
+    """
     made = folder / "road.net.xml"
     for (_, name), content in files.items():
         (folder / name).write_text(content)

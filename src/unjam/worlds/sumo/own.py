@@ -49,7 +49,7 @@ class OwnTraffic(LaneTraffic[OwnRoad]):
         if "lane_speeds" in self.asked:
             step = self.scenario.decision_step
             messages = Messages(self.road.roadside, step, self._noise_generator)
-            self._service = RoadAhead(self._simulation, messages)
+            self._service = RoadAhead(self._simulation, messages, step)
         self._fuel_every = max(1, int(FUEL_SECONDS / self.scenario.decision_step))
         super().start(controlled, on_progress)
 

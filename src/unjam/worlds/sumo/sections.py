@@ -1,18 +1,24 @@
 """The lanes of a user's network in sections, and what a service tells CAVs of those ahead on their routes."""
 
 from collections.abc import Sequence
+from heapq import heapify, heappop, heappush
 from itertools import accumulate, pairwise
 from math import ceil, inf
 
 import numpy as np
 
 from unjam.drivers.local_state import SECTION, SECTIONS_AHEAD
-from unjam.drivers.roadside import Messages
+from unjam.drivers.roadside import CongestionMonitor, Messages
 from unjam.physics.arrays import Floats
+from unjam.worlds.sumo.networks import NetworkLane
 from unjam.worlds.sumo.simulation import Simulation
 
 NOWHERE = -1
 """the section behind the end of a route"""
+QUEUE_REACH = 1000.0
+"""before a stop line, slow vehicles may be its queue: no congestion is reported there [m]"""
+SHORTEST_MONITORED = 50.0
+"""of a shorter section too few vehicles are measured to tell congestion from free flow [m]"""
 
 
 class LaneSections:
@@ -25,23 +31,37 @@ class LaneSections:
         firsts = [0, *accumulate(counts)]
         self._ends = dict(zip(self._lanes, pairwise(firsts), strict=True))
         """of each lane the number of its first section, and of the next lane's"""
-        self.allowed: Floats = np.repeat([lane.speed for lane in self._lanes.values()], counts)
+        pieces = [
+            (lane, number)
+            for lane, count in zip(self._lanes.values(), counts, strict=True)
+            for number in range(count)
+        ]
+        self.allowed: Floats = np.array([lane.speed for lane, _ in pieces])
         """what each section allows [m/s]"""
+        rows: dict[tuple[str, int], int] = {}
+        self.cross_sections = np.array(
+            [rows.setdefault((lane.edge, number), len(rows)) for lane, number in pieces], np.intp
+        )
+        """of each section a number that it shares with those of the adjacent lanes"""
+        to_stop_line = distances_to_stop_lines(self._lanes)
+        rest = np.array([lane.length - SECTION * number for lane, number in pieces])
+        way = np.array([to_stop_line.get(lane.name, inf) for lane, _ in pieces])
+        self.monitored = (rest >= SHORTEST_MONITORED) & (rest + way > QUEUE_REACH)
+        """whether congestion is reported of a section"""
 
     def __contains__(self, lane: str) -> bool:
         """Whether a lane is no junction's."""
         return lane in self._lanes
 
-    def means(self, places: Sequence[tuple[str, float]], speeds: Floats) -> Floats:
-        """Return the mean speed in each section; where nobody is, what it allows [m/s].
+    def measure(self, places: Sequence[tuple[str, float]], speeds: Floats) -> tuple[Floats, Floats]:
+        """Return the number of vehicles in each section, and the sum of their speeds [m/s].
 
         Of each vehicle: its lane and how far along it is [m], and its speed.
         """
         count = len(self.allowed)
         cells = [self._section(*place) if place[0] in self._ends else count for place in places]
-        there = np.bincount(cells, minlength=count + 1)[:count]
-        total = np.bincount(cells, speeds, minlength=count + 1)[:count]
-        return np.where(there > 0, total / there.clip(1), self.allowed)
+        there, total = (np.bincount(cells, weight, count + 1)[:count] for weight in (None, speeds))
+        return there.astype(np.float64), total.astype(np.float64)
 
     def ahead(self, lane: str, along: float, route: Sequence[str]) -> list[int]:
         """Return the sections ahead, that of the vehicle first; `route` has its edge and those that follow.
@@ -79,9 +99,10 @@ class LaneSections:
 class RoadAhead:
     """What CAVs are told of the road ahead; in a junction, of that before which they last were in a lane."""
 
-    def __init__(self, simulation: Simulation, messages: Messages) -> None:
-        """Begin where nothing was measured yet."""
+    def __init__(self, simulation: Simulation, messages: Messages, step: float) -> None:
+        """Begin where nothing was measured yet; `step` is the time between two measurements [s]."""
         self._simulation, self._messages, self._sections = simulation, messages, LaneSections(simulation)
+        self._monitor = CongestionMonitor(1 + int(self._sections.cross_sections.max()), step)
         self._last: dict[str, list[int]] = {}
         """of each CAV the sections ahead when it was last in a lane"""
         self._wishes: dict[str, tuple[float, float]] = {}
@@ -89,7 +110,13 @@ class RoadAhead:
 
     def measure(self, places: Sequence[tuple[str, float]], speeds: Floats) -> None:
         """Take where everybody is, in which lane and how far along it [m], and how fast."""
-        self._messages.send(self._sections.means(places, speeds))
+        sections = self._sections
+        counts, totals = sections.measure(places, speeds)
+        means = np.where(counts > 0, totals / counts.clip(1), sections.allowed)
+        across = sections.cross_sections
+        density, flow = (np.bincount(across, each).astype(np.float64) for each in (counts, totals))
+        congested = self._monitor.update(density, flow)[across] & sections.monitored
+        self._messages.send(np.stack([means, congested.astype(np.float64)]))
 
     def told(self, names: Sequence[str], places: Sequence[tuple[str, float]]) -> dict[str, Floats]:
         """Return what these CAVs are told, by field of a `LocalState`."""
@@ -97,8 +124,8 @@ class RoadAhead:
         for name, place, way in zip(names, places, self._simulation.ways(names), strict=True):
             if place[0] in sections:
                 self._last[name] = sections.ahead(*place, way)
-        beyond = [NOWHERE] * SECTIONS_AHEAD
-        ahead = np.array([self._last.get(name, beyond) for name in names], np.intp).reshape(
+        unknown = [NOWHERE] * SECTIONS_AHEAD
+        ahead = np.array([self._last.get(name, unknown) for name in names], np.intp).reshape(
             -1, SECTIONS_AHEAD
         )
         new = [name for name in names if name not in wishes]
@@ -106,5 +133,29 @@ class RoadAhead:
         factors, fastest = np.array([wishes[name] for name in names]).reshape(-1, 2).T
         legal = np.where(ahead[:, 0] == NOWHERE, inf, sections.allowed[ahead[:, 0]])
         allowed = np.minimum(legal * factors, fastest)
-        speeds = np.where(ahead == NOWHERE, allowed[:, None], self._messages.arrived[ahead])
-        return {"allowed_speed": allowed, "lane_speeds": speeds}
+        means, congestion = self._messages.arrived[:, ahead]
+        beyond = ahead == NOWHERE
+        speeds = np.where(beyond, allowed[:, None], means)
+        return {
+            "allowed_speed": allowed,
+            "lane_speeds": speeds,
+            "congestion": np.where(beyond, 0.0, congestion),
+        }
+
+
+def distances_to_stop_lines(lanes: dict[str, NetworkLane]) -> dict[str, float]:
+    """Return how far the end of a lane is before the nearest stop line that it leads to [m], by lane."""
+    before: dict[str, list[str]] = {}
+    for lane in lanes.values():
+        for following in lane.leads_to:
+            before.setdefault(following, []).append(lane.name)
+    found: dict[str, float] = {}
+    nearest = [(0.0, lane.name) for lane in lanes.values() if lane.has_stop_line]
+    heapify(nearest)
+    while nearest:
+        way, name = heappop(nearest)
+        if name not in found and way < QUEUE_REACH:
+            found[name] = way
+            for other in before.get(name, ()):
+                heappush(nearest, (way + lanes[name].length, other))
+    return found

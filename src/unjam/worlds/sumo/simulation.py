@@ -19,8 +19,8 @@ from unjam.sumo_files import copy_harmless, stamp_of
 from unjam.worlds.record import SumoWarning
 from unjam.worlds.sumo.control import VehicleControl
 from unjam.worlds.sumo.files import Files
-from unjam.worlds.sumo.library import Backend, Libsumo, Neighbours, NetworkLane, Traci, function_of
-from unjam.worlds.sumo.networks import said_in, sumo_program
+from unjam.worlds.sumo.library import Backend, Libsumo, Neighbours, Traci, function_of
+from unjam.worlds.sumo.networks import FREE_LINKS, NetworkLane, said_in, sumo_program
 from unjam.worlds.sumo.tripinfo import read_trips, trip_options
 from unjam.worlds.sumo.warnings_log import LIMIT_OF_EXAMPLES, read_warnings
 from unjam.worlds.trips import Trips
@@ -190,9 +190,11 @@ class Simulation(VehicleControl):
         """Return all lanes of the network but those of junctions."""
         lane = self._sumo.lane
         names = [name for name in lane.getIDList() if not name.startswith(":")]
-        links = [tuple(link[0] for link in lane.getLinks(name)) for name in names]
+        links = [lane.getLinks(name) for name in names]
+        leads_to = (tuple(link[0] for link in each) for each in links)
+        stops = (any(link[5] not in FREE_LINKS for link in each) for each in links)
         facts = map(lane.getEdgeID, names), map(lane.getLength, names), map(lane.getMaxSpeed, names)
-        return list(map(NetworkLane, names, *facts, links))
+        return list(map(NetworkLane, names, *facts, leads_to, stops))
 
     def lane_places(self, ids: Sequence[str]) -> list[tuple[str, float]]:
         """Return in which lane each of `ids` is, and how far along it [m]."""
