@@ -8,8 +8,11 @@ import pytest
 
 import unjam as package
 from tests.system.conftest import Run
-from tests.worlds.sumo.own_roads import LATE, STANDING, TELEPORTS, UNSORTED, crossing, straight
+from tests.worlds.sumo.own_roads import LATE, STANDING, TELEPORTS, UNSORTED, crossing, straight, two_way
+from unjam.controller import make_driver
 from unjam.errors import InputError
+from unjam.scenarios import make_scenario
+from unjam.worlds.episode import run_episode
 
 IGNORED = "demand is missing, SUMO warns: Route file should be sorted by departure time, ignoring 'c'!"
 NONE_ENTERED = "no vehicle entered before 60 s; the first departs at 25,200 s; use --begin 25200"
@@ -101,3 +104,20 @@ def test_a_limit_of_teleports_ends_episodes_and_assess_refuses_such_a_baseline(
     assert refused.returncode == 2
     assert f"unjam: human: {STOPPED}; allowed: 5 %" in refused.stderr
     assert not (tmp_path / "answer").exists()
+
+
+@pytest.mark.long
+def test_contact_of_cavs_is_recorded_for_the_verdict_without_ending_the_episode(
+    unjam: Run, tmp_path: Path
+) -> None:
+    two_way(tmp_path)
+    drive = ("drive", "my.sumocfg", "--cav-share", 0.9, "-d", "acc", "-n", 2, "--no-report")
+    found = document(unjam, *drive, "--set", "actuation=raw", "--set", "safety.active=false")
+    rows = found["episodes"]
+    assert {row["status"] for row in rows} == {"completed"}
+    assert found["ended_early"] == {}
+    assert sum(row["contacts"] for row in rows) > 0
+    file, driver = str(tmp_path / "my.sumocfg"), make_driver("acc", 0.5)
+    changes = {"cav_share": 0.9, "actuation": "raw", "safety.active": False}
+    trained = run_episode(make_scenario(file, changes), driver, rows[0]["seed"])
+    assert trained.status == "collision"

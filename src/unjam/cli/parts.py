@@ -95,7 +95,7 @@ def _common_facts(scenario: Any) -> list[tuple[str, str]]:
     from unjam.scenarios.own_network import OwnNetwork
 
     warmup, seconds = scenario.warmup, scenario.warmup * scenario.simulation_step
-    ends = "a collision of a CAV" if isinstance(scenario, OwnNetwork) else "a collision"
+    ends = "in training, a collision of a CAV" if isinstance(scenario, OwnNetwork) else "a collision"
     return [
         ("episode", f"{scenario.horizon:,} decisions of {scenario.decision_step:g} s; {ends} ends it"),
         ("warm-up", f"{warmup} all-human steps ({seconds:g} s), before control, not counted"),

@@ -140,6 +140,7 @@ def drivable(row: dict[str, Any], people_alone: float | None = None) -> str:
     smallest = SMALLEST_WITH_LANES if lanes else FLOOR_MET * floor
     checks = [
         (row["status"] == "collision", f"{row['collisions']:.0f} vehicles in contact"),
+        ((contacts := row.get("contacts", 0)) > 0, f"{contacts} CAVs in contact"),
         (
             row["min_headway"] < smallest - TOLERANCE,
             f"follows at {row['min_headway']:.2f} s (floor {floor:g} s)",

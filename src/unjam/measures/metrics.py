@@ -338,7 +338,8 @@ def measure(episode: Episode) -> dict[str, Any]:
     """
     row = {
         "seed": episode.seed[0] if len(episode.seed) == 1 else list(episode.seed),
-        **{name: getattr(episode, name) for name in ("status", "reason", "error", "steps", "teleports")},
+        **{name: getattr(episode, name) for name in ("status", "reason", "error", "steps")},
+        **{"teleports": episode.teleports, "contacts": episode.contacts},
         "warnings": [asdict(each) for each in episode.warnings],
         "vehicles": len(episode.vehicle_ids),
         **episode.drawn,

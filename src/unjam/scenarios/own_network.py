@@ -47,8 +47,8 @@ class OwnNetwork(Scenario):
 
     Roads with several lanes, signals, and routes that end are fine. A vehicle becomes a CAV at the first
     decision after it entered; SUMO still chooses its lane and obeys signals. Its neighbours are SUMO's.
-    Collisions are what SUMO counts with the user's settings; one with a CAV ends an episode, as does SUMO's
-    `max-num-teleports`.
+    Collisions are what SUMO counts with the user's settings; one with a CAV ends an episode in training, and
+    SUMO's `max-num-teleports` always does.
     """
 
     title: ClassVar[str] = "own-network"

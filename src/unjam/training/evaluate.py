@@ -86,7 +86,8 @@ def evaluate_each(
     An episode of each is kept for pictures; not so where none are `pictured`, for it needs much memory.
     """
     pairs = [(label, index) for index in range(len(seeds)) for label in drivers]
-    tasks = [EpisodeTask(*drivers[label], seeds[index], reward, full=True) for label, index in pairs]
+    how: dict[str, Any] = {"reward": reward, "full": True, "stop_at_contact": False}
+    tasks = [EpisodeTask(*drivers[label], seeds[index], **how) for label, index in pairs]
 
     def on_progress(task: int, steps: int) -> None:
         if progress is not None:
@@ -137,6 +138,7 @@ def _driven_here(
                     *(task.scenario, task.driver, task.seed, task.reward, task.explore, task.full),
                     simulation=simulation,
                     progress=partial(on_progress, index),
+                    stop_at_contact=task.stop_at_contact,
                 ),
             )
             for index, task in left.items()

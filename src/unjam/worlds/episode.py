@@ -47,11 +47,12 @@ def run_episode(
     full: bool = False,
     simulation: Simulation | None = None,
     progress: OnProgress | None = None,
+    stop_at_contact: bool = True,
 ) -> Episode:
     """Run one episode and return all of it.
 
-    The result depends on scenario, driver, seed, reward and `explore` alone: not on the process, on what
-    ran in it before, or on the clock.
+    The result depends on scenario, driver, seed, reward, `explore` and `stop_at_contact` alone: not on the
+    process, on what ran in it before, or on the clock.
 
     Args:
         scenario: road, traffic and horizon.
@@ -65,6 +66,8 @@ def run_episode(
             its own on a network of your own, which may neither write nor listen, and, with a warning, where
             libsumo already holds a simulation in this process, yours or unjam's.
         progress: called now and then with the number of decisions made.
+        stop_at_contact: whether contact of a CAV ends an episode on a network of your own, as in training.
+            Otherwise the traffic goes on as plain SUMO's would, and the contact is recorded.
 
     Raises:
         InputError: driver or reward answer something that is not finite, or of a wrong shape.
@@ -77,18 +80,20 @@ def run_episode(
     paid = make_reward(reward or scenario.reward)
     if simulation is None:
         with simulation_for(scenario) as simulation:
-            return run_episode(scenario, driver, seed, reward, explore, full, simulation, progress)
+            how = (reward, explore, full, simulation, progress, stop_at_contact)
+            return run_episode(scenario, driver, seed, *how)
     if not simulation.in_use.acquire(blocking=False):
         raise UnjamError("simulation: an episode is running in it; allowed: one at a time")
     try:
         traffic = make_traffic(scenario, seed, simulation, driver.plain_numbers, full, driver.asks)
+        traffic.stop_at_contact = stop_at_contact
         episode = drive(traffic, driver, explore, on_progress=progress)
+        episode = replace(episode, warnings=simulation.finish())
     except Exception:
         simulation.check()  # or other code's changes would be reported as an error of SUMO
         raise
     finally:
         simulation.in_use.release()
-    episode = replace(episode, warnings=simulation.finish())
     if isinstance(scenario, OwnNetwork):
         scenario.check_vehicles(bool(episode.vehicle_ids), [each.example for each in episode.warnings])
     check_cavs_drove(episode, driver)

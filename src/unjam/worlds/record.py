@@ -162,6 +162,8 @@ class Episode:
     """where vehicles are is kept of every so many-th moment: not of all where many drive for long"""
     collisions: int = 0
     """vehicles that collided: on a built-in road by contact, on a user's network as its settings say"""
+    contacts: int = 0
+    """CAVs that were in contact with another vehicle on a user's network; on other roads contact ends it"""
     speeds: Floats = field(default_factory=lambda: np.zeros((1, 0)))
     """[m/s], shape (T + 1, N); NaN where a vehicle is not on the road"""
     positions: Floats = field(default_factory=lambda: np.zeros((1, 0)))

@@ -70,7 +70,7 @@ def _run(facts: dict[str, Any], arrays: Arrays, simulation: Simulation, answers:
     if isinstance(scenario, OwnNetwork):
         give_up_rights()
     driver = driver_from_recipe(facts["driver"], arrays)
-    how = {name: facts[name] for name in ("seed", "reward", "explore", "full")}
+    how = {name: facts[name] for name in ("seed", "reward", "explore", "full", "stop_at_contact")}
     return run_episode(scenario, driver, **how, simulation=simulation, progress=progress)
 
 

@@ -41,11 +41,13 @@ class EpisodeTask:
     reward: str = ""
     explore: float = 0.0
     full: bool = False
+    stop_at_contact: bool = True
 
     def message(self) -> Message:
         """Return the task as it travels to a worker."""
         recipe, arrays = recipe_of(self.driver)
         how = {"seed": list(self.seed), "reward": self.reward, "explore": self.explore, "full": self.full}
+        how |= {"stop_at_contact": self.stop_at_contact}
         return {"scenario": scenario_recipe(self.scenario), "driver": recipe, **how}, arrays
 
 

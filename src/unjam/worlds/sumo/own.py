@@ -41,6 +41,8 @@ class OwnTraffic(LaneTraffic[OwnRoad]):
         """number of each edge on which anybody was"""
         self._allowed, self._counted = 0.0, 0
         """sum of the speeds that were allowed to vehicles [m/s], and of how many"""
+        self._contacts = set[str]()
+        """CAVs that were in contact with another vehicle"""
         self._came, self._picked = 0, 0
         """vehicles that have entered, and CAVs among them"""
         self._limits: dict[str, VehicleLimits] = {}
@@ -170,8 +172,13 @@ class OwnTraffic(LaneTraffic[OwnRoad]):
         return list(found)
 
     def _ends_with(self, colliding: Sequence[str]) -> bool:
-        """Whether a CAV is among them; in human-only traffic, the baseline, nothing ends early for that."""
-        return self._controlled and any(name in self.cavs for name in colliding)
+        """Whether a CAV is among them, which is recorded, and that ends the episode.
+
+        In human-only traffic, the baseline, there are no CAVs.
+        """
+        found = set(self.cavs).intersection(colliding) if self._controlled else set[str]()
+        self._contacts |= found
+        return self.stop_at_contact and bool(found)
 
     def _pictured_now(self, names: Sequence[str]) -> dict[str, Any]:
         unknown = np.full(len(names), np.nan)
@@ -210,7 +217,8 @@ class OwnTraffic(LaneTraffic[OwnRoad]):
         files, scenario = self.road.files, self.scenario
         classes = {name: attributes.get("vClass", PASSENGER) for name, attributes in files.types.items()}
         start = files.begin + scenario.warmup * scenario.simulation_step
-        return replace(episode, trips=self._simulation.end_with_trips(classes, start))
+        trips = self._simulation.end_with_trips(classes, start)
+        return replace(episode, trips=trips, contacts=len(self._contacts))
 
     def _places_of(self, names: Sequence[str]) -> list[tuple[str, float]]:
         """Return in which lane vehicles are, and how far along it [m]; SUMO is asked once in a step."""

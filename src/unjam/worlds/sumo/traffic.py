@@ -76,6 +76,8 @@ class Traffic(World[Episode], Generic[RoadKind]):
         self.limits = scenario.limits
         self.road = road
         self.crashed = False
+        self.stop_at_contact = True
+        """whether contact of a CAV ends an episode on a user's network; on built-in roads it always does"""
         self.over = False
         """whether nobody is on the road any more, nor will be"""
         self.stopped = ""
