@@ -209,6 +209,34 @@ def guesses() -> pd.DataFrame:
 SOAK = "soak/soak.json"
 
 
+def networks_table() -> pd.DataFrame:
+    """Return how the human baseline compares with plain SUMO on public networks: a row for each."""
+    rows = {}
+    for name, found in json.loads((RESULTS / "networks.json").read_text())["networks"].items():
+        about = {"simulated [s]": f"{found['seconds']:.0f}"}
+        if "refused" in found:
+            rows[name] = {**about, "result": f"refused: {found['refused']}"}
+            continue
+        ours, plain = found["human_baseline"], found["plain_sumo"]
+        both = {
+            label: f"{ours[key]:.{digits}f} / {plain[key]:.{digits}f}"
+            for key, label, digits in (
+                ("departures", "departures", 0),
+                ("arrivals", "arrivals", 0),
+                ("travel_time", "mean travel time [s]", 1),
+                ("teleports", "teleports", 0),
+            )
+        }
+        rows[name] = {
+            **about,
+            **both,
+            "result": f"{found['different_trips']} trips differ",
+            "CPU time": f"{ours['seconds'] / plain['seconds']:.1f} x ({plain['seconds']:.1f} s)",
+            "memory [MB]": f"{ours['megabytes']:.0f} / {plain['megabytes']:.0f}",
+        }
+    return pd.DataFrame.from_dict(rows, orient="index").fillna("")
+
+
 def soak_table() -> pd.DataFrame:
     """Return what was injected in the last soak, how often, and what happened."""
     table = []

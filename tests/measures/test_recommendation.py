@@ -118,3 +118,12 @@ def test_only_with_properties_set_for_cavs_the_gain_is_split() -> None:
     split = replace(ACC_HELPS, of_properties=between(-4.0, -2.0))
     assert split.words.endswith("change -3.0 [-4.0, -2.0] s of travel time.")
     assert "properties" not in ACC_HELPS.words
+
+
+def test_a_road_that_is_nearly_free_is_said_to_have_nothing_to_gain() -> None:
+    free = [{"status": "completed", "travel_time": 103.2, "delay": 3.2} for _ in range(3)]
+    nothing = "Nothing to gain here: the human baseline is within 4 % of free flow. No controller"
+    assert headline([QUICK_AND_WRONG], [ACC_CHANGES_NOTHING], free).startswith(nothing)
+    assert headline([HELPS], [ACC_CHANGES_NOTHING], free).startswith("Recommended on this road")
+    for busy in ([{**row, "delay": 20.0} for row in free], [{**row, "delay": nan} for row in free], []):
+        assert headline([QUICK_AND_WRONG], [ACC_CHANGES_NOTHING], busy).startswith("No controller")

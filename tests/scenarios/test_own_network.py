@@ -11,7 +11,7 @@ from tests.worlds.sumo.own_roads import straight
 from unjam.drivers import Human
 from unjam.errors import InputError
 from unjam.scenarios import make_scenario, scenario_from_recipe, scenario_recipe
-from unjam.scenarios.own_network import OwnNetwork, own_network, passenger_types
+from unjam.scenarios.own_network import OwnNetwork, _log_once, own_network, passenger_types
 from unjam.scenarios.road import OwnRoad
 from unjam.sumo_files import read_sumo_files
 from unjam.worlds.episode import run_episode
@@ -222,7 +222,6 @@ BIKES = '<routes><vType id="bike" vClass="bicycle"/><flow id="g" type="bike"/></
     ("changes", "routes", "words"),
     [
         ({"cav_share": 0.0}, TYPES, "cav_share: 0.0 is not allowed without cav_types"),
-        ({"horizon": 5}, TYPES, "cav_share: 0.0 is not allowed without cav_types"),
         ({"cav_share": 1.5}, TYPES, "cav_share: 1.5"),
         ({"cav_share": "some"}, TYPES, "cav_share: 'some'"),
         ({"cav_types": ["tank"]}, TYPES, "no vehicle has the type 'tank'; allowed: bike, car, truck"),
@@ -293,6 +292,16 @@ def test_demand_that_begins_after_the_end_is_refused(changes: dict[str, Any], tm
     with pytest.raises(InputError, match=words):
         make_scenario(str(path), {"cav_share": 0.5, **changes})
     assert make_scenario(str(path), {"cav_share": 0.5, "begin": 25200.0, "end": 25300.0}).horizon == 100
+
+
+def test_without_a_rate_a_tenth_of_the_vehicles_become_cavs_and_a_line_says_so(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    _log_once.cache_clear()
+    path = str(configuration(tmp_path))
+    rates = [own_network(path, changes).cav_share for changes in ({}, {"cav_types": ["car"]})]
+    assert rates == [0.1, 0.0]
+    assert "penetration rate: 10 %, as none is set; --cav-share sets another" in caplog.messages
 
 
 def test_what_differs_from_sumo_alone_is_noted(tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from unjam.worlds.episode import run_episode
 
 IGNORED = "demand is missing, SUMO warns: Route file should be sorted by departure time, ignoring 'c'!"
 NONE_ENTERED = "no vehicle entered before 60 s; the first departs at 25,200 s; use --begin 25200"
-STOPPED = "2 of 2 episodes ended early: more than 0 teleports (max-num-teleports)"
+STOPPED = "episodes ended early: more than 0 teleports (max-num-teleports)"
 
 
 def document(run: Run, *words: object) -> dict[str, Any]:
@@ -94,7 +94,7 @@ def test_a_limit_of_teleports_ends_episodes_and_assess_refuses_such_a_baseline(
     straight(tmp_path, STANDING, end=120.0, step=0.5, options=options)
     drive = ("drive", "straight.sumocfg", "--cav-share", 0.5, "-d", "human", "-n", 2)
     ran = unjam(*drive, "--out", "out", pictures=False)
-    assert f"note: human: {STOPPED}; means are over complete episodes only" in ran.stderr
+    assert f"note: human: 2 of 2 {STOPPED}; means are over complete episodes only" in ran.stderr
     assert STOPPED in (tmp_path / "out" / "report.html").read_text()
     found = document(unjam, *drive, "--no-report")
     assert found["ended_early"] == {"more than 0 teleports (max-num-teleports)": 2}
@@ -102,7 +102,7 @@ def test_a_limit_of_teleports_ends_episodes_and_assess_refuses_such_a_baseline(
     assert {row["status"] for row in found["episodes"]} == {"teleports"}
     refused = unjam("assess", "straight.sumocfg", "-d", "acc", "--shares", "0.5", "-n", 40, "--out", "answer")
     assert refused.returncode == 2
-    assert f"unjam: human: {STOPPED}; allowed: 5 %" in refused.stderr
+    assert f"unjam: human: 10 of 10 {STOPPED}; allowed: 5 %" in refused.stderr
     assert not (tmp_path / "answer").exists()
 
 

@@ -29,6 +29,8 @@ from unjam.measures.statistics import (
 
 FLOW_LOST = 0.01
 """share of people's flow that the interval must exclude as a loss"""
+LITTLE_DELAY = 0.05
+"""delay as a share of the free travel time up to which a road has nothing to gain"""
 LEAST_JUDGED = 10
 """seeds without which nothing is recommended: an interval of fewer is too narrow to be trusted"""
 
@@ -284,8 +286,23 @@ def shown_beside(judged: Sequence[Judged]) -> Judged | None:
     return recommended(judged) or quickest
 
 
-def headline(judged: Sequence[Judged], acc: Sequence[AccResult]) -> str:
-    """Return the answer: what is recommended, and what ACC vehicles alone would do."""
+def near_free_flow(baseline: Sequence[dict[str, Any]]) -> str:
+    """Return a sentence where the rows of the human baseline have hardly any delay; else an empty text."""
+    time, delay = (estimate_of(baseline, name).mean for name in (TIME, "delay"))
+    above_free = delay / (time - delay)
+    if not above_free <= LITTLE_DELAY:
+        return ""
+    within = max(1, ceil(100 * above_free))
+    return f"Nothing to gain here: the human baseline is within {within} % of free flow. "
+
+
+def headline(
+    judged: Sequence[Judged], acc: Sequence[AccResult], baseline: Sequence[dict[str, Any]] = ()
+) -> str:
+    """Return the answer: what is recommended, and what ACC vehicles alone would do.
+
+    `baseline` has the rows of the human baseline: on a nearly free road there is nothing to gain.
+    """
     best = recommended(judged)
     if best is not None:
         first = (
@@ -309,6 +326,7 @@ def headline(judged: Sequence[Judged], acc: Sequence[AccResult]) -> str:
         second = "lengthen travel time"
     else:
         second = "are not shown to shorten travel time"
+    first = first if best else near_free_flow(baseline) + first
     return f"{first} ACC vehicles alone {second}."
 
 

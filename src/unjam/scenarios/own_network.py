@@ -32,6 +32,8 @@ ROAD_CLASSES = (
     *("bus", "coach", "motorcycle", "moped", "custom1", "custom2"),
 )
 """SUMO's vehicle classes whose vehicles may become CAVs"""
+USUAL_RATE = 0.1
+"""penetration rate where neither a rate nor vehicle types are set"""
 DRAWN = 100
 """calibrated people of an episode, drawn from the population"""
 WITH_OWN_ACC: dict[str, Any] = {"actuation": "cruise", "safety.active": False}
@@ -214,6 +216,9 @@ def own_network(file: str, changes: dict[str, Any]) -> OwnNetwork:
     _log_once(*notes_on_files(files, MOST_LOGGED))
     if isinstance(cruise := changes.get("cruise", {}), dict):
         changes = {**changes, "cruise": {"acceleration": None, "deceleration": None, **cruise}}
+    if not changes.keys() & {"cav_share", "cav_types"}:
+        changes = {**changes, "cav_share": USUAL_RATE}
+        _log_once(f"penetration rate: {100 * USUAL_RATE:g} %, as none is set; --cav-share sets another")
     values = {"file": str(files.path), "simulation_step": files.step, **changes}
     made = build(OwnNetwork, values, Path(file).name)
     if "horizon" not in changes:

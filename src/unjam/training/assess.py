@@ -257,7 +257,7 @@ def _document(asked: Question, choice: Choice, found: Findings, chose: int, budg
         if choice.rows[option]
     ]
     return {
-        "headline": headline(found.judged, found.acc),
+        "headline": headline(found.judged, found.acc, found.rows[HUMAN]),
         "recommended": best and {"share": best.share, "driver": best.driver},
         "judged": [{**asdict(each), "reasons": each.reasons, "words": each.words} for each in found.judged],
         "acc": [{**asdict(each), "driver": ACC, "words": each.words} for each in found.acc],
