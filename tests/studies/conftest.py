@@ -68,5 +68,5 @@ def run_here(
 ) -> None:
     """Run command lines of `unjam` in this process."""
     for name, command in commands.items():
-        app(command.line()[3:], standalone_mode=False)
+        app(command.line()[4:], standalone_mode=False)
         on_line(name)

@@ -52,7 +52,7 @@ def planted(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     (folder / "later.py").write_text("ONE = 1.0\n")
     (folder / "small.toml").write_text(to_toml(small_config(**SMALL)))
     steps = range(60)
-    columns = {"period": 1, "follower": 1, "time": [0.5 * each for each in steps], "gap": 10.0}
+    columns = {"pair": 1, "follower": 1, "time": [0.5 * each for each in steps], "gap": 10.0}
     speeds = {"speed": [8.0 + 0.01 * each for each in steps], "leader_speed": [8.0] * len(steps)}
     pd.DataFrame({**columns, **speeds}).to_csv(folder / "data.csv", index=False)
     before = {**os.environ}

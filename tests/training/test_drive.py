@@ -1,5 +1,6 @@
 import json
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -193,10 +194,9 @@ def test_an_error_in_a_function_of_the_program_is_raised_as_it_is() -> None:
 
 def test_it_drives_while_an_environment_is_open_and_warns() -> None:
     environment = RoadEnv(**ROAD)
-    environment.reset(seed=0)
-    with pytest.warns(UserWarning, match="runs over TraCI"):
+    with closing(environment), pytest.warns(UserWarning, match="runs in a process of its own"):
+        environment.reset(seed=0)
         beside = drive("ring", follow, 1, road=ROAD, workers=1)
-    environment.close()
     assert beside.mean["return"] == drive("ring", follow, 1, road=ROAD, workers=1).mean["return"]
 
 

@@ -124,7 +124,7 @@ class Trainings:
             raise KeyboardInterrupt
         if self.failing:
             return 2
-        config = load_config(Path(command.line()[5]))
+        config = load_config(Path(command.line()[6]))
         folder = Path(command.words[-1])
         folder.mkdir(parents=True)
         worth = -abs(math.log10(config.trpo.target_kl) + 2)

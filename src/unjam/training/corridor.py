@@ -9,7 +9,7 @@ from typing import Any
 from unjam.controller.file import hash_of_file
 from unjam.errors import InputError, did_you_mean, wrong, wrong_name
 from unjam.measures.detectors import Measurement, read_detectors
-from unjam.scenarios.own_network import OwnNetwork, own_network, passenger_types
+from unjam.scenarios.own_network import ROAD_CLASSES, OwnNetwork, own_network, passenger_types
 from unjam.sumo_files import SumoFiles, read_sumo_files
 from unjam.training.assess import NOBODY
 from unjam.training.space import Range, Space, space_of
@@ -91,7 +91,7 @@ def corridor(file: str, detectors: Path, begin: float | None = None, end: float 
     kind, rows = read_detectors(detectors)
     # People alone: the share is so small that nobody has it.
     times = {name: time for name, time in (("begin", begin), ("end", end)) if time is not None}
-    checked = own_network(file, {"cav_share": NOBODY, **times})
+    checked = own_network(file, {"cav_share": NOBODY, "cav_classes": ROAD_CLASSES, **times})
     files = read_sumo_files(Path(checked.file))
     first = files.begin if begin is None else begin
     last = next((limit for limit in (end, files.end) if limit is not None), inf)
