@@ -123,7 +123,26 @@ def test_only_with_properties_set_for_cavs_the_gain_is_split() -> None:
 def test_a_road_that_is_nearly_free_is_said_to_have_nothing_to_gain() -> None:
     free = [{"status": "completed", "travel_time": 103.2, "delay": 3.2} for _ in range(3)]
     nothing = "Nothing to gain here: the human baseline is within 4 % of free flow. No controller"
-    assert headline([QUICK_AND_WRONG], [ACC_CHANGES_NOTHING], free).startswith(nothing)
+    found = headline([QUICK_AND_WRONG], [ACC_HELPS], free)
+    assert found.startswith(nothing)
+    assert "ACC" not in found
     assert headline([HELPS], [ACC_CHANGES_NOTHING], free).startswith("Recommended on this road")
     for busy in ([{**row, "delay": 20.0} for row in free], [{**row, "delay": nan} for row in free], []):
         assert headline([QUICK_AND_WRONG], [ACC_CHANGES_NOTHING], busy).startswith("No controller")
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        (
+            {"baseline_teleports": 0.02},
+            "nothing can be concluded: in the human baseline SUMO teleports or removes 2.0 %",
+        ),
+        ({"teleports": 3}, "3 more vehicles teleported or removed than without CAVs"),
+    ],
+)
+def test_nothing_is_recommended_where_sumo_takes_vehicles_off_the_road(
+    changes: dict[str, float], words: str
+) -> None:
+    assert words in replace(HELPS, effect=replace(GOOD, **changes)).reasons[0]  # pyright: ignore[reportArgumentType]
+    assert not replace(HELPS, effect=replace(GOOD, baseline_teleports=0.01, teleports=-3)).reasons

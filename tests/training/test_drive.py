@@ -193,10 +193,10 @@ def test_an_error_in_a_function_of_the_program_is_raised_as_it_is() -> None:
 
 
 def test_it_drives_while_an_environment_is_open_and_warns() -> None:
-    environment = RoadEnv(**ROAD)
-    with closing(environment), pytest.warns(UserWarning, match="runs in a process of its own"):
+    with closing(RoadEnv(**ROAD)) as environment:
         environment.reset(seed=0)
-        beside = drive("ring", follow, 1, road=ROAD, workers=1)
+        with pytest.warns(UserWarning, match="runs in a process of its own"):
+            beside = drive("ring", follow, 1, road=ROAD, workers=1)
     assert beside.mean["return"] == drive("ring", follow, 1, road=ROAD, workers=1).mean["return"]
 
 

@@ -29,6 +29,8 @@ from unjam.measures.statistics import (
 
 FLOW_LOST = 0.01
 """share of people's flow that the interval must exclude as a loss"""
+MOST_TELEPORTS = 0.01
+"""share of the baseline's vehicles that SUMO may teleport or remove: more of them distort all travel times"""
 LITTLE_DELAY = 0.05
 """delay as a share of the free travel time up to which a road has nothing to gain"""
 LEAST_JUDGED = 10
@@ -67,6 +69,10 @@ class Effect:
     """mean speed of all vehicles [m/s]"""
     ended_early: int = 0
     """episodes that ran, but ended early, with or without CAVs: only complete ones are compared"""
+    teleports: int = 0
+    """vehicles that SUMO teleported or removed beyond those of the human baseline, all episodes together"""
+    baseline_teleports: float = 0.0
+    """teleports and removals of the human baseline, as a share of its vehicles"""
 
     @property
     def words(self) -> str:
@@ -101,6 +107,7 @@ def effect_of(
     people = [row for row in people if str(row["seed"]) in seeds]
     ran = [row for row in rows if row["status"] != "failed"]
     differences = (paired_difference(rows, people, name, confidence) for name in (TIME, FLOW, FUEL, HARD))
+    teleports, of_baseline = (sum(row.get("teleports", 0) for row in each) for each in (rows, people))
     return Effect(
         *differences,
         collisions=float(
@@ -114,6 +121,8 @@ def effect_of(
         delay_cut=_delay_cut(rows, people, confidence),
         speed=paired_difference(rows, people, "mean_speed", confidence),
         ended_early=sum(map(ended_early, [*rows, *people])),
+        teleports=teleports - of_baseline,
+        baseline_teleports=of_baseline / max(1, sum(row.get("vehicles", 0) for row in people)),
     )
 
 
@@ -157,6 +166,12 @@ def reasons_against(effect: Effect) -> list[str]:
         (effect.travel_time.count >= LEAST_JUDGED, f"{effect.travel_time.count} test seeds are too few"),
         (not effect.failed, f"{effect.failed} episodes failed"),
         (not effect.ended_early, f"{effect.ended_early} episodes ended early"),
+        (
+            effect.baseline_teleports <= MOST_TELEPORTS,
+            f"nothing can be concluded: in the human baseline SUMO teleports or removes "
+            f"{100 * effect.baseline_teleports:.1f} % of the vehicles (limit {100 * MOST_TELEPORTS:g} %)",
+        ),
+        (effect.teleports <= 0, f"{effect.teleports} more vehicles teleported or removed than without CAVs"),
         *((not worse, words) for worse, words in _harms(effect)),
         (
             effect.travel_time.low > 0 or effect.travel_time.high < 0,
@@ -326,7 +341,8 @@ def headline(
         second = "lengthen travel time"
     else:
         second = "are not shown to shorten travel time"
-    first = first if best else near_free_flow(baseline) + first
+    if not best and (free := near_free_flow(baseline)):
+        return free + first
     return f"{first} ACC vehicles alone {second}."
 
 

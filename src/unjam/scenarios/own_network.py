@@ -118,11 +118,13 @@ class OwnNetwork(Scenario):
     def draw(self, generator: np.random.Generator) -> OwnRoad:
         """Return the network; random is which vehicles the share picks."""
         files = read_sumo_files(Path(self.file))
-        # The horizon ends an episode: at an earlier end of the configuration's SUMO would let flows stop.
-        options = {name: value for name, value in files.options.items() if name != "end"}
+        options = dict(files.options)
         if self.begin is not None:
             options["begin"] = str(self.begin)
         begin = files.begin if self.begin is None else self.begin
+        if files.end is not None:  # flows without an end of their own last until it: at least to the horizon
+            driven = self.warmup * self.simulation_step + self.horizon * self.decision_step
+            options["end"] = str(max(files.end, begin + driven))
         files = files._replace(begin=begin, options=options)
         cav_seed = int(generator.integers(2**31))
         drivers = self.calibrated.draw(DRAWN, generator) if self.calibrated else ()

@@ -27,8 +27,9 @@ NOWHERE = "NUL"
 """the file that SUMO never makes"""
 TO_FILES = ("file", "output", "dest", "href")
 """attributes that name files, beside those that end in `File`"""
-IN_PARAMETERS = ("file", "output", "log", "ssm")
-"""what is in the names of parameters of vehicles and signals that name files, or write one by themselves"""
+IN_PARAMETERS = ("file", "output", "log", "ssm", "tripinfo")
+"""what is in the names of parameters of vehicles and signals that name files, write one by themselves, or
+keep trips out of the records that delays are read from"""
 TYPES = "vType", "vTypeDistribution"
 CHECKED = {*ONLY_WRITERS, "include", "param", "vType", "vTypeDistribution"}
 """elements that are looked at whatever attributes they have"""

@@ -161,23 +161,25 @@ def _study(base: RunConfig, space: Space, folder: Path) -> "Study":
 
 def _proposed(study: "Study", space: Space, trials: int) -> Iterator[tuple[int, dict[str, Any]]]:
     """Yield number and values of what is to be tried: what was stopped, then new ones, so many in all."""
-    for stopped in [trial for trial in study.get_trials() if trial.state.name == "RUNNING"]:
-        if stopped.params.keys() == space.keys():
-            for key, value in stopped.params.items():
-                _check_offered(key, value, space[key])
-            yield stopped.number, stopped.params
+    for stored in study.get_trials():
+        for key, value in stored.params.items():
+            _check_offered(key, value, space.get(key))
+        if stored.state.is_finished():
+            continue
+        if stored.state.name == "RUNNING" and stored.params.keys() == space.keys():
+            yield stored.number, stored.params
         else:
-            _tell(study, stopped.number, None)  # it was stopped before it had all its values
+            _tell(study, stored.number, None)  # it was stopped before it had all its values
     while len(study.get_trials(deepcopy=False)) < trials:
         trial = study.ask()
         for key, values in space.items():
             values.suggest(trial, key)
-        yield trial.number, trial.params
+        yield trial.number, {key: trial.params[key] for key in space}
 
 
-def _check_offered(key: str, value: Any, values: Range | Choice) -> None:
-    """Raise `InputError` where a value that a folder holds is a text not offered: it may name code."""
-    if not isinstance(value, int | float) and value not in values.ends:
+def _check_offered(key: str, value: Any, values: Range | Choice | None) -> None:
+    """Raise `InputError` where a value that a folder holds was not offered: a text may name code."""
+    if values is None or (not isinstance(value, int | float) and value not in values.ends):
         raise InputError(f"out: {key}: {value!r} in {JOURNAL} was not offered; allowed: a new folder")
 
 

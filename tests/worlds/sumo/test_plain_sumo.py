@@ -122,6 +122,45 @@ def test_the_human_baseline_of_a_motorway_has_the_trips_of_plain_sumo(
     check_same_trips(episode.trips, trips_of_plain_sumo(path, sumo_seed, 60.0))
 
 
+def test_flows_without_an_end_of_their_own_bring_as_many_vehicles_as_in_plain_sumo(
+    tmp_path: Path, simulation: Simulation
+) -> None:
+    flow = '<flow id="f" type="car" route="along" begin="0" number="40" departSpeed="max"/>'
+    path = straight(tmp_path, flow, end=120.0, step=0.5)
+    command = [sumo_program("sumo"), "-c", str(path), *trip_options(tmp_path / "plain.xml")]
+    subprocess.run(command, check=True, capture_output=True, cwd=tmp_path)
+    plain = read_trips(tmp_path / "plain.xml", CLASSES, 0.0)
+    for end in (None, 60.0):
+        changes = {} if end is None else {"end": end}
+        episode, _ = human_baseline(path, simulation, **changes)
+        assert len(episode.trips.vehicle_ids) == (len(plain.vehicle_ids) if end is None else 21)
+    assert len(plain.vehicle_ids) == 40
+
+
+def test_trips_of_any_type_have_its_class(tmp_path: Path, simulation: Simulation) -> None:
+    vehicles = "".join(
+        f'<vType id="{kind}" vClass="{name}"/>'
+        f'<vehicle id="{kind}-v@1" type="{kind}" route="along" depart="{n}"/>'
+        for n, (kind, name) in enumerate(
+            {
+                "a@b": "passenger",
+                "bus": "passenger",
+                "bus_of_driver_a": "bus",
+                "x_of_driver_3": "truck",
+            }.items()
+        )
+    )
+    episode, _ = human_baseline(straight(tmp_path, vehicles, step=0.5), simulation)
+    assert episode.trips.vehicle_classes == ("passenger", "passenger", "bus", "truck")
+
+
+def test_a_type_cannot_keep_its_vehicles_out_of_the_trips(tmp_path: Path, simulation: Simulation) -> None:
+    kind = '<vType id="hidden"><param key="has.tripinfo.device" value="false"/></vType>'
+    vehicles = kind + '<vehicle id="v" type="hidden" route="along" depart="0"/>'
+    episode, _ = human_baseline(straight(tmp_path, vehicles, step=0.5), simulation)
+    assert episode.trips.vehicle_ids == ("v",)
+
+
 def test_delay_and_travel_time_by_vehicle_class_are_those_of_the_trips(
     tmp_path: Path, simulation: Simulation
 ) -> None:

@@ -6,6 +6,7 @@ from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from unjam.physics.idm import IDMParameters
+from unjam.scenarios.own_network import PASSENGER
 from unjam.scenarios.road import BuiltRoad, MotorwayRoad, OwnRoad, Road
 from unjam.scenarios.scenario import ACCELERATION, OBEDIENT, SMALLEST_CAV_GAP, VEHICLE_LENGTH, Scenario
 from unjam.sumo_files import is_harmless_attribute, is_harmless_parameter
@@ -13,10 +14,9 @@ from unjam.worlds.sumo.networks import Attributes, element, network_file
 
 CAV_COLOUR = "215,38,61"
 """red, in SUMO's window"""
-CAV_PREFIX, DRIVER_SUFFIX = "cav_of_", "_of_driver_"
-CAV_TYPES = CAV_PREFIX + "{}"
+CAV_TYPES = "cav_of_{}"
 """the type of a CAV whose own type is `{}`"""
-CALIBRATED_TYPES = "{}" + DRIVER_SUFFIX + "{}"
+CALIBRATED_TYPES = "{}_of_driver_{}"
 """the type of a car whose own type is `{}`, driven by a calibrated person of that number"""
 FOLLOWING = {"carFollowModel", "tau", "minGap", "sigma", "delta", "stepping"}
 """attributes of a vehicle type that are its car-following law's: a CAV keeps all others"""
@@ -153,10 +153,14 @@ def _variant(name: str, attributes: Attributes, law: Attributes, parameters: dic
     return f"{opened.removesuffix('/>')}>{nested}</vType>"
 
 
-def base_type(name: str) -> str:
-    """Return the user's vehicle type from which the type of that name was made, for a CAV or a driver."""
-    of_one_vehicle = name.partition("@")[0]  # as SUMO names a type of which one vehicle has a changed copy
-    return of_one_vehicle.partition(DRIVER_SUFFIX)[0].removeprefix(CAV_PREFIX)
+def classes_of_types(road: OwnRoad) -> dict[str, str]:
+    """Return the vehicle class of all types that vehicles can have: the user's, and those made of them."""
+    made, own = dict[str, str](), dict[str, str]()
+    for name, attributes in road.files.types.items():
+        own[name] = attributes.get("vClass", PASSENGER)
+        bases = [name, *(CALIBRATED_TYPES.format(name, number) for number in range(len(road.drivers)))]
+        made |= dict.fromkeys([*bases, *map(CAV_TYPES.format, bases)], own[name])
+    return made | own
 
 
 def _vehicle_type(name: str, scenario: Scenario, **attributes: Any) -> str:

@@ -14,11 +14,10 @@ from unjam.drivers.command import Command
 from unjam.drivers.local_state import LARGEST_GAP, LocalState
 from unjam.drivers.roadside import Messages
 from unjam.drivers.safety import Ahead
-from unjam.scenarios.own_network import PASSENGER
 from unjam.scenarios.road import OwnRoad
 from unjam.worlds.record import Episode, Floats
 from unjam.worlds.sumo.control import VehicleLimits
-from unjam.worlds.sumo.files import CALIBRATED_TYPES, CAV_TYPES
+from unjam.worlds.sumo.files import CALIBRATED_TYPES, CAV_TYPES, classes_of_types
 from unjam.worlds.sumo.lanes import Followed, LaneTraffic
 from unjam.worlds.sumo.library import Neighbours
 from unjam.worlds.sumo.networks import edge_lengths, lane_counts, network_lines
@@ -214,10 +213,8 @@ class OwnTraffic(LaneTraffic[OwnRoad]):
     def record(self, driven: Driven) -> Episode:
         """Return what happened since the start, with all trips; SUMO ends with it."""
         episode = super().record(driven)
-        files, scenario = self.road.files, self.scenario
-        classes = {name: attributes.get("vClass", PASSENGER) for name, attributes in files.types.items()}
-        start = files.begin + scenario.warmup * scenario.simulation_step
-        trips = self._simulation.end_with_trips(classes, start)
+        start = self.road.files.begin + self.scenario.warmup * self.scenario.simulation_step
+        trips = self._simulation.end_with_trips(classes_of_types(self.road), start)
         return replace(episode, trips=trips, contacts=len(self._contacts))
 
     def _places_of(self, names: Sequence[str]) -> list[tuple[str, float]]:

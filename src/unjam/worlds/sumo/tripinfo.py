@@ -5,7 +5,6 @@ from xml.parsers import expat
 
 import numpy as np
 
-from unjam.worlds.sumo.files import base_type
 from unjam.worlds.trips import Trips
 
 NOT_ARRIVED = -1.0
@@ -25,15 +24,17 @@ def trip_options(path: Path) -> list[str]:
 def read_trips(path: Path, classes: dict[str, str], after: float) -> Trips:
     """Return the trips in a file that SUMO has closed, in SUMO's order.
 
-    `classes` has the vehicle class of each vehicle type. Trips that ended before the time `after` [s], during
-    a warm-up, are left out.
+    `classes` has the vehicle class of each vehicle type. Left out are trips that ended before the time
+    `after` [s], during a warm-up, and those of vehicles that were not to depart yet.
     """
     ids, kinds, times = list[str](), list[str](), list[list[float]]()
 
     def start(tag: str, attributes: dict[str, str]) -> None:
-        if tag == "tripinfo" and not NOT_ARRIVED < float(attributes["arrival"]) <= after:
+        if tag != "tripinfo" or NOT_ARRIVED < float(attributes["arrival"]) <= after:
+            return
+        if float(attributes["depart"]) >= 0.0 or float(attributes["departDelay"]) > 0.0:
             ids.append(attributes["id"])
-            kinds.append(classes[base_type(attributes["vType"])])
+            kinds.append(_class_of(attributes["vType"], classes))
             times.append([float(attributes[name]) for name in TIMES])
 
     parser = expat.ParserCreate()
@@ -43,3 +44,9 @@ def read_trips(path: Path, classes: dict[str, str], after: float) -> Trips:
             parser.Parse(chunk)
     depart_delay, duration, time_loss, arrival = np.array(times, np.float64).reshape(-1, len(TIMES)).T
     return Trips(tuple(ids), tuple(kinds), depart_delay, duration, time_loss, arrival != NOT_ARRIVED)
+
+
+def _class_of(kind: str, classes: dict[str, str]) -> str:
+    """Return the class of a type; SUMO calls a copy that belongs to one vehicle `type@vehicle`."""
+    names = kind, kind.rpartition("@")[0], kind.partition("@")[0]
+    return next((classes[name] for name in names if name in classes), "")
