@@ -17,6 +17,7 @@ from unjam.errors import InputError
 from unjam.folders import HELD_FOLDERS
 from unjam.processes import (
     HEARTBEAT,
+    HELD,
     LOCK,
     MISSED,
     PARENT,
@@ -223,7 +224,8 @@ def test_what_killed_processes_left_in_the_temporary_folder_is_swept(
     killed, alive = (Path(process.stdout.readline().strip()) for process in started if process.stdout)
     mine = tmp_path / "unjam-results"  # of somebody who keeps results here
     mine.mkdir()
-    (mine / LOCK).touch()
+    for name in (LOCK, HELD):
+        (mine / name).touch()
     started[0].kill()
     started[0].wait()
     sweep_private_folders.__wrapped__()

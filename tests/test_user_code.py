@@ -240,3 +240,27 @@ def test_a_file_that_cannot_be_parsed_fails_when_it_runs(tmp_path: Path) -> None
     (tmp_path / "main.py").write_bytes(b"# -*- coding: latin-1 -*-\nvalue = '\xe9'\n")
     assert read_code(tmp_path / "main.py").run().value == "é"
     assert os.listdir(tmp_path) == ["main.py"]
+
+
+@pytest.mark.parametrize("has_init", [True, False])
+def test_packages_of_the_folder_are_not_searched_for_modules_that_were_not_read(
+    has_init: bool, tmp_path: Path
+) -> None:
+    package = tmp_path / "plug"
+    package.mkdir()
+    if has_init:
+        (package / "__init__.py").touch()
+    (package / "known.py").write_text("value = 1\n")
+    (package / "late.py").write_text("raise SystemExit('not read, and run')\n")
+    lines = [
+        *("import importlib", "import plug.known", "names = []"),
+        "for name in ('plug.late', plug.__name__ + '.late'):",
+        *("    try:", "        importlib.import_module(name)"),
+        "    except ModuleNotFoundError as error:",
+        "        names.append(error.name)",
+    ]
+    file = tmp_path / "mine.py"
+    file.write_text("\n".join(lines))
+    module = read_code(file).run()
+    assert module.plug.known.value == 1
+    assert [name.rpartition(".")[2] for name in module.names] == ["late", "late"]

@@ -207,7 +207,7 @@ def _refuse_other_machine(path: Path, descriptor: int) -> None:
     """Raise `InputError` where a process of another machine has held a lock until just now."""
     owner = os.pread(descriptor, 300, 0).decode(errors="replace").split()
     age = time.time() - os.fstat(descriptor).st_mtime
-    if owner and owner[0] != platform.node() and age < MISSED * HEARTBEAT:
+    if owner and owner[0] != platform.node() and abs(age) < MISSED * HEARTBEAT:
         held = f"run: {str(path.parent)!r} is being written on {owner[0]}"
         raise InputError(f"{held}; allowed: one at a time, or {MISSED * HEARTBEAT:g} s after its end")
 
@@ -219,6 +219,8 @@ class PrivateFolder(tempfile.TemporaryDirectory[str]):
         """Make it, and hold it."""
         super().__init__(prefix=PREFIX)
         self._held = _locked(Path(self.name, HELD))
+        if self._held is not None:
+            os.write(self._held, _identity_of(Path(self.name)))
 
     def cleanup(self) -> None:
         """Remove it."""
@@ -239,8 +241,15 @@ def sweep_private_folders() -> None:
                 continue
             if (folder / HELD).is_file() and (descriptor := _locked(folder / HELD)) is not None:
                 with suppress(DiskError):
-                    remove(folder)
+                    if os.pread(descriptor, 100, 0) == _identity_of(folder):  # or another program made it
+                        remove(folder)
                 os.close(descriptor)
+
+
+def _identity_of(folder: Path) -> bytes:
+    """Return what no copy of a folder has."""
+    found = folder.lstat()
+    return f"unjam {found.st_dev} {found.st_ino}".encode()
 
 
 def check_not_owned(folder: Path) -> None:

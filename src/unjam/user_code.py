@@ -204,6 +204,8 @@ class _Modules(InspectLoader):
             name, place, loader=self, submodule_search_locations=below
         )
         assert spec is not None
+        if below is not None:
+            spec.submodule_search_locations = []  # or Python itself would search the folder, unhashed
         module = importlib.util.module_from_spec(spec)
         module.__dict__["__builtins__"] = self._builtins
         self._modules[inner] = sys.modules[name] = module

@@ -43,6 +43,19 @@ def test_a_graph_is_run_on_one_moment_after_the_other() -> None:
     np.testing.assert_array_equal(run_graph(graph(), Constant(), states), states.leader_speed - states.speed)
 
 
+def test_cavs_that_perceive_the_same_must_get_the_same_answers() -> None:
+    def answer_by_row(model: Any) -> None:
+        sums = helper.make_node("CumSum", ["acceleration", "axis"], ["sums"])
+        axis = helper.make_node("Constant", [], ["axis"], value_int=0)
+        model.graph.node.extend([axis, sums])
+        model.graph.output[0].name = "sums"
+
+    part, states = graph(answer_by_row), perceived()
+    np.testing.assert_array_equal(run_graph(part, Constant(), states), states.leader_speed - states.speed)
+    with pytest.raises(InputError, match="graph: 3 CAVs that perceive the same get different answers"):
+        run_graph(part, Constant(), states, rows=3)
+
+
 def test_what_it_remembers_is_given_back_to_it() -> None:
     def remember(model: Any) -> None:
         model.graph.node[0].input[1] = "memory.acceleration"

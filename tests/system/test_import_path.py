@@ -109,7 +109,7 @@ watch ring --set horizon=20 --set warmup=0 -d pi --video film.mp4
 search ring --config small.toml --vary trpo.target_kl=0.1,0.2 --trials 1 --out search
 tune ring --set horizon=20 --set warmup=0 --expert pi --steps 8000 --out tuned
 fit-drivers data.csv --set calibration.generations=2
-reproduce theory --out theory
+reproduce theory --dry-run
 """
 
 

@@ -131,7 +131,7 @@ WRONG: dict[str, tuple[str, list[str]]] = {
         ["drive ring --driver pi --cav-share 0.1"],
     ),
     "configuration that is missing": ("there is no such file", ["drive none.sumocfg --driver pi"]),
-    "own network without CAVs": ("cav_share: 0.0", ["drive good.sumocfg --driver pi"]),
+    "own network without CAVs": ("cav_share: 0.0", ["drive good.sumocfg --driver pi --cav-share 0"]),
     "type that nobody has": (
         "no vehicle has the type 'tank'; allowed: car",
         ["drive good.sumocfg --driver pi --cav-types tank"],
@@ -144,7 +144,7 @@ WRONG: dict[str, tuple[str, list[str]]] = {
         "torn.net.xml: cannot be read",
         ["drive torn.sumocfg --driver pi --cav-share 0.5"],
     ),
-    "training where nobody is a CAV": ("cav_share: 0.0", ["train good.sumocfg --steps 10"]),
+    "training where nobody is a CAV": ("cav_share: 0.0", ["train good.sumocfg --steps 10 --set road.cav_share=0"]),
     "assessing a road of the package": ("your own .sumocfg file", ["assess ring"]),
     "assessing what is missing": ("there is no such file", ["assess none.sumocfg"]),
     "shares that are words": ("shares: 'few'", ["assess good.sumocfg --shares few"]),

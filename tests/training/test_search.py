@@ -205,6 +205,26 @@ def test_values_that_nobody_offered_are_not_tried(tmp_path: Path, trainings: Tra
     assert trainings.done == []
 
 
+@pytest.mark.parametrize("state", ["WAITING", "COMPLETE"])
+def test_a_stored_trial_that_no_search_began_is_refused(
+    state: str, tmp_path: Path, trainings: Trainings
+) -> None:
+    optuna = pytest.importorskip("optuna")
+    (tmp_path / "config.toml").write_text(to_toml(BASE))
+    backend = optuna.storages.journal.JournalFileBackend(str(tmp_path / JOURNAL))
+    study = optuna.create_study(study_name="search", storage=optuna.storages.JournalStorage(backend))
+    named = {"expert": optuna.distributions.CategoricalDistribution(["code.py:of_others"])}
+    params = {"expert": "code.py:of_others"} if state == "COMPLETE" else {}
+    value, known = (1.0, named) if params else (None, {})
+    stored = optuna.trial.create_trial(
+        state=optuna.trial.TrialState[state], params=params, distributions=known, value=value
+    )
+    study.add_trial(stored)
+    with pytest.raises(InputError, match=r"^out: .*journal\.log"):
+        search(BASE, SPACE, 3, tmp_path, 1)
+    assert trainings.done == []
+
+
 def test_a_journal_that_a_crash_has_cut_short_goes_on_and_has_no_link(tmp_path: Path) -> None:
     journal = pytest.importorskip("unjam.training.journal").Journal
     path, entries = tmp_path / JOURNAL, [{"op_code": 0, "value": [float("nan")]}, {"op_code": 1}]

@@ -56,8 +56,9 @@ def make_driver(text: str, time_step: float) -> Driver:
         return Mixed(tuple(make_driver(part, time_step) for part in parts))
     if text.startswith(SHIPPED):
         return load_controller(shipped_file(text.removeprefix(SHIPPED)))
-    named = text.partition(":")[0] in DRIVERS or is_file_reference(text)
-    if not named and (text.endswith(SUFFIX) or os.path.isdir(text)):
+    is_folder = os.path.isdir(text)  # whatever it is called, it is no file with code
+    named = text.partition(":")[0] in DRIVERS or (is_file_reference(text) and not is_folder)
+    if not named and (text.endswith(SUFFIX) or is_folder):
         return load_controller(text)
     return named_driver(text, time_step)
 

@@ -132,30 +132,36 @@ def _check_node(node: Any, types: Any) -> None:
         seen.add(attribute.name)
 
 
-def run_graph(part: bytes, driver: Driver, states: LocalState) -> Floats:
+def run_graph(part: bytes, driver: Driver, states: LocalState, rows: int = 1) -> Floats:
     """Return what a checked graph answers when it perceives `states` one after the other [m/s2].
 
-    It begins with the first memory of `driver`, whose graph it is; all arrays have the shape (T,).
+    It begins with the first memory of `driver`, whose graph it is; all arrays have the shape (T,). It runs
+    for so many CAVs at once, in `rows`, that perceive the same.
 
     Raises:
-        InputError: onnxruntime refuses it.
+        InputError: onnxruntime refuses it, or CAVs that perceive the same get other answers.
         MissingPartError: onnxruntime is not installed.
     """
     runtime = needed("onnxruntime")
     options = runtime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     options.log_severity_level = 4
-    (inputs, _), answers = graph_names(driver), np.zeros(len(states.speed))
-    memory: list[Any] = [rows for _, rows in leaves(driver.initial_memory(1))]
+    (inputs, _), answers, alike = graph_names(driver), np.zeros(len(states.speed)), True
+    memory: list[Any] = [rows for _, rows in leaves(driver.initial_memory(rows))]
     try:
         session = runtime.InferenceSession(part, options, providers=["CPUExecutionProvider"])
         for step in range(len(answers)):
-            now = states.at(slice(step, step + 1))
+            now = states.at(np.full(rows, step))
             seen = [getattr(now, name) for name in driver.perceives]
             acceleration, *memory = session.run(None, dict(zip(inputs, [*seen, *memory], strict=True)))
             answers[step] = acceleration[0]
+            alike = (
+                alike and np.shape(acceleration) == (rows,) and bool((acceleration == answers[step]).all())
+            )
     except Exception as error:  # the runtime's own kinds of error
         raise InputError(f"graph: cannot be run: {error}") from None
+    if not alike:
+        raise InputError(f"graph: {rows} CAVs that perceive the same get different answers")
     return answers
 
 

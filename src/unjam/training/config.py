@@ -231,7 +231,7 @@ def load_config(
             folder names Python code that is not trusted.
     """
     read = read_toml(file) if file is not None else {}
-    if file is not None and (file.parent / CONFIG).is_file():  # by itself it is the user's own
+    if file is not None and _is_below_results(file):  # by itself it is the user's own
         check_values(f"config file {file}", read)
     given = changed(read, nested(changes or {}))
     values: dict[str, Any] = {}
@@ -250,6 +250,18 @@ def load_config(
         # Virtual rows know no ACC of a CAV's own: without a model, unless one is asked for.
         wanted = changed({"virtual": {"virtual_ratio": 0.0}}, wanted)
     return build(RunConfig, wanted, "")
+
+
+def _is_below_results(file: Path) -> bool:
+    """Return whether a file lies in a folder of results, or somewhere below one; above the working folder
+    none is looked for.
+    """
+    for folder in file.absolute().parents:
+        if (folder / CONFIG).is_file():
+            return True
+        if folder == Path.cwd():
+            break
+    return False
 
 
 def _check_heeded(preset: str, tasks: Sequence[dict[str, Any]], given: dict[str, Any]) -> None:

@@ -164,6 +164,8 @@ def _proposed(study: "Study", space: Space, trials: int) -> Iterator[tuple[int, 
     for stored in study.get_trials():
         for key, value in stored.params.items():
             _check_offered(key, value, space.get(key))
+        if stored.state.name == "WAITING":
+            raise InputError(f"out: {JOURNAL} holds a trial that no search began; allowed: a new folder")
         if stored.state.is_finished():
             continue
         if stored.state.name == "RUNNING" and stored.params.keys() == space.keys():
