@@ -144,7 +144,10 @@ WRONG: dict[str, tuple[str, list[str]]] = {
         "torn.net.xml: cannot be read",
         ["drive torn.sumocfg --driver pi --cav-share 0.5"],
     ),
-    "training where nobody is a CAV": ("cav_share: 0.0", ["train good.sumocfg --steps 10 --set road.cav_share=0"]),
+    "training where nobody is a CAV": (
+        "cav_share: 0.0",
+        ["train good.sumocfg --steps 10 --set road.cav_share=0"],
+    ),
     "assessing a road of the package": ("your own .sumocfg file", ["assess ring"]),
     "assessing what is missing": ("there is no such file", ["assess none.sumocfg"]),
     "shares that are words": ("shares: 'few'", ["assess good.sumocfg --shares few"]),
