@@ -101,13 +101,14 @@ def main(words: list[str]) -> None:
     """Compare all networks, and write what was found after each."""
     if words[0] == ONE:
         return drive_baseline(Path(words[1]).resolve(), float(words[2]), Path(words[3]))
-    target, found = Path(words[0]), dict[str, Any]()
+    target, found, about = Path(words[0]), dict[str, Any](), manifest()
+    del about["command"]  # it names folders of this machine
     for word in words[1:]:
         name, _, rest = word.partition("=")
         file, _, seconds = rest.rpartition(":")
         found[name] = {"seconds": float(seconds), **compare(Path(file).resolve(), float(seconds))}
         print(name, json.dumps(found[name]), flush=True)
-        write_whole(target, to_json({"manifest": manifest(), "networks": found}, indent=1))
+        write_whole(target, to_json({"manifest": about, "networks": found}, indent=1))
     return None
 
 
