@@ -352,7 +352,7 @@ def test_a_row_has_the_episode_what_was_drawn_and_every_metric() -> None:
         "length",
         "floor",
         "lanes",
-        "teleports",
+        *("teleports", "contacts"),
         "drivable",
     }
     assert set(row) == about | set(METRICS)

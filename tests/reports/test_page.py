@@ -365,9 +365,9 @@ def test_all_controls_can_be_reached_by_tab_and_have_names(open_page: Opener, dr
         assert page.get_by_role(role, name=name).count() == 1  # pyright: ignore[reportArgumentType]
 
 
-def metrics_in(folder: Path) -> list[Metric]:
-    """The metrics that the road of a folder of results has."""
-    rows = json.loads((folder / "evaluation.json").read_text())["rows"]
+def metrics_in(report: Path) -> list[Metric]:
+    """The metrics that the road of a report has."""
+    rows = json.loads((report.parent / "evaluation.json").read_text())["rows"]
     return [metric for name, metric in METRICS.items() if any(row[name] is not None for row in rows)]
 
 
