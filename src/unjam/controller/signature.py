@@ -43,7 +43,7 @@ _ORDER_8 = 0x05FC536D880238B13933C6D305ACDFD5F098EFF289F4C345B027B2C28F95E826
 SMALL_ORDER = {0, 1, FIELD_PRIME - 1, _ORDER_8, FIELD_PRIME - _ORDER_8}
 """y coordinates of the eight points whose order divides 8: with such a key one signature fits any message.
 Source: RFC 8032, section 5.1; Chalkias et al. 2020, Taming the many EdDSAs"""
-WEAK = "a weak Ed25519 key, for which anybody can sign,"
+WEAK = "a weak Ed25519 key, for which signatures can be forged,"
 SIGNED = "unjam controller, signature 1"
 """the first line of what is signed: nothing else that is signed with the same key can be taken for it"""
 

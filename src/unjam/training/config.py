@@ -253,9 +253,7 @@ def load_config(
 
 
 def _is_below_results(file: Path) -> bool:
-    """Return whether a file lies in a folder of results, or somewhere below one; above the working folder
-    none is looked for.
-    """
+    """Return whether a file lies in or below a folder of results; the search ends at the working folder."""
     for folder in file.absolute().parents:
         if (folder / CONFIG).is_file():
             return True
