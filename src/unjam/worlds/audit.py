@@ -1,7 +1,7 @@
 """Could cars and people have done that? The physics of all vehicles, in every simulation step."""
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +24,7 @@ PEOPLE, CAV, CAV_CUT_IN = 0, 1, 2
 CUT_IN = 3.0
 """time after a change of leader in which braking is counted apart [s]"""
 SETTLED = 5.0
-"""time behind the same leader after which headways are a car's own choice [s]"""
+"""time behind the same leader in which nothing is counted of how a CAV follows [s]"""
 NOTED_AT_ONCE = 1000
 """steps that are counted together: one by one takes longer than they take to drive"""
 
@@ -50,13 +50,13 @@ class Following:
     """How the CAVs followed those ahead, over all simulation steps."""
 
     headway: float = np.inf
-    """smallest time headway while faster than 1 m/s [s]"""
+    """smallest time gap while faster than 1 m/s, recovery after cut-ins excluded [s]"""
     time_to_collision: float = np.inf
     """smallest gap over closing speed [s]"""
     needed_braking: float = 0.0
     """largest deceleration rate to avoid a crash, closing speed squared over twice the gap [m/s2]"""
     share_short: float = 0.0
-    """share of the time faster than 1 m/s with a time headway below one second"""
+    """share of the time faster than 1 m/s with a time gap below one second, recovery excluded likewise"""
     jerk: float = 0.0
     """largest change of acceleration over time [m/s3]"""
     overridden: float = 0.0
@@ -121,17 +121,55 @@ class BrakingLog:
         self._whose.clear()
 
 
+class Pair(NamedTuple):
+    """A CAV and its leader in a simulation step: numbers, or arrays with an element for each of n CAVs."""
+
+    speed: Any
+    """of the CAV [m/s]"""
+    leader_speed: Any
+    """[m/s]"""
+    gap: Any
+    """net gap [m]"""
+
+
+def is_recovering(recovered_so_far: Any, lasts: Any, before: Pair, now: Pair) -> Any:
+    """Return whether a CAV still recovers from a change of its leader: a short time gap that opens.
+
+    Another vehicle that cuts in determines the first time gap, not the CAV. The CAV recovers as long as the
+    time gap to this leader has been short ever since and, after the first 5 s, increases in each step or the
+    leader is faster. Recovery that has ended does not begin again behind the same leader.
+    Source: UN Regulation No. 157, 5.2.3.3, which lets a vehicle that cannot respect the minimum time gap
+    because of other road users restore it at the next opportunity without harsh braking.
+
+    Args:
+        recovered_so_far: whether the CAV was recovering in the step before.
+        lasts: time since it has this leader [s]; zero in the first step, whatever was before.
+        before: the CAV and this leader in the step before.
+        now: both now.
+    """
+    is_short = (now.speed > MOVING_SPEED) & (now.gap < SHORT_HEADWAY * now.speed)
+    opens = (now.leader_speed > now.speed) | (now.gap * before.speed > before.gap * now.speed)
+    return is_short & ((lasts <= 0.0) | (recovered_so_far & (opens | (lasts <= SETTLED))))
+
+
 def following(
-    speed: Floats, leader_speed: Floats, gap: Floats, step: float, overridden: Any = (), yielding: Any = ()
+    speed: Floats,
+    leader_speed: Floats,
+    gap: Floats,
+    step: float,
+    overridden: Any = (),
+    yielding: Any = (),
+    recovering: Any = False,
 ) -> Following:
     """Return how CAVs followed; arrays of shape (moments, CAVs) one `step` apart, NaN where one is not there.
 
     `overridden` says which commands SUMO changed, `yielding` which were given near a crossing; any shape.
+    Moments of `recovering` CAVs, as `is_recovering` finds them, do not count for time gaps.
     Sources: TTC after Hayward 1972; DRAC after Almqvist et al. 1991; SAE J2944.
     """
     with np.errstate(invalid="ignore", divide="ignore"):
         moving, closing = speed > MOVING_SPEED, speed - leader_speed
-        headways = (gap / speed)[moving]
+        headways = (gap / speed)[moving & ~np.asarray(recovering, bool)]
         nearing = (closing > 0) & (gap > 0)
         times, needed = (gap / closing)[nearing], (closing**2 / (2.0 * gap))[nearing]
         jerks = np.abs(np.diff(speed, 2, axis=0)) / step**2

@@ -22,7 +22,9 @@ from unjam.worlds.audit import (
     SHORT_HEADWAY,
     Audit,
     Brakings,
+    Pair,
     following,
+    is_recovering,
 )
 from unjam.worlds.batch.vehicles import Vehicles
 from unjam.worlds.record import FRAMES, Episode, Trajectory, shared_columns, trajectory
@@ -83,6 +85,10 @@ class MotorwayLog:
         self._beyond = np.zeros((roads, kinds, len(BEYOND)), np.intp)
         self._leader, self._since = np.full((2, roads, self.entries), -1)
         self._steps, self._settled = 0, list[Floats]()
+        self._recovers = np.zeros((roads, self.entries), bool)
+        """whether each vehicle, if it is a CAV, recovers from a change of leader"""
+        self._pairs = np.zeros((len(Pair._fields), roads, self.entries))
+        """each of them and its leader in the last step, as `Pair` has them"""
 
     def note_step(
         self,
@@ -110,7 +116,11 @@ class MotorwayLog:
             kind[rows[lasts < CUT_IN]] = CAV_CUT_IN
             follows = (leader >= 0) & (lasts > SETTLED) & goes_on[road[rows]]
             gap = vehicles.place[leader] - self.roads[0].vehicle_length - vehicles.place[rows]
-            seen = road[rows], vehicles.speed[rows], vehicles.speed[leader], gap
+            pair = Pair(vehicles.speed[rows], vehicles.speed[leader], gap)
+            recovers = is_recovering(self._recovers[own], lasts, Pair(*self._pairs[:, *own]), pair)
+            self._recovers[own] = recovers = recovers & (leader >= 0)
+            self._pairs[:, *own] = pair
+            seen = road[rows], *pair, recovers
             self._settled.append(np.stack([each[follows].astype(np.float64) for each in seen]))
         np.add.at(self._braked, (road, kind), goes_on[road])
         hard = np.flatnonzero((vehicles.acceleration < 0.0) & goes_on[road])
@@ -142,7 +152,7 @@ class MotorwayLog:
     def episodes(self, driven: Driven, seeds: Sequence[Sequence[int]], per_road: int) -> tuple[Episode, ...]:
         """Return the record of each road; CAVs' names are `road * per_road + entry`."""
         stays, wheres = self._stays(driven, per_road), self._by_road()
-        settled = np.concatenate(self._settled, 1) if self._settled else np.zeros((4, 0))
+        settled = np.concatenate(self._settled, 1) if self._settled else np.zeros((5, 0))
         waiting = np.stack(self._waiting, 1).astype(np.float64)
         return tuple(
             self._episode(number, tuple(seed), wheres[number], stays[number], waiting[number], settled)
@@ -268,6 +278,7 @@ class MotorwayLog:
         )
         jerks = [np.abs(np.diff(each.states.speed, 2)).max(initial=0.0) for each in stays]
         jerk = max(jerks, default=0.0) / self.decision_step**2
-        speed, leader, gap = settled[:, None]
-        found = replace(following(speed, leader, gap, self.step), jerk=float(jerk))
+        speed, leader, gap, recovering = settled[:, None]
+        found = following(speed, leader, gap, self.step, recovering=recovering)
+        found = replace(found, jerk=float(jerk))
         return Audit(people, cavs, found, SHORT_HEADWAY, lanes=True, cut_in=cut_in)

@@ -1,7 +1,7 @@
 """Traffic on roads with lanes: others cut in, and a CAV's own ACC may be what follows.
 
-Who cuts in leaves less of a gap than anybody would choose. What a CAV does in the seconds after it says
-nothing of how it follows; the audit counts it apart.
+A vehicle that cuts in leaves a smaller gap than the CAV would choose. The audit counts separately how the CAV
+brakes in the seconds after a cut-in, and excludes the time gaps until it has recovered.
 """
 
 from array import array
@@ -14,7 +14,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from unjam.drivers.command import Command, time_headways
-from unjam.worlds.audit import CAV, CAV_CUT_IN, CUT_IN, PEOPLE, SETTLED, SHORT_HEADWAY, Audit, following
+from unjam.worlds.audit import (
+    CAV,
+    CAV_CUT_IN,
+    CUT_IN,
+    PEOPLE,
+    SETTLED,
+    SHORT_HEADWAY,
+    Audit,
+    Pair,
+    following,
+    is_recovering,
+)
 from unjam.worlds.record import Floats, Trajectory
 from unjam.worlds.sumo.open import OpenTraffic
 from unjam.worlds.sumo.traffic import OpenKind
@@ -41,8 +52,11 @@ class LaneTraffic(OpenTraffic[OpenKind]):
         """Run the warm-up, then hand the CAVs over; drivers remember nothing of it."""
         self._leaders: dict[str, tuple[str, int]] = {}
         """of each CAV: its leader, and the simulation step since when"""
+        self._pairs: dict[str, tuple[bool, Pair]] = {}
+        """of each CAV: whether it recovers from a change of leader, and the two in the last step"""
         self._seen = array("d")
-        """speed, leader's speed and gap of CAVs that follow the same for long, in each simulation step"""
+        """of CAVs that have had their leader for more than `SETTLED`, in each simulation step: speed, that of
+        the leader, gap, and whether they still recover"""
         self._steps = 0
         self._fastest: dict[str, float] = {}
         """of CAVs that have a set speed, how fast they would drive without it"""
@@ -91,8 +105,12 @@ class LaneTraffic(OpenTraffic[OpenKind]):
             since = (self._steps - known[1]) * step
             if since < CUT_IN:
                 whose[rows[name]] = CAV_CUT_IN
+            now = Pair(*seen)
+            so_far, before = self._pairs.get(name, (False, now))
+            recovers = bool(leader) and is_recovering(so_far, since, before, now)
+            self._pairs[name] = recovers, now
             if leader and since > SETTLED:
-                self._seen.extend(seen)
+                self._seen.extend((*now, recovers))
         return whose
 
     def _tell(self, speeds: dict[str, float]) -> None:
@@ -118,12 +136,13 @@ class LaneTraffic(OpenTraffic[OpenKind]):
     def _audit(self, trajectories: Sequence[Trajectory]) -> Audit:
         """Return the physics of every simulation step; how CAVs follow whom they have followed for long."""
         people, cavs, cut_in = map(self._brakings.of, (PEOPLE, CAV, CAV_CUT_IN))
-        speed, ahead, gap = self._settled()
-        found = following(speed, ahead, gap, self.scenario.simulation_step)
+        speed, ahead, gap, recovering = self._settled()
+        step = self.scenario.simulation_step
+        found = following(speed, ahead, gap, step, recovering=recovering)
         decided = self._decided(trajectories)
         commands = {name: getattr(decided, name) for name in ("jerk", "overridden", "yielded")}
         return Audit(people, cavs, replace(found, **commands), SHORT_HEADWAY, lanes=True, cut_in=cut_in)
 
     def _settled(self) -> Floats:
-        """Return what was seen of who follows the same for long: three arrays of shape (1, moments)."""
-        return np.array(self._seen, np.float64).reshape(-1, 3).T[:, None]
+        """Return what `_seen` holds: four arrays of shape (1, moments)."""
+        return np.array(self._seen, np.float64).reshape(-1, 4).T[:, None]
