@@ -58,6 +58,24 @@ def test_a_gain_that_acc_vehicles_have_too_is_no_reason_for_a_controller(
     assert recommended([found]) is None
 
 
+def test_what_a_controller_gains_beyond_acc_vehicles_must_matter() -> None:
+    found = replace(HELPS, beyond_acc=between(-0.4, -0.2))
+    assert found.reasons == [
+        "travel time differs from that with ACC vehicles alone at this penetration rate by less than 0.5 %, "
+        "which is too small to matter: -0.3 [-0.4, -0.2] s"
+    ]
+    assert recommended([found]) is None
+
+
+@pytest.mark.parametrize("time", [between(0.1, 0.3), between(-0.3, -0.1)])
+def test_acc_vehicles_that_change_too_little_neither_shorten_nor_lengthen(time: Estimate) -> None:
+    little = AccResult(0.2, replace(GOOD, travel_time=time))
+    small = "by less than 0.5 %, which is too small to matter"
+    assert headline([], [little]).endswith(f" ACC vehicles alone change travel time {small}.")
+    assert f"travel time differs {small}, compared with the human baseline." in little.words
+    assert headline([], [little, ACC_HELPS]).endswith("-4.0 [-6.0, -2.0] s (-4.0 %) at 20 %.")
+
+
 def test_the_answer_is_the_largest_gain_among_those_that_pass() -> None:
     judged = [HELPS, QUICK_AND_WRONG, HELPS_MORE]
     assert recommended(judged) == shown_beside(judged) == HELPS_MORE

@@ -2,7 +2,8 @@
 
 The rule is one for all roads. A controller is recommended only where travel time is shown to be shorter than
 with human drivers alone and than with ACC vehicles at the same penetration rate, flow is shown not to be
-lower, the CAVs are feasible, and human drivers do not brake hard more often.
+lower, the CAVs are feasible, and human drivers do not brake hard more often. A difference of travel time that
+is shown to be smaller than 0.5 % is no gain and no harm.
 """
 
 from collections.abc import Sequence
@@ -29,6 +30,8 @@ from unjam.measures.statistics import (
 
 FLOW_LOST = 0.01
 """share of people's flow that the interval must exclude as a loss"""
+SMALLEST_EFFECT = 0.005
+"""share of the baseline's travel time below which a difference is too small to matter"""
 MOST_TELEPORTS = 0.01
 """share of the baseline's vehicles that SUMO may teleport or remove: more of them distort all travel times"""
 LITTLE_DELAY = 0.05
@@ -39,6 +42,7 @@ LEAST_JUDGED = 10
 TIME, FLOW, FUEL = "travel_time", "throughput_veh_per_h", "fuel_ml_per_km"
 HARD = "people_beyond_4_5"
 NONE = "No controller is recommended on this road"
+TOO_SMALL = f"less than {100 * SMALLEST_EFFECT:g} %, which is too small to matter"
 
 
 @dataclass(frozen=True)
@@ -94,6 +98,17 @@ class Effect:
     def relative_time(self) -> float:
         """Difference of travel time, as a share of people's."""
         return self.travel_time.mean / self.people_time
+
+    @property
+    def is_too_small(self) -> bool:
+        """Whether the difference of travel time is shown to be too small to matter."""
+        return is_too_small(self.travel_time, self.people_time)
+
+
+def is_too_small(difference: Estimate, baseline_time: float) -> bool:
+    """Return whether the whole interval of a difference is below 0.5 % of the baseline's travel time [s]."""
+    least = SMALLEST_EFFECT * baseline_time
+    return -least < difference.low and difference.high < least
 
 
 def effect_of(
@@ -155,7 +170,7 @@ def _harms(effect: Effect) -> tuple[tuple[bool, str], ...]:
     """Return whether travel time and flow are shown to be worse, each with the words for it."""
     longer = f"travel time is longer than that of the human baseline: {signed(effect.travel_time, 1)} s"
     lower = f"flow is lower than that of the human baseline: {signed(effect.flow)} veh/h"
-    return (effect.travel_time.low > 0, longer), (effect.flow.high < 0, lower)
+    return (effect.travel_time.low > 0 and not effect.is_too_small, longer), (effect.flow.high < 0, lower)
 
 
 def reasons_against(effect: Effect) -> list[str]:
@@ -174,7 +189,12 @@ def reasons_against(effect: Effect) -> list[str]:
         (effect.teleports <= 0, f"{effect.teleports} more vehicles teleported or removed than without CAVs"),
         *((not worse, words) for worse, words in _harms(effect)),
         (
-            effect.travel_time.low > 0 or effect.travel_time.high < 0,
+            not effect.is_too_small,
+            f"travel time differs from that of the human baseline by {TOO_SMALL}: "
+            f"{signed(effect.travel_time, 1)} s",
+        ),
+        (
+            effect.travel_time.low > 0 or effect.travel_time.high < 0 or effect.is_too_small,
             "travel time is not shown to be shorter than that of the human baseline: "
             f"{signed(effect.travel_time, 1)} s",
         ),
@@ -222,9 +242,11 @@ class AccResult:
     def words(self) -> str:
         """The finding, in a sentence or two."""
         time = self.effect.travel_time
-        shown = "longer" if time.low > 0 else "shorter" if time.high < 0 else "not shown to differ"
+        shown = "is longer" if time.low > 0 else "is shorter" if time.high < 0 else "is not shown to differ"
+        if self.effect.is_too_small:
+            shown = f"differs by {TOO_SMALL},"
         words = (
-            f"ACC vehicles alone at a penetration rate of {percent(self.share)}: travel time is {shown} "
+            f"ACC vehicles alone at a penetration rate of {percent(self.share)}: travel time {shown} "
             "compared with the human baseline. "
             f"Differences: {self.effect.words}{_undecided(self.missing, time, 2)}."
         )
@@ -250,7 +272,12 @@ class Judged:
     def reasons(self) -> list[str]:
         """Why it is not recommended; none where it is."""
         beyond, reasons = self.beyond_acc, reasons_against(self.effect)
-        if not beyond.high < 0:
+        if is_too_small(beyond, self.effect.people_time):
+            reasons.append(
+                "travel time differs from that with ACC vehicles alone at this penetration rate by "
+                f"{TOO_SMALL}: {signed(beyond, 1)} s"
+            )
+        elif not beyond.high < 0:
             shown = "longer than" if beyond.low > 0 else "not shown to be shorter than"
             difference = signed(beyond, 1)
             reasons.append(
@@ -332,13 +359,15 @@ def headline(
         first = f"{NONE} so far: for some of them there is no verdict yet."
     else:
         first = f"{NONE}: none passes the rule."
-    gains = [each for each in acc if each.effect.travel_time.high < 0]
+    gains = [each for each in acc if each.effect.travel_time.high < 0 and not each.effect.is_too_small]
     if gains:
         most = min(gains, key=lambda each: each.effect.relative_time)
         time, cut = signed(most.effect.travel_time, 1), 100 * most.effect.relative_time
         second = f"shorten travel time: {time} s ({cut:+.1f} %) at {percent(most.share)}"
-    elif any(each.effect.travel_time.low > 0 for each in acc):
+    elif any(each.effect.travel_time.low > 0 and not each.effect.is_too_small for each in acc):
         second = "lengthen travel time"
+    elif acc and all(each.effect.is_too_small for each in acc):
+        second = f"change travel time by {TOO_SMALL}"
     else:
         second = "are not shown to shorten travel time"
     if not best and (free := near_free_flow(baseline)):

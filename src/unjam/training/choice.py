@@ -18,6 +18,7 @@ from unjam.measures.effect import (
     Judged,
     effect_of,
     harm_of,
+    is_too_small,
     percent,
     seeds_for_verdict,
 )
@@ -232,7 +233,8 @@ def _judged(option: Option, rows: dict[Option, Rows], confidence: float, precisi
 def _is_refused(effect: Effect, beyond_acc: Estimate) -> bool:
     """Return whether more test seeds can hardly lead to a recommendation."""
     harms = bool(harm_of(effect)) or beyond_acc.low > 0
-    return bool(effect.failed) or harms or effect.drivable != DRIVABLE
+    nothing = effect.is_too_small or is_too_small(beyond_acc, effect.people_time)
+    return bool(effect.failed) or harms or nothing or effect.drivable != DRIVABLE
 
 
 def _acc_result(option: Option, rows: dict[Option, Rows], confidence: float, precision: float) -> AccResult:
@@ -243,7 +245,8 @@ def _acc_result(option: Option, rows: dict[Option, Rows], confidence: float, pre
         paired_difference(rows[option], unchanged, "travel_time", confidence) if unchanged else None
     )
     needed = seeds_for_verdict(effect.travel_time, precision * effect.people_time)
-    return AccResult(option.share, effect, of_properties, max(0.0, needed - effect.travel_time.count))
+    missing = 0.0 if effect.is_too_small else max(0.0, needed - effect.travel_time.count)
+    return AccResult(option.share, effect, of_properties, missing)
 
 
 def _is_open(found: Judged, affordable: int, precision: float) -> bool:
