@@ -1,4 +1,4 @@
-"""Injects thousands of faults, and writes down what happened: results/soak/soak.json. Takes half an hour.
+"""Injects thousands of faults, and writes down what happened: results/soak.json. Takes half an hour.
 
 Run: python tests/faults/soak.py [NAME ...]
 """
@@ -19,7 +19,7 @@ from unjam.errors import wrong_name  # noqa: E402
 from unjam.files import to_json, write_whole  # noqa: E402
 from unjam.manifest import manifest  # noqa: E402
 
-TARGET = ROOT / "results" / "soak" / "soak.json"
+TARGET = ROOT / "results" / "soak.json"
 
 
 def soak(names: list[str]) -> None:

@@ -12,7 +12,7 @@ from tests.test_sandbox import kept
 MARKS = {True: [pytest.mark.slow], False: []}
 NEEDED = {"sandbox": kept}
 """what the kernel must offer for a fault to be tried"""
-SOAK = Path(__file__).parents[2] / "results" / "soak" / "soak.json"
+SOAK = Path(__file__).parents[2] / "results" / "soak.json"
 
 
 @pytest.mark.long

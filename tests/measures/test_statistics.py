@@ -1,4 +1,3 @@
-import json
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -26,10 +25,11 @@ from unjam.measures.statistics import (
     two_modes,
     verdict_on,
 )
+from unjam.studies.results_file import read_part
 
 COUNTS = (3, 5, 10, 20)
 REPEATS = 500
-RING = Path(__file__).parents[2] / "results" / "drivable" / "ring.json"
+DRIVABLE = Path(__file__).parents[2] / "results" / "drivable.json"
 NUMBERS = st.lists(st.floats(-1e3, 1e3), min_size=2, max_size=12)
 
 
@@ -56,7 +56,7 @@ def test_intervals_of_ratios_cover_what_they_say(count: int) -> None:
 
 def returns_on_ring() -> dict[str, np.ndarray]:
     """The returns of each driver that was measured on the ring, a row per length of it."""
-    found = json.loads(RING.read_text())
+    found = read_part(DRIVABLE, "ring")
     return {
         driver: np.array(
             [[row["return"] for row in lengths[driver]["episodes"]] for lengths in found.values()]

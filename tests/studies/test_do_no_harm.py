@@ -160,12 +160,12 @@ def test_the_study_ends_by_itself_and_goes_on_where_it_was_stopped(
     monkeypatch.setattr(Workers, "run_each", stopped_in_the_second)
     with pytest.raises(KeyboardInterrupt):
         DO_NO_HARM.write(StudyFolder(tmp_path), 1, tmp_path, 1)
-    first = json.loads((tmp_path / RESULTS).read_text())
+    first = json.loads((tmp_path / f"{RESULTS}.json").read_text())
     assert list(first) == ["a"]
     for _ in range(2):  # the second time nothing is left to drive
         DO_NO_HARM.write(StudyFolder(tmp_path), 1, tmp_path, 1)
     assert batches == [15, 15, 15], "human drivers, and both others at two penetration rates, on three seeds"
-    assert json.loads((tmp_path / RESULTS).read_text())["a"] == first["a"]
+    assert json.loads((tmp_path / f"{RESULTS}.json").read_text())["a"] == first["a"]
     table = DO_NO_HARM.tables["harm"](tmp_path)
     assert table["road"].tolist() == ["a", "a", "b", "b"]
     assert set(table["verdict"]) == {PASSED}

@@ -1,6 +1,5 @@
 """Does the study of all roads say what its files hold?"""
 
-import json
 from functools import partial
 from math import nan
 from pathlib import Path
@@ -23,9 +22,10 @@ from unjam.studies.everywhere import (
     picture,
     table,
 )
+from unjam.studies.results_file import read_part
 from unjam.training.family import FAMILY
 
-RESULTS = Path(__file__).parents[2] / "results/everywhere"
+RESULTS = Path(__file__).parents[2] / "results/everywhere.json"
 
 
 def test_each_road_has_a_row_and_the_mean_and_the_worst_follow() -> None:
@@ -72,7 +72,7 @@ def test_the_best_of_a_road_gains_what_its_one_says() -> None:
 
 
 def test_the_best_of_a_road_could_have_driven_so_in_every_episode() -> None:
-    rows = json.loads((RESULTS / "00.json").read_text())["rows"]
+    rows = read_part(RESULTS, "00")["rows"]
     measured = {who: [{**row, "travel_time": nan} for row in rows[who]] for who in (PEOPLE, "unjam:best")}
     careful = measured["unjam:best"]
     reckless = [{**row, "mean_speed_second_half": 9.0} for row in careful]
@@ -97,7 +97,7 @@ def test_only_what_is_not_known_is_driven_and_the_best_may_be_another(
         asked.append([*drivers.values()])
         return {label: [{**row, "mean_speed_second_half": speeds[name]}] for label, name in drivers.items()}
 
-    found = json.loads((RESULTS / "00.json").read_text())
+    found = read_part(RESULTS, "00")
     row = {**found["rows"]["unjam:best"][0], "travel_time": nan}
     files = {"unjam:ring-tuned": "one"}
     monkeypatch.setattr(everywhere, "driven", driven)

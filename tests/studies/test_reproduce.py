@@ -3,6 +3,7 @@ import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from zipfile import ZipFile
 
 import numpy as np
 import pandas as pd
@@ -13,6 +14,7 @@ from unjam.files import write_whole
 from unjam.studies import STUDIES, TOGETHER, study
 from unjam.studies.comparison import comparison_of
 from unjam.studies.reproduce import estimated_seconds, make_plan, reproduce, studies_of
+from unjam.studies.results_file import read_parts
 from unjam.studies.study import PlannedRun, StudyFolder
 from unjam.training.folder import read_config
 
@@ -72,6 +74,12 @@ def test_a_study_leaves_its_trainings_numbers_picture_and_manifest(reproduced: M
     assert {path.name for path in (folder / "little").iterdir()} == {
         *("table.json", "table.csv", "curves.json", "curves.png", "manifest.json", "controllers")
     }
+    one_file = read_parts(folder / "little.json")
+    assert one_file == read_parts(folder / "little")
+    assert list(one_file) == ["manifest", "curves", "table"]
+    assert (folder / "little-curves.png").read_bytes() == (folder / "little/curves.png").read_bytes()
+    with ZipFile(folder / "little-controllers.zip") as archive:
+        assert {*archive.namelist()} == {path.name for path in (folder / "little/controllers").iterdir()}
     kept, made = folder / "little/controllers/virtual-1.unjam", folder / "runs/little/virtual/1"
     assert kept.read_bytes() == (made / "controller.unjam").read_bytes()
     assert sum("failed" in line for line in told) == 0

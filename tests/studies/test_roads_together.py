@@ -8,12 +8,13 @@ import pytest
 
 from unjam.drivers.by_road import SEVERAL
 from unjam.studies.everywhere import JUDGING
+from unjam.studies.results_file import read_part
 from unjam.studies.roads_together import BESIDE, FRESH, RINGS, SHARED, _on_road, controller_for, table
 from unjam.studies.study import PlannedRun, StudyFolder
 from unjam.training.family import FAMILY, family_roads
 from unjam.training.presets import RINGS_TUNED
 
-EVERYWHERE = Path(__file__).parents[2] / "results/everywhere"
+EVERYWHERE = Path(__file__).parents[2] / "results/everywhere.json"
 
 
 @pytest.fixture
@@ -21,7 +22,7 @@ def folder(tmp_path: Path) -> Path:
     """Three rings with three trainings each, which drive as known drivers do."""
     for number, name in enumerate(("ring-22-grown", "ring-44-grown", "ring-22-dense")):
         at = list(FAMILY).index(name)
-        found = json.loads((EVERYWHERE / f"{at:02d}.json").read_text())
+        found = read_part(EVERYWHERE, f"{at:02d}")
         rows = found["rows"]
         careful, slow = rows["unjam:best"], rows["jam-ahead"]
         found["rows"] |= dict.fromkeys(BESIDE, careful) | {found["best"]: careful}

@@ -6,7 +6,8 @@ import pytest
 from unjam.errors import EpisodeError
 from unjam.scenarios import Ring
 from unjam.studies import study
-from unjam.studies.parts import SHIPPED_THEN, Part, measure_parts, read_part
+from unjam.studies.parts import SHIPPED_THEN, Part, measure_parts
+from unjam.studies.results_file import read_part
 from unjam.studies.study import about_study, judged
 from unjam.training.evaluate import Evaluation
 from unjam.worlds.workers import Workers

@@ -22,12 +22,12 @@ def test_what_cells_made_is_kept_until_a_measured_file_or_code_changes(
 ) -> None:
     monkeypatch.setattr(cells, "ROOT", tmp_path)
     made_of = [
-        tmp_path / "results/ring/ring.json",
+        tmp_path / "results/ring.json",
         tmp_path / "src/unjam/table.py",
         tmp_path / "docs/tables.py",
     ]
     for path in made_of:
-        path.parent.mkdir(parents=True)
+        path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text("1")
     build, found = tmp_path / "build", []
     for path in (None, *made_of):

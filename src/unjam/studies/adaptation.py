@@ -23,7 +23,8 @@ from unjam.physics.idm import PAPER_IDM, IDMParameters, idm_acceleration
 from unjam.reports.figures import LINES, MUTED, STYLE, new_figure, png_bytes
 from unjam.scenarios.ring import Ring
 from unjam.studies.everywhere import PI_ON_RINGS
-from unjam.studies.parts import measure_parts, read_part
+from unjam.studies.parts import measure_parts
+from unjam.studies.results_file import read_part
 from unjam.studies.study import Study, StudyFolder
 from unjam.training.family import GROWING, HURRIED
 from unjam.training.seeds import held_out_seeds

@@ -32,8 +32,8 @@ from unjam.measures.statistics import (
 from unjam.measures.table import cell_of, unbroken
 from unjam.reports.figures import INK, LINES, STYLE, new_figure, png_bytes, space_time
 from unjam.reports.results import Shown, read_results, validations_of
-from unjam.studies.parts import read_part
 from unjam.studies.references import best_expert
+from unjam.studies.results_file import read_part
 from unjam.studies.study import (
     PAPERS_ROADS,
     ROADS,

@@ -28,6 +28,7 @@ from unjam.scenarios import make_scenario
 from unjam.scenarios.own_network import WITH_OWN_ACC
 from unjam.studies.harm_roads import HARM_ROADS, HarmRoad, write_road
 from unjam.studies.parts import file_of
+from unjam.studies.results_file import read_part
 from unjam.studies.study import Study, StudyFolder, Table
 from unjam.training.evaluate import raise_failure
 from unjam.training.seeds import held_out_seeds
@@ -49,7 +50,7 @@ LEAST_FLOW = 0.2
 """share of the capacity that must flow there meanwhile: a few slow vehicles are no breakdown"""
 PLACE, PERIOD = 250.0, 30.0
 """length [m] and time [s] over which mean speeds are taken"""
-RESULTS = "do-no-harm.json"
+RESULTS = "do-no-harm"
 KEPT = (
     *("seed", "status", TIME, FLOW, "collisions", "drivable", "floor", "lanes", "overridden", HARD),
     *("min_headway", "share_short_headway", "cav_min_ttc", "cav_max_braking", "cut_in_max_braking"),
@@ -137,8 +138,8 @@ def _has_breakdown(found: Mapping[str, Any]) -> bool:
 
 def _write(studies: StudyFolder, seeds: int, folder: Path, workers: int) -> None:
     """Drive what is missing; what is there stays, unless the controller or the road is another one now."""
-    path = folder / RESULTS
-    results = _read_results(path)
+    path = folder / f"{RESULTS}.json"
+    results = _read_results(folder) if path.is_file() else {}
     with TemporaryDirectory() as place, Workers(workers) as pool:
         for number, (name, road) in enumerate(HARM_ROADS.items()):
             about = {"controller": file_of(CONTROLLER), "road": json.loads(to_json(asdict(road)))}
@@ -153,9 +154,9 @@ def _write(studies: StudyFolder, seeds: int, folder: Path, workers: int) -> None
                 write_whole(path, to_json(results, indent=1))
 
 
-def _read_results(path: Path) -> dict[str, Any]:
+def _read_results(study: Path) -> dict[str, Any]:
     """Return what is known of each road; numbers that are null in the file are NaN."""
-    results: dict[str, Any] = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+    results: dict[str, Any] = read_part(study, RESULTS)
     for row in (row for found in results.values() for rows in found["rows"].values() for row in rows):
         row |= {name: nan for name, value in row.items() if value is None}
     return results
@@ -197,7 +198,7 @@ def _drive_batch(
 def harm_table(folder: Path) -> pd.DataFrame:
     """Return the comparison with the ACC alone and the verdict, for each road and penetration rate."""
     table: Table = []
-    for (name, found), rate in product(_read_results(folder / RESULTS).items(), PENETRATION_RATES):
+    for (name, found), rate in product(_read_results(folder).items(), PENETRATION_RATES):
         road, rows = HARM_ROADS[name], found["rows"]
         acc, own = (rows[_label(driver, rate)] for driver in (ACC, CONTROLLER))
         judged, slow = _judgment(found, rate), [row["breakdown"] for row in rows[PEOPLE]]

@@ -25,7 +25,7 @@ from unjam.physics.arrays import Floats
 from unjam.scenarios.figure_eight import FigureEight
 from unjam.scenarios.ring import Ring
 from unjam.scenarios.scenario import Scenario
-from unjam.studies.parts import read_part
+from unjam.studies.results_file import read_part
 from unjam.studies.study import Study, StudyFolder, judged, planned
 from unjam.training.family import GROWN
 from unjam.training.presets import BEST
@@ -46,7 +46,7 @@ JAMMED_LONG = (
     "time_constant=2.976,fading=26,watched_share=0"
 )
 """what `unjam tune ring-jammed --expert pi-from-gap --steps 12000000` finds within the bounds that were given
-for `unjam:ring-jammed-tuned`, which had half of these steps: results/tuned has both commands"""
+for `unjam:ring-jammed-tuned`, which had half of these steps: results/tuned.json has both commands"""
 PACER_LONG = (
     "pacer:varying=true,gathering_speed=1.96,gathering_gap=0.319,regathering_gap=0.1595,time_constant=0.0966"
 )

@@ -30,7 +30,8 @@ from unjam.scenarios.figure_eight import FigureEight
 from unjam.scenarios.on_ramp import OnRamp
 from unjam.scenarios.ring import Ring
 from unjam.scenarios.scenario import Scenario
-from unjam.studies.parts import file_of, read_part
+from unjam.studies.parts import file_of
+from unjam.studies.results_file import read_part
 from unjam.studies.study import Study, StudyFolder, judged
 from unjam.training.export import export_controller
 from unjam.training.family import GROWN

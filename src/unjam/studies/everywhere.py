@@ -25,6 +25,7 @@ from unjam.physics.arrays import Floats
 from unjam.reports.figures import INK, new_figure
 from unjam.scenarios.scenario import Scenario
 from unjam.studies.parts import file_of
+from unjam.studies.results_file import read_parts
 from unjam.studies.study import Study, StudyFolder
 from unjam.training.family import FAMILY, KINDS
 from unjam.training.seeds import held_out_seeds, tuning_seeds
@@ -52,7 +53,7 @@ JAM_ON_ALL = (
     "jam-ahead:first=2,last=3,margin=-2.086,margin_by_share=19.15,lowest=3.369,slowing=0.5985,"
     "all_lanes=False,time_constant=1.678,jam=0.652"
 )
-"""what `unjam tune everywhere` finds for three experts, results/tuned"""
+"""what `unjam tune everywhere` finds for three experts, results/tuned.json"""
 TUNED: dict[str, tuple[str, ...]] = {
     "rings": (
         *("pi", "unjam:ring-tuned", "unjam:ring-gap-tuned", "unjam:ring-jammed-tuned", "unjam:rings-tuned"),
@@ -168,8 +169,9 @@ def gains_of(folder: Path) -> dict[str, dict[str, Any]]:
     Speeds are means of the whole episode, start and waves included, seed by seed [m/s].
     """
     roads: dict[str, dict[str, Any]] = {}
-    for file in sorted(folder.glob("[0-9]*.json")):
-        found = json.loads(file.read_text())
+    for number, found in read_parts(folder).items():
+        if not number.isdecimal():
+            continue
         rows: dict[str, Rows] = {
             label: [{key: np.nan if value is None else value for key, value in row.items()} for row in of]
             for label, of in found["rows"].items()

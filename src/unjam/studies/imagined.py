@@ -16,7 +16,7 @@ import pandas as pd
 from unjam.measures.statistics import over_trainings
 from unjam.measures.table import cell_of
 from unjam.studies.comparison import comparison_of
-from unjam.studies.parts import read_part
+from unjam.studies.results_file import read_part
 from unjam.studies.study import VARIANTS, PlannedRun, Study
 from unjam.worlds.record import Floats
 

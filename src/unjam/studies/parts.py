@@ -13,6 +13,7 @@ from typing import Any
 from unjam.children import isolated_start
 from unjam.controller import SHIPPED, shipped_file
 from unjam.files import make_folder, to_json, write_whole
+from unjam.studies.results_file import read_part
 
 SHIPPED_THEN = "shipped-then.json"
 """which files the shipped controllers were that drove in parts of a study, by part"""
@@ -72,8 +73,3 @@ def _shipped_in(arguments: Any) -> dict[str, str]:
         return _shipped_in(list(arguments.values()))
     inner = arguments if isinstance(arguments, list | tuple) else ()
     return {name: file for each in inner for name, file in _shipped_in(each).items()}
-
-
-def read_part(folder: Path, name: str) -> Any:
-    """Return what a part has answered."""
-    return json.loads((folder / f"{name}.json").read_text(encoding="utf-8"))

@@ -19,7 +19,7 @@ from unjam.measures.statistics import estimate_on_shared_seeds
 from unjam.measures.table import PEOPLE, cell_of
 from unjam.scenarios.on_ramp import ON_RAMP
 from unjam.studies.drivable import NOTHING, in_a_word
-from unjam.studies.parts import read_part
+from unjam.studies.results_file import read_part
 from unjam.studies.study import Study, StudyFolder, judged, planned
 from unjam.training.presets import ON_RAMP_LONG
 from unjam.worlds.workers import Workers

@@ -48,7 +48,7 @@ TUNED: dict[str, dict[str, str]] = {
     },
     "on-ramp": {"tuned jam-ahead": "unjam:on-ramp-tuned"},
 }
-"""what `unjam tune` found, with as many steps as learners have, or more (results/tuned); on the merge no
+"""what `unjam tune` found, with as many steps as learners have, or more (results/tuned.json); on the merge no
 setting is drivable, and none is tuned"""
 NO_EXPERTS = ("human", "zero", "constant +0.1")
 """references that nobody would add to"""

@@ -15,6 +15,7 @@ from unjam.scenarios import SCENARIOS
 from unjam.studies import STUDIES, TOGETHER
 from unjam.studies.parts import OnProgress
 from unjam.studies.references import drive_references
+from unjam.studies.results_file import collect_results
 from unjam.studies.study import ROADS, PlannedRun, Study, StudyFolder, about_study
 from unjam.training.executors import Executor, run_all, training_command
 from unjam.training.folder import read_config
@@ -89,6 +90,8 @@ def reproduce(
 ) -> list[Path]:
     """Make what is missing, `workers` trainings at once, draw the studies, and return their folders.
 
+    Beside the folder of each study lies its results file, NAME.json.
+
     A study that was stopped goes on where it was: trainings from their last checkpoint. With `ray` they run
     on a cluster whose machines share the folder.
 
@@ -117,6 +120,7 @@ def reproduce(
         about = {"study": name, "title": study.title, "seeds": plan.seeds, **begun}
         about["trainings"] = [_trained_by(run, studies) for run in study.runs(plan.seeds)]
         write_whole(target / "manifest.json", to_json(about, indent=1))
+        collect_results(target)
     return [studies.folder / name for name in plan.names]
 
 

@@ -27,7 +27,8 @@ from unjam.reports.figures import png_bytes, space_time
 from unjam.reports.results import read_results
 from unjam.scenarios import make_scenario
 from unjam.studies.comparison import HONEST, entries, estimates, interval, number, table_rows, write_table
-from unjam.studies.parts import OnProgress, read_part
+from unjam.studies.parts import OnProgress
+from unjam.studies.results_file import read_part
 from unjam.studies.study import ROADS, PlannedRun, Study, StudyFolder, Table, planned
 from unjam.training.config import load_config
 from unjam.training.evaluate import TRAINED, Evaluation, evaluate, raise_failure, save_evaluation

@@ -26,7 +26,7 @@ from unjam.measures.statistics import estimate_of, over_trainings
 from unjam.reports.figures import LINES, STYLE, new_figure, png_bytes, stacked_bars
 from unjam.reports.results import read_progress, seconds_by_part
 from unjam.studies.comparison import entries
-from unjam.studies.parts import read_part
+from unjam.studies.results_file import read_part
 from unjam.studies.study import PAPERS_ROADS, VARIANTS, PlannedRun, Study, StudyFolder, Table, planned
 from unjam.training.evaluate import evaluate
 from unjam.training.folder import start_folder

@@ -17,7 +17,7 @@ from unjam.files import to_json, write_whole
 from unjam.measures.statistics import over_trainings
 from unjam.measures.table import cell_of
 from unjam.studies.comparison import comparison_of
-from unjam.studies.parts import read_part
+from unjam.studies.results_file import read_part
 from unjam.studies.study import LAST_SHARE, VARIANTS, Study, StudyFolder, Table, TrainedRun
 from unjam.training.config import load_config
 from unjam.training.stopping import has_converged
