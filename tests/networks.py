@@ -14,6 +14,7 @@ from collections import defaultdict
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 
@@ -59,6 +60,13 @@ def count_different(found: Trips, plain: Trips) -> int:
     return sum(rows[0].get(name) != rows[1].get(name) for name in rows[0].keys() | rows[1].keys())
 
 
+def count_teleports(statistics: Path) -> int:
+    """Return the teleports of SUMO's statistic output: what it prints may be cut by a warning."""
+    found = ElementTree.parse(statistics).getroot().find("teleports")
+    assert found is not None
+    return int(found.attrib["total"])
+
+
 def drive_baseline(path: Path, seconds: float, out: Path) -> None:
     """Drive the human baseline and write its trips, the seed that SUMO had, and its teleports."""
     end = read_sumo_files(path).begin + seconds
@@ -83,15 +91,16 @@ def compare(path: Path, seconds: float) -> dict[str, Any]:
         trips: Trips = unpack(Trips, found["trips"], arrays)
         end = read_sumo_files(path).begin + seconds + make_scenario(str(path)).simulation_step
         command = [sumo_program("sumo"), "-c", str(path), "--seed", str(found["seed"]), "--end", str(end)]
-        command += [*trip_options(plain_file), "--no-step-log", "--duration-log.statistics"]
+        statistics = folder / "statistics.xml"
+        command += [*trip_options(plain_file), "--no-step-log", "--statistic-output", str(statistics)]
         printed, code, plain_cost = run_measured(command, folder)
         if code:
             return {"refused": f"plain SUMO ends with code {code}: {printed.strip()[-300:]}"}
         plain = read_trips(plain_file, ANY_CLASS, 0.0)
-    teleports = [int(line.split()[1]) for line in printed.splitlines() if line.startswith("Teleports: ")]
+        teleports = count_teleports(statistics)
     return {
         "human_baseline": {**facts_of(trips), "teleports": found["teleports"], **cost},
-        "plain_sumo": {**facts_of(plain), "teleports": sum(teleports), **plain_cost},
+        "plain_sumo": {**facts_of(plain), "teleports": teleports, **plain_cost},
         "different_trips": count_different(trips, plain),
         "status": found["status"],
     }

@@ -360,7 +360,8 @@ def test_an_end_of_file_in_the_users_code_is_not_the_end_of_the_worker(
 
 def test_a_road_that_sumo_refuses_fails_in_sumos_words_and_the_worker_goes_on(workers: Workers) -> None:
     good = EpisodeTask(SHORT, IDM(), (0,))
-    failed, found = workers.run([EpisodeTask(replace(SHORT, emission_class="coal"), IDM(), (5,)), good])
+    bad = EpisodeTask(replace(SHORT, emission_class="coal"), IDM(), (5,))
+    _, failed, found = workers.run([good, bad, good])
     assert (failed.status, failed.error) == ("failed", "RefusedError")
     assert "'coal' doesn't exist" in failed.reason
     assert fingerprint(found) == fingerprint(run_episode(SHORT, IDM(), (0,)))

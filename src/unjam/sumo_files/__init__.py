@@ -98,6 +98,8 @@ class SumoFiles(NamedTuple):
     """[s]; None: when the last vehicle has arrived"""
     first_departure: float | None
     """when the first vehicle departs at the earliest [s]; None where that cannot be told"""
+    calibrated_until: float
+    """until when calibrators may bring vehicles at the latest [s]; zero: there are none"""
     step: float
     """[s]"""
     options: dict[str, str]
@@ -118,6 +120,8 @@ class SumoFiles(NamedTuple):
 
 _known: dict[Path, tuple[dict[Path, tuple[int, int]], SumoFiles]] = {}
 """what was read already, with the stamps of all files that were read for it"""
+_answers: dict[str, dict[str, Any]] = {}
+"""of each configuration that was read: what the program answered, as it is passed on to other processes"""
 
 
 def read_sumo_files(path: Path) -> SumoFiles:
@@ -131,12 +135,26 @@ def read_sumo_files(path: Path) -> SumoFiles:
         stamps, files = _known[path]
         if all(file.is_file() and stamp_of(file) == before for file, before in stamps.items()):
             return files
-    found = _ask("configuration", path)
-    stamps = {Path(file): (time, size) for file, (time, size) in found.pop("stamps").items()}
+    return take_answer(str(path), _ask("configuration", path))
+
+
+def answer_of(path: str) -> dict[str, Any] | None:
+    """Return what another process needs in order not to read a configuration again; None: it was not read."""
+    return _answers.get(path)
+
+
+def take_answer(file: str, answer: dict[str, Any]) -> SumoFiles:
+    """Note and return what a .sumocfg file says, of which the program has answered this in some process.
+
+    Raises:
+        InputError: SUMO has no such option, or it changes the traffic and cannot be passed on.
+    """
+    path, found = Path(file), dict(answer)
+    stamps = {Path(each): (time, size) for each, (time, size) in found.pop("stamps").items()}
     found["network"], found["sources"] = Path(found["network"]), tuple(stamps)
     for name in ("additional_files", "route_files", "weight_files"):
         found[name] = tuple(map(Path, found[name]))
-    found["to_copy"] = {Path(file): tuple(map(Path, made)) for file, made in found["to_copy"].items()}
+    found["to_copy"] = {Path(each): tuple(map(Path, made)) for each, made in found["to_copy"].items()}
     found["used_types"] = frozenset(found["used_types"])
     options: dict[str, str] = found["options"]
     kinds = {name: kind_of_option(path.name, name, value) for name, value in options.items()}
@@ -147,7 +165,7 @@ def read_sumo_files(path: Path) -> SumoFiles:
     )
     found["replaced"] = tuple(name for name in options if kinds[name] == "replaced")
     files = SumoFiles(path, **found)
-    _known[path] = stamps, files
+    _known[path], _answers[file] = (stamps, files), answer
     return files
 
 

@@ -26,6 +26,8 @@ from unjam.sumo_files.reader import Attributes, Broken, Notes, Reader, check_exi
 
 DEFAULT_TYPE = "DEFAULT_VEHTYPE"
 """SUMO's type of vehicles that name none"""
+MODE_TYPES = {"car": DEFAULT_TYPE, "bicycle": "DEFAULT_BIKETYPE"}
+"""types of the vehicles that SUMO creates for a person's trip that names modes alone"""
 OTHER_DEFAULT_TYPES = {"DEFAULT_BIKETYPE": "bicycle", "DEFAULT_TAXITYPE": "taxi", "DEFAULT_RAILTYPE": "rail"}
 """vehicle classes of SUMO's other types that no file need define"""
 DEMAND = {"vehicle": "depart", "trip": "depart", "flow": "begin"}
@@ -96,7 +98,9 @@ def _configuration(path: Path) -> dict[str, Any]:
         stamps = {**reader.sources, **stamps}
     _check_network(network, readers[network])
     if not demand.wanted:
-        raise Broken(f"{path.name}: its route and additional files have no vehicle, trip or flow")
+        raise Broken(
+            f"{path.name}: its route and additional files have no vehicle, trip, flow or personal car"
+        )
     begin = _seconds(path, options, "begin", 0.0) or 0.0
     end = _seconds(path, options, "end", None)
     if end is not None and end <= begin:
@@ -112,6 +116,7 @@ def _configuration(path: Path) -> dict[str, Any]:
         "begin": begin,
         "end": end,
         "first_departure": demand.first,
+        "calibrated_until": demand.last_end if demand.calibrates else 0.0,
         "step": _seconds(path, options, "step-length", 1.0) or 1.0,
         "used_types": sorted(demand.used_types()),
         "types": demand.types,
@@ -213,6 +218,10 @@ class _Demand:
         """types and distributions that vehicles have"""
         self.first: float | None = inf
         """when the first vehicle departs [s]; None where that cannot be told"""
+        self.calibrates = False
+        """whether there is a calibrator: SUMO does not count among those it expects whom it will bring"""
+        self.last_end = 0.0
+        """the latest end of a flow that names one [s], in calibrators and elsewhere"""
         self._mixtures: dict[str, set[str]] = {}
         """types of each distribution; it may be used in another file than the one that defines it"""
         self.type_parameters: dict[str, Attributes] = {}
@@ -227,17 +236,30 @@ class _Demand:
         vehicles = {tag: partial(self._note_vehicle, depart) for tag, depart in DEMAND.items()}
         types = {"vType": self._note_type, "vTypeDistribution": self._note_mixture}
         persons = dict.fromkeys(("person", "personFlow"), self._note_person)
+        persons |= {"personTrip": self._note_person_trip, "calibrator": self._note_calibrator}
         laws = {f"carFollowing-{name}": self._note_law for name in LAWS}
         ends = {"/vType": self._end_type, "/vTypeDistribution": self._end_mixture}
         return {**vehicles, **types, **persons, **laws, "param": self._note_parameter, **ends}
 
     def _note_vehicle(self, depart: str, attributes: Attributes) -> None:
+        if "speed" in attributes and "vehsPerHour" not in attributes:
+            return  # a calibrator that only changes speeds
         self.wanted.add(attributes.get("type", DEFAULT_TYPE))
+        if (end := attributes.get("end")) and isfinite(last := _time(end)):
+            self.last_end = max(self.last_end, last)
         if self.first is not None:
             self._note_departure(attributes.get(depart, ""))
 
     def _note_person(self, attributes: Attributes) -> None:
         self.first = None  # persons may take a car of their own
+
+    def _note_person_trip(self, attributes: Attributes) -> None:
+        modes = attributes.get("modes", "").replace(",", " ").split()
+        own = {MODE_TYPES[mode] for mode in modes if mode in MODE_TYPES}
+        self.wanted |= set(attributes.get("vTypes", "").split()) or own
+
+    def _note_calibrator(self, attributes: Attributes) -> None:
+        self.calibrates = True
 
     def _note_type(self, attributes: Attributes) -> None:
         name = attributes.get("refId") or attributes.get("id", "")

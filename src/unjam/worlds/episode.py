@@ -10,7 +10,7 @@ import numpy as np
 from unjam.drivers.driver import Driver
 from unjam.drivers.from_file import DriverLike, as_driver
 from unjam.drivers.observation import feature
-from unjam.errors import InputError, NoCavError, UnjamError, wrong
+from unjam.errors import EpisodeError, InputError, NoCavError, RefusedError, UnjamError, in_own_words, wrong
 from unjam.scenarios.own_network import OwnNetwork
 from unjam.scenarios.scenario import Scenario
 from unjam.worlds.drive import drive
@@ -71,8 +71,9 @@ def run_episode(
 
     Raises:
         InputError: driver or reward answer something that is not finite, or of a wrong shape.
-        EpisodeError: SUMO cannot run the scenario, or other code in this process has started, stepped or
-            closed a simulation through libsumo meanwhile (`LostError`).
+        RefusedError: SUMO refuses files or options, at once or when it comes to them.
+        EpisodeError: SUMO cannot run the scenario for another reason, or other code in this process has
+            started, stepped or closed a simulation through libsumo meanwhile (`LostError`).
         UnjamError: another episode runs in `simulation`.
     """
     driver, seed = as_driver(driver), as_seed(seed)
@@ -89,8 +90,11 @@ def run_episode(
         traffic.stop_at_contact = stop_at_contact
         episode = drive(traffic, driver, explore, on_progress=progress)
         episode = replace(episode, warnings=simulation.finish())
-    except Exception:
+    except Exception as error:
         simulation.check()  # or other code's changes would be reported as an error of SUMO
+        known = in_own_words(error)
+        if isinstance(scenario, OwnNetwork) and type(known) is EpisodeError and simulation.has_refused():
+            raise RefusedError(str(known)) from error  # what a file holds further on
         raise
     finally:
         simulation.in_use.release()

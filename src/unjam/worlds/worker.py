@@ -18,6 +18,7 @@ from unjam.errors import in_own_words
 from unjam.processes import end_with_parent
 from unjam.scenarios import scenario_from_recipe
 from unjam.scenarios.own_network import OwnNetwork
+from unjam.sumo_files import take_answer
 from unjam.tree import Arrays, pack
 from unjam.worlds.episode import run_episode
 from unjam.worlds.messages import read_message, write_message
@@ -66,6 +67,8 @@ def _run(facts: dict[str, Any], arrays: Arrays, simulation: Simulation, answers:
             except BrokenPipeError:
                 sys.exit()  # the parent is gone
 
+    if "files" in facts:  # as the parent has read them; changed ones are read again
+        take_answer(facts["scenario"]["file"], facts["files"])
     scenario = scenario_from_recipe(facts["scenario"])
     if isinstance(scenario, OwnNetwork):
         give_up_rights()

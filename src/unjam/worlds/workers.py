@@ -12,12 +12,12 @@ from typing import Any, Self, TypeVar
 from unjam.children import child_environment, python_command
 from unjam.drivers.driver import Driver
 from unjam.drivers.registry import recipe_of
-from unjam.errors import EpisodeError
+from unjam.errors import EpisodeError, RefusedError
 from unjam.processes import PrivateFolder, sweep_private_folders
 from unjam.scenarios import scenario_recipe
 from unjam.scenarios.own_network import OwnNetwork
 from unjam.scenarios.scenario import Scenario
-from unjam.sumo_files import LONGEST_TIME
+from unjam.sumo_files import LONGEST_TIME, answer_of
 from unjam.tree import Arrays, unpack
 from unjam.worlds.messages import read_message, write_message
 from unjam.worlds.record import Episode, failed_episode
@@ -60,7 +60,7 @@ class Workers:
 
     def __init__(self, count: int = 1, silence: float = SILENCE, attempts: int = ATTEMPTS) -> None:
         """Prepare `count` workers; nothing is started yet."""
-        self.count, self._attempts = count, attempts
+        self.count, self._attempts, self._is_first = count, attempts, True
         # Of all workers, so that nothing stays behind of one that was killed.
         sweep_private_folders()
         self._temporary = PrivateFolder()
@@ -75,6 +75,7 @@ class Workers:
     ) -> list[Episode]:
         """Run all tasks and return their episodes, in the order of the tasks; one that failed says why.
 
+        Where SUMO refuses the files of the very first one, raise `RefusedError`, as `run_each` does.
         `progress` is called with a task's index and its decisions so far, from several threads.
         """
         return self.run_each(tasks, lambda index, episode: episode, progress)
@@ -88,10 +89,17 @@ class Workers:
         """Run all tasks and return what `keep` makes of each index and episode: many need much memory.
 
         `keep` is called as an episode ends, from several threads.
+
+        Raises:
+            RefusedError: SUMO refuses the files of the very first task: it would refuse those of others, too.
         """
+        is_first, self._is_first = self._is_first, False
 
         def run_one(index: int, task: EpisodeTask) -> Kept:
-            return keep(index, self._run_one(index, task, progress))
+            episode = self._run_one(index, task, progress)
+            if is_first and index == 0 and episode.error == RefusedError.__name__:
+                raise RefusedError(episode.reason)
+            return keep(index, episode)
 
         futures = list[Future[Kept]]()
         try:
@@ -147,6 +155,8 @@ class _Worker:
         self._silence, self._temporary = silence, temporary
         self._process: subprocess.Popen[bytes] | None = None
         self._stopped = self._confined = False
+        self._told = set[str]()
+        """the user's configurations that the process need not read"""
         self._starting = threading.Lock()
 
     def _start(self) -> subprocess.Popen[bytes]:
@@ -161,6 +171,7 @@ class _Worker:
             env=child_environment(**single, TMPDIR=self._temporary),
             start_new_session=True,  # an interrupt in the terminal is the parent's to handle
         )
+        self._told.clear()
         self._messages: queue.SimpleQueue[Message | None] = queue.SimpleQueue()
         threading.Thread(target=_read_all, args=(process, self._messages), daemon=True).start()
         return process
@@ -180,7 +191,7 @@ class _Worker:
         # A network of the user's own is read, and loaded, before there is anything to tell.
         patience = self._silence + (LONGEST_TIME if self._confined else 0.0)
         try:
-            self._send(process, task)
+            self._send(process, self._with_files(task))
             while True:
                 message = self._messages.get(timeout=patience)
                 patience = self._silence
@@ -195,6 +206,16 @@ class _Worker:
             raise _WorkerLost(f"no sign of life for {patience:g} s") from None
         except BrokenPipeError:
             raise _WorkerLost(self._why(process)) from None
+
+    def _with_files(self, task: Message) -> Message:
+        """Return a task with what was read of the user's files, the first time that the process needs it."""
+        facts, arrays = task
+        file = facts["scenario"].get("file")
+        answer = answer_of(file) if file and file not in self._told else None
+        if answer is None:
+            return task
+        self._told.add(file)
+        return {**facts, "files": answer}, arrays
 
     def _send(self, process: subprocess.Popen[bytes], task: Message) -> None:
         assert process.stdin is not None

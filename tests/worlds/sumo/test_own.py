@@ -13,7 +13,7 @@ from tests.worlds.test_record import fingerprint, travelled
 from unjam.drivers import IDM, Constant, Human, PISaturation
 from unjam.drivers.command import Command
 from unjam.drivers.network import Network
-from unjam.errors import InputError
+from unjam.errors import InputError, RefusedError
 from unjam.measures.drivable import drivable
 from unjam.measures.metrics import measure
 from unjam.physics.idm import IDMParameters
@@ -382,33 +382,33 @@ def test_a_warmup_runs_before_the_first_decision(file: Path, simulation: Simulat
 def test_a_vehicle_that_sumo_refuses_later_is_told_in_one_line(tmp_path: Path) -> None:
     late = COLUMN + '<vehicle id="v" type="ghost" route="along" depart="300"/>'
     scenario = scenario_of(straight(tmp_path, late, end=1000.0), cav_share=1.0, horizon=5000)
-    with Workers(1) as workers:
-        (episode,) = workers.run([EpisodeTask(scenario, IDM(), (0,))])
-    assert episode.status == "failed"
-    assert "ghost" in episode.reason
-    assert "\n" not in episode.reason
+    with Workers(1) as workers, pytest.raises(RefusedError, match="ghost") as refused:
+        workers.run([EpisodeTask(scenario, IDM(), (0,))])
+    assert "\n" not in str(refused.value)
 
 
-def test_what_sumo_refuses_on_the_way_fails_the_episode_in_one_line(tmp_path: Path) -> None:
+def test_what_sumo_refuses_on_the_way_is_told_in_one_line(tmp_path: Path) -> None:
     flow = '<flow id="f" type="car" from="road" to="road" begin="0" end="690" period="9"/>'
     late = flow + '<trip id="w" type="car" from="road" to="road" depart="690"/>'  # so far SUMO reads ahead
     late += '<trip id="v" type="car" from="road" to="road" depart="700" departPos="nowhere"/>'
     file = straight(tmp_path, late, end=1000.0)
     file.write_text(file.read_text().replace('value="0.1"', 'value="1"'))
-    with Workers(1) as workers:
-        (episode,) = workers.run([EpisodeTask(scenario_of(file, cav_share=0.5, horizon=1000), IDM(), (0,))])
-    assert (episode.status, episode.error) == ("failed", "EpisodeError")
-    assert episode.reason.startswith("SUMO cannot go on: Invalid departPos definition for trip 'v'")
-    assert "\n" not in episode.reason
+    task = EpisodeTask(scenario_of(file, cav_share=0.5, horizon=1000), IDM(), (0,))
+    words = "^SUMO cannot go on: Invalid departPos definition for trip 'v'"
+    with Workers(1) as workers, pytest.raises(RefusedError, match=words) as refused:
+        workers.run([task])
+    assert "\n" not in str(refused.value)
+    with pytest.raises(RefusedError, match=words):
+        run_episode(task.scenario, task.driver, task.seed)
 
 
 def test_what_sumo_says_before_it_has_a_log_is_told(tmp_path: Path) -> None:
     file = straight(tmp_path, COLUMN)
     demand = tmp_path / "demand.rou.xml"
     demand.write_text(demand.read_text().replace('id="van"', 'id="van" emissionClass="PHEMlight5/none"'))
-    with Workers(1) as workers:
-        (episode,) = workers.run([EpisodeTask(scenario_of(file, cav_share=1.0, horizon=5), IDM(), (0,))])
-    assert "emissionClass with name 'PHEMlight5/none' doesn't exist" in episode.reason
+    words = "emissionClass with name 'PHEMlight5/none' doesn't exist"
+    with Workers(1) as workers, pytest.raises(RefusedError, match=words):
+        workers.run([EpisodeTask(scenario_of(file, cav_share=1.0, horizon=5), IDM(), (0,))])
 
 
 def test_of_a_network_that_is_made_again_pictures_show_the_new_one(

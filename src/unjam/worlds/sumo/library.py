@@ -57,6 +57,8 @@ class Libsumo:
         self._steps = 0
         """simulated since the simulation was started"""
         self._begin = 0.0
+        self.has_refused = False
+        """whether a step has failed since the simulation was started"""
         self._claimed = _libsumo_in_use.acquire(blocking=False)
         if not self._claimed or self._is_loaded():
             self.close()
@@ -97,11 +99,15 @@ class Libsumo:
         self._count_from_now()
 
     def _count_from_now(self) -> None:
-        self._begin, self._steps = self._time(), 0
+        self._begin, self._steps, self.has_refused = self._time(), 0, False
 
     def step(self) -> None:
         """Simulate one time step."""
-        self._step()
+        try:
+            self._step()
+        except Exception:
+            self.has_refused = True
+            raise
         self._steps += 1
 
     def end(self) -> None:
@@ -126,7 +132,7 @@ class Libsumo:
 class Traci:
     """SUMO as a child process, over a connection that nobody else in this process is given."""
 
-    is_lost = False
+    is_lost = has_refused = False
 
     def __init__(self) -> None:
         """Import traci; nothing is started yet."""

@@ -103,7 +103,9 @@ class OwnTraffic(LaneTraffic[OwnRoad]):
                 simulation.change_type(name, CALIBRATED_TYPES.format(kind, number))
 
     def _moved(self, left: Sequence[str], entered: Sequence[str]) -> None:
-        self.over = not self._simulation.more_expected()
+        # SUMO does not expect the vehicles that calibrators will bring.
+        until, simulation = self.road.files.calibrated_until, self._simulation
+        self.over = not simulation.more_expected() and (not until or simulation.now() >= until)
         if self.full:
             self._routes.update(self._simulation.route_of(name) for name in entered)
 

@@ -107,6 +107,14 @@ class Simulation(VehicleControl):
         self.waiting: Callable[[], Sequence[str]] = call("simulation", "getPendingVehicles")
         """who wants to enter and cannot"""
 
+    def now(self) -> float:
+        """Return SUMO's time [s]."""
+        return float(self._sumo.simulation.getTime())
+
+    def has_refused(self) -> bool:
+        """Return whether a step of this episode has failed: SUMO refuses what a file holds further on."""
+        return self._library.has_refused
+
     def load(self, files: Files, step: float, seed: int) -> None:
         """Start an episode: load network and traffic, and put the vehicles on the road.
 
