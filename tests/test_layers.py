@@ -227,6 +227,11 @@ UNSAFE_BUT = {
     "studies/do_no_harm.py: files.mkdir()": PRIVATE,
     "studies/harm_roads.py: (folder / 'road.rou.xml').write_text(_document('routes', traffic))": PRIVATE,
     "studies/harm_roads.py: path.write_text(_document('configuration', lines))": PRIVATE,
+    "studies/assess_examples.py: (folder / 'road').mkdir()": PRIVATE,
+    "studies/assess_examples.py: (folder / 'road.rou.xml').write_text('\\n'.join(lines))": PRIVATE,
+    "studies/assess_examples.py: (folder / 'road.rou.xml').write_text(_document('routes', traffic))": PRIVATE,
+    "studies/assess_examples.py: path.write_text(_document('configuration', lines))": PRIVATE,
+    "studies/assess_examples.py: shutil.copy(network_file(road.network), folder / 'road.net.xml')": PRIVATE,
     "sumo_files/program.py: open(copy, 'w', encoding='utf-8')": PRIVATE,
     "reports/film.py: imageio_ffmpeg.write_frames(str(film), (SIZE, SIZE), fps=rate, "
     "ffmpeg_log_level='error')": PRIVATE,
